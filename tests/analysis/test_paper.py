@@ -11,20 +11,27 @@ import pytest
 
 from gsbench.analysis.cells import Cell
 from gsbench.analysis.paper import (
-    TABLE1_QUANTITIES,
-    Agreement,
+    DIFFERS,
+    INTERVAL,
+    QUANTITIES,
+    ROUNDING,
     Printed,
     agreement,
     load_paper,
+    load_published,
     paper_tables,
-    t_half_width,
+    published_names,
+    published_table,
 )
 from gsbench.analysis.results import Experiment, load_experiment
-from gsbench.analysis.table_formats import to_html, to_latex, to_markdown
+from gsbench.analysis.table_formats import to_html_page, to_latex, to_markdown
 from gsbench.analysis.tables import build_table
 from gsbench.errors import InputError
+from gsbench.eval.facts import find
+from gsbench.system.install import conf_dir
 from gsbench.verbs import tables
 from tests.analysis.synthetic import Plan, write_runs
+from tests.analysis.test_tables import one_trial, texts
 
 
 def cell(mean: float, std: float | None = None, count: int = 3) -> Cell:
@@ -41,23 +48,24 @@ def test_the_data_are_those_of_the_printed_tables(shared: Path) -> None:
     assert len(table1) == 13
     for row in table1:
         scene = name.get(row[-1], row[-1].lower())
-        keys = [(scene, "dim", arm, q) for q in TABLE1_QUANTITIES for arm in ("adc", "volumetric")]
-        assert [paper.table1[key].text for key in keys] == row[1:11]
+        keys = [(scene, "dim", arm, q) for q in QUANTITIES["table1"] for arm in ("adc", "volumetric")]
+        assert [paper.tables["table1"][key].text for key in keys] == row[1:11]
     table2 = [row for row in rows if len(row) == 5 and re.fullmatch(r"[\d.]+", row[1])]
     assert len(table2) == 12
     for row in table2:
         scene = name.get(row[0], row[0].lower())
         arms = (("sfm", "adc"), ("dim", "adc"), ("sfm", "volumetric"), ("dim", "volumetric"))
-        assert [paper.table2[scene, init, arm, "lpips_vgg_raw"].text for init, arm in arms] == row[1:]
+        assert [paper.tables["table2"][scene, init, arm, "lpips_vgg_raw"].text for init, arm in arms] == row[1:]
 
 
 def test_what_the_paper_contradicts_follows_from_its_numbers() -> None:
     paper = load_paper()
+    table1, table2 = (paper.tables[name] for name in ("table1", "table2"))
     text = "\n".join(paper.contradictions)
 
     def pairs(quantity: str) -> list[tuple[float, float]]:
         keys = [[(scene, "dim", arm, quantity) for arm in ("adc", "volumetric")] for scene in paper.scenes("table1")]
-        return [(paper.table1[one].value, paper.table1[other].value) for one, other in keys]
+        return [(table1[one].value, table1[other].value) for one, other in keys]
 
     for name, quantity in (("Gaussians", "gaussians_millions"), ("Training time", "train_minutes")):
         costs = np.array(pairs(quantity))
@@ -74,39 +82,33 @@ def test_what_the_paper_contradicts_follows_from_its_numbers() -> None:
         assert (
             f"{name}: mean of 13 scenes {one:.{digits}f} (3DGS), {other:.{digits}f} (ours); ours is {counts}." in text
         )
-    for key, printed in paper.table2.items():
-        if key in paper.table1 and (
-            printed.range[0] > paper.table1[key].range[1] or printed.range[1] < paper.table1[key].range[0]
-        ):
+    for key, printed in table2.items():
+        if key in table1 and (printed.range[0] > table1[key].range[1] or printed.range[1] < table1[key].range[0]):
             name = {"adc": "3DGS", "volumetric": "Ours"}[key[2]]
-            assert f"{key[0]} {name} {paper.table1[key].text}/{printed.text}" in text
+            assert f"{key[0]} {name} {table1[key].text}/{printed.text}" in text
     assert set(paper.scenes("table1")) - set(paper.scenes("table2")) == {"train"}
 
 
 def test_a_printed_number_stands_for_its_rounding_range() -> None:
-    assert Printed("0.27").half_step == pytest.approx(0.005)
+    assert Printed("0.27").range == pytest.approx((0.265, 0.275))
     assert Printed("0.270").range == pytest.approx((0.2695, 0.2705))
 
 
 @pytest.mark.parametrize(
     ("measured", "expected"),
     [
-        (cell(0.124), Agreement.ROUNDING),  # rounds to 0.12
-        (cell(0.126), Agreement.DIFFERS),  # a single trial has no interval
-        (cell(0.130, 0.002), Agreement.DIFFERS),  # 0.130 - 4.303 * 0.002 / sqrt(3) = 0.12503 > 0.125
-        (cell(0.130, 0.0021), Agreement.INTERVAL),  # 0.130 - 4.303 * 0.0021 / sqrt(3) = 0.12478
-        (cell(0.110, 0.0021), Agreement.INTERVAL),
-        (cell(0.200, 0.001), Agreement.DIFFERS),
+        (cell(0.124), ROUNDING),  # rounds to 0.12
+        (cell(0.126), DIFFERS),  # a single trial has no interval
+        (cell(0.130, 0.002), DIFFERS),  # 0.130 - 4.303 * 0.002 / sqrt(3) = 0.12503 > 0.125
+        (cell(0.130, 0.0021), INTERVAL),  # 0.130 - 4.303 * 0.0021 / sqrt(3) = 0.12478
+        (cell(0.110, 0.0021), INTERVAL),
+        (cell(0.200, 0.001), DIFFERS),
+        (cell(0.130, 0.00055, 2), DIFFERS),  # 12.706 for two trials: 0.130 - 12.706 * 0.00055 / sqrt(2) = 0.12506
+        (cell(0.130, 0.00056, 2), INTERVAL),
     ],
 )
-def test_agreement(measured: Cell, expected: Agreement) -> None:
-    assert agreement(measured, Printed("0.12")) is expected
-
-
-def test_the_interval_is_students() -> None:
-    # Tabulated two-sided 95 % quantiles: 12.706 for 1 degree of freedom, 4.303 for 2.
-    assert t_half_width(1.0, 2) == pytest.approx(12.706 / 2**0.5, abs=1e-3)
-    assert t_half_width(1.0, 3) == pytest.approx(4.303 / 3**0.5, abs=1e-3)
+def test_agreement(measured: Cell, expected: str) -> None:
+    assert agreement(measured, Printed("0.12")) == expected
 
 
 def test_table1_has_the_papers_rows_and_marks_what_was_not_run(make_experiment: Callable[..., Experiment]) -> None:
@@ -116,9 +118,10 @@ def test_table1_has_the_papers_rows_and_marks_what_was_not_run(make_experiment: 
     assert measured.rows[-1].labels == ("mean of 2 scenes",)
     by_scene = {row.labels[0]: row for row in measured.rows}
     assert by_scene["stump"].entries[0].text == "— (0/3)"
-    assert {row.labels for row in difference.rows} == {(s, a) for s in ("garden", "bonsai") for a in ("3DGS", "Ours")}
+    arms = ("adc", "volumetric")
+    assert {row.labels for row in difference.rows} == {(s, "dim", a) for s in ("garden", "bonsai") for a in arms}
     psnr = by_scene["garden"].entries[2].cell
-    shown = next(row for row in difference.rows if row.labels == ("garden", "3DGS")).entries[3].text
+    shown = next(row for row in difference.rows if row.labels == ("garden", "dim", "adc")).entries[3].text
     assert shown.split()[0].replace("−", "-") == f"{psnr.mean - 27.06:+.2f}"
 
 
@@ -179,7 +182,7 @@ def test_below_the_differences_stands_what_the_paper_says_of_its_setup(
     make_experiment: Callable[..., Experiment],
 ) -> None:
     _, difference = paper_tables(make_experiment(experiment="table1", inits=("dim",), scenes=("garden",)), "table1")
-    for written in (to_markdown(difference), to_html(difference), to_latex(difference)):
+    for written in (to_markdown(difference), to_html_page(difference), to_latex(difference)):
         assert "The paper on hardware: it trained on one NVIDIA RTX 2080." in written
 
 
@@ -189,6 +192,48 @@ def test_the_papers_own_set_up_has_the_papers_layout(tmp_path: Path, capsys: pyt
     out = capsys.readouterr().out
     assert "### Table 1, measured (experiment table1_own)" in out
     assert "replace the paper's DIM" not in out  # image matching by the settings of the paper's time is the paper's DIM
-    assert "| garden | 3DGS |" in out
+    assert "| garden | dim_paper | adc |" in out
     assert tables.main(["table1_own", "--paper", "3dgs"], tmp_path) == 0
     assert "The paper on poses: it takes the cameras that come" in capsys.readouterr().out
+
+
+# --- other papers
+
+
+@pytest.mark.parametrize("name", published_names())
+def test_every_paper_names_its_source_and_has_sane_numbers(name: str) -> None:
+    paper = load_published(name)
+    assert paper.title
+    assert "github.com/" in paper.source or "arxiv.org/" in paper.source
+    assert paper.conventions
+    assert all(find(key) is not None for key in paper.quantities)
+    bounds = {"psnr": (10, 45), "ssim": (0.3, 1), "lpips_vgg_raw": (0, 1)}
+    for (_, key), printed in paper.printed.items():
+        low, high = bounds[key]
+        assert low < printed.value < high
+
+
+@pytest.mark.parametrize("name", published_names())
+def test_scenes_and_methods_are_called_as_gsbench_calls_them(name: str) -> None:
+    paper = load_published(name)
+    assert all((conf_dir() / "scene" / f"{scene}.yaml").is_file() for scene, _ in paper.printed)
+    assert (conf_dir() / "densify" / f"{paper.densify}.yaml").is_file()
+
+
+def test_ours_stand_beside_the_printed_numbers(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for seed, psnr in enumerate((27.41, 27.41, 27.41)):
+        one_trial(tmp_path, seed, psnr=psnr, ssim=0.9, lpips_vgg_raw=0.2)
+    one_trial(tmp_path, 0, psnr=1.0, _scene="nowhere")
+    table = published_table(load_experiment(tmp_path, "exp").trials, "3dgs")
+    assert texts(table) == [["garden", "sfm", "adc", "27.410", "+0.000 =", "0.868", "+0.032 ≠", "0.103", "+0.097 ≠"]]
+    assert any(note.startswith("Read from github.com/nerfbaselines") for note in table.notes)
+    assert tables.main(["exp", "--paper", "3dgs"], tmp_path) == 0
+    assert "### Difference from 3dgs" in capsys.readouterr().out
+
+
+def test_what_cannot_be_compared_is_said(tmp_path: Path) -> None:
+    one_trial(tmp_path, 0, psnr=1.0, _scene="nowhere")
+    with pytest.raises(InputError, match="no trial here is of one of them"):
+        published_table(load_experiment(tmp_path, "exp").trials, "3dgs-mcmc")
+    with pytest.raises(InputError, match=r"no published numbers '3dsg'.*did you mean 3dgs"):
+        load_published("3dsg")

@@ -14,14 +14,13 @@ import pytest
 from PIL import Image
 from plyfile import PlyData
 
-from gsbench.analysis.images import texture_energy
+from gsbench.analysis.images import choose_views, texture_energy
 from gsbench.analysis.pairing import pair_trials
 from gsbench.analysis.report.build import build_report, trial_figures
-from gsbench.analysis.report.charts import ForestRow, Series, _Axis, bar_chart, forest_plot, line_chart
-from gsbench.analysis.report.pictures import choose_views
-from gsbench.analysis.report.sections import _threshold, mean_by_step
-from gsbench.analysis.report.volumes import log10_volumes, share_above, volume_histogram
+from gsbench.analysis.report.charts import Axis, ForestRow, forest_plot, line_chart
+from gsbench.analysis.report.sections import _threshold, histogram, log10_volumes, mean_by_step
 from gsbench.analysis.results import Experiment, load_experiment
+from gsbench.analysis.statistics import Interval
 from gsbench.analysis.verdicts import by_scene_lines, headline, judge_pairs
 from gsbench.errors import InputError
 from gsbench.runs.declaration import Arm
@@ -168,10 +167,21 @@ def test_volumes_are_those_of_the_ellipsoids(experiment: Experiment) -> None:
     vertices = PlyData.read(path)["vertex"]
     scales = np.exp(np.stack([vertices[f"scale_{axis}"] for axis in range(3)]).astype(np.float64))
     volumes = 4 / 3 * np.pi * scales.prod(axis=0)
-    assert log10_volumes(path) == pytest.approx(np.log10(volumes), abs=1e-6)
-    trials = experiment.trials[:1]
-    assert sum(share for _, share in volume_histogram(trials)) == pytest.approx(1)
-    assert share_above(trials, 1e-4) == pytest.approx(np.mean(volumes > 1e-4))
+    found = log10_volumes(path)
+    assert found == pytest.approx(np.log10(volumes), abs=1e-6)
+    shares = histogram(np.append(found, -np.inf))
+    assert sum(share for _, share in shares) == pytest.approx(1)
+    assert sum(share for volume, share in shares if volume > 1e-4) == pytest.approx(np.mean(found >= -4))
+
+
+def test_the_share_above_the_threshold_is_said(experiment: Experiment, page: str) -> None:
+    found = [10 ** log10_volumes(t.path / "point_cloud.ply") for t in experiment.trials if t.densify == "adc"]
+    assert f"sfm-adc: {np.mean(np.concatenate(found) > 0.03):.2%} of volumes exceed 0.03." in page
+
+
+def test_growth_and_pruning_by_cause_are_a_table(page: str) -> None:
+    events = page.split("<caption>Gaussians by cause, mean of a trial</caption>")[1].split("</table>")[0]
+    assert '<th scope="row">split volume</th><td>0</td><td>100</td>' in events
 
 
 def test_a_truncated_point_cloud_is_refused(tmp_path: Path, experiment: Experiment) -> None:
@@ -186,14 +196,9 @@ def test_mean_curves_use_common_steps() -> None:
 
 
 CHARTS = {
-    "lines": lambda title: line_chart(
-        title, [Series("a", [(1, 1), (10, 5)]), Series("b", [(2, 3)])], "x", "y", log_x=True
-    ),
-    "flat": lambda title: line_chart(title, [Series("a", [(5, 1), (5, 1)])], "x", "y", marker=(5, "here")),
-    "bars": lambda title: bar_chart(title, ["p", "q"], [("a", [1, 2]), ("b", [0, -1])], "count"),
-    "forest": lambda title: forest_plot(
-        title, [ForestRow("s", 0.1, -0.1, 0.3), ForestRow("t", 0.2, None, None)], "d", 1
-    ),
+    "lines": lambda title: line_chart(title, [("a", [(1, 1), (10, 5)]), ("b", [(2, 3)])], "x", "y", log=True),
+    "flat": lambda title: line_chart(title, [("a", [(5, 1), (5, 1)])], "x", "y", marker=5),
+    "forest": lambda title: forest_plot(title, [ForestRow("s", 0.1, Interval(-0.1, 0.3)), ForestRow("t", 0.2)], "d", 1),
 }
 
 
@@ -210,7 +215,7 @@ def test_charts_are_well_formed_and_stay_inside(chart: str) -> None:
 
 
 def test_a_line_chart_puts_values_where_they_belong() -> None:
-    figure = ElementTree.fromstring(line_chart("t", [Series("a", [(0, 0), (5, 10), (10, 0)])], "x", "y"))
+    figure = ElementTree.fromstring(line_chart("t", [("a", [(0, 0), (5, 10), (10, 0)])], "x", "y"))
     points = [tuple(map(float, p.split(","))) for p in next(figure.iter("polyline")).attrib["points"].split()]
     (x0, y0), (x1, y1), (x2, y2) = points
     assert x1 - x0 == pytest.approx(x2 - x1, abs=0.2)
@@ -223,7 +228,7 @@ def test_a_line_chart_puts_values_where_they_belong() -> None:
 )
 def test_an_axis_has_round_ticks_within_its_range(values: tuple[float, float], log: bool) -> None:
     """Its range goes a little beyond the values; on a logarithmic one of no two decades, ends and middle are named."""
-    axis = _Axis(values, log, 100.0, 300.0)
+    axis = Axis(values, log, 100.0, 300.0)
     places = [axis.place(tick) for tick in axis.ticks]
     assert 2 <= len(places) <= 12
     assert places == sorted(set(places))
@@ -241,7 +246,7 @@ def test_an_axis_has_round_ticks_within_its_range(values: tuple[float, float], l
 
 
 def test_an_axis_from_zero_begins_at_zero() -> None:
-    axis = _Axis([0.0, 10.0], False, 0.0, 104.0)
+    axis = Axis([0.0, 10.0], False, 0.0, 104.0)
     assert [axis.place(value) for value in (0, 5, 10)] == pytest.approx([0, 50, 100])
 
 
@@ -266,8 +271,8 @@ def test_the_threshold_of_a_chart_is_the_one_that_all_arms_have_in_scene_units(
 
 
 def test_nothing_to_draw_is_an_empty_string() -> None:
-    assert line_chart("t", [Series("a", [])], "x", "y") == ""
-    assert line_chart("t", [Series("a", [(0, 1)])], "x", "y", log_x=True) == ""
+    assert line_chart("t", [("a", [])], "x", "y") == ""
+    assert line_chart("t", [("a", [(0, 1)])], "x", "y", log=True) == ""
     assert forest_plot("t", [], "x", 1) == ""
 
 
@@ -358,5 +363,5 @@ def test_points_of_a_search_are_not_held_against_each_other(tmp_path: Path) -> N
 def test_a_forest_has_a_scale_whatever_its_range() -> None:
     """A range of -.09 to .09 had zero as its one tick."""
     for reach in (0.0886, 0.09, 0.11, 1.0, 3.3, 940.0):
-        chart = forest_plot("t", [ForestRow("a", 0.1 * reach, -reach, reach)], "difference", 1)
+        chart = forest_plot("t", [ForestRow("a", 0.1 * reach, Interval(-reach, reach))], "difference", 1)
         assert chart.count('class="grid"') >= 2, reach

@@ -16,11 +16,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gsbench.analysis.quantities import choose_quantities, quantity
-from gsbench.analysis.report.sections import change_words, cost_change
+from gsbench.analysis.quantities import Change, choose_quantities, quantity, relative_change
 from gsbench.analysis.results import Experiment, load_experiment
-from gsbench.analysis.table_formats import escape_latex, to_csv, to_html, to_html_page, to_latex, to_markdown
-from gsbench.analysis.tables import Table, build_table
+from gsbench.analysis.table_formats import Table, escape_latex, to_csv, to_html_page, to_latex, to_markdown
+from gsbench.analysis.tables import build_table
 from gsbench.errors import InputError
 from tests.analysis.synthetic import Plan, trial_data, write_runs, write_trial
 
@@ -203,10 +202,10 @@ def test_costs_are_averaged_by_both_rules(make_experiment: Make, tmp_path: Path)
         one_trial(tmp_path, 0, psnr=20.0, _scene=scene, _num_gaussians=volumetric, _densify="volumetric")
     trials = load_experiment(tmp_path, "exp").trials
     arms = [[trial for trial in trials if trial.densify == name] for name in ("adc", "volumetric")]
-    change = cost_change(*arms, lambda trial: trial.record.num_gaussians)
-    assert change == pytest.approx((5 / 4 - 1, 0.5, 2))  # totals 4M -> 5M; ratios 2 and 1
-    assert change is not None
-    assert change_words(*change) == "+25.0% as a ratio of totals, +50.0% as the mean of 2 scenes"
+    change = relative_change(*arms, lambda trial: trial.record.num_gaussians)
+    assert change == Change(5 / 4 - 1, 0.5, 2)  # totals 4M -> 5M; ratios 2 and 1
+    assert str(change) == "+25.0% as a ratio of totals, +50.0% as the mean of 2 scenes"
+    assert relative_change(arms[0], [], lambda trial: trial.record.num_gaussians) is None
 
 
 def test_metrics_of_earlier_iterations_have_columns_of_their_own(tmp_path: Path) -> None:
@@ -274,8 +273,8 @@ def test_html_is_well_formed_and_escaped(make_experiment: Make) -> None:
     parser.feed(to_html_page(build_table(experiment, rows=["scene", "init"], columns=["densify"])))
     assert parser.open == []
     assert len(set(parser.rows)) == 1
-    assert "&lt;b&gt;" in to_html(build_table(experiment, title="<b>"))
-    page = to_html(build_table(experiment, rows=["scene", "init"], columns=["densify"]))
+    assert "&lt;b&gt;" in to_html_page(build_table(experiment, title="<b>"))
+    page = to_html_page(build_table(experiment, rows=["scene", "init"], columns=["densify"]))
     heads = page[page.index("<thead>") : page.index("</thead>")]
     assert all(f">{name}</th>" in heads for name in ("adc", "volumetric"))
 

@@ -27,12 +27,13 @@ STUDIES = [Study(f"trial {k}", effect, Interval(effect - 0.1, effect + 0.1)) for
 def test_studies_are_the_units() -> None:
     found, expected = pool(STUDIES), stats.ttest_1samp(EFFECTS, 0)
     interval = expected.confidence_interval()
-    assert found.mean == pytest.approx(np.mean(EFFECTS))
-    assert found.p == pytest.approx(expected.pvalue)
-    assert found.interval is not None
-    assert (found.interval.low, found.interval.high) == pytest.approx((interval.low, interval.high))
-    assert found.prediction is not None
-    assert found.prediction.high - found.prediction.low > found.interval.high - found.interval.low
+    assert found.test is not None
+    assert found.test.mean == pytest.approx(np.mean(EFFECTS))
+    assert found.test.p == pytest.approx(expected.pvalue)
+    own = found.test.interval()
+    assert (own.low, own.high) == pytest.approx((interval.low, interval.high))
+    half = stats.t.ppf(0.975, 3) * np.std(EFFECTS, ddof=1) * (1 + 1 / 4) ** 0.5
+    assert found.prediction.high - found.test.mean == pytest.approx(half)
 
 
 def test_intervals_hold_the_truth_as_often_as_they_say() -> None:
@@ -41,25 +42,27 @@ def test_intervals_hold_the_truth_as_often_as_they_say() -> None:
     for _ in range(600):
         effects = rng.normal(1.0, 0.3, 5) + rng.normal(0, rng.uniform(0.1, 0.5, 5))
         found = pool([Study(str(k), float(effect)) for k, effect in enumerate(effects)])
-        assert found.interval is not None
-        held += found.interval.low <= 1.0 <= found.interval.high
+        assert found.test is not None
+        held += found.test.interval().low <= 1.0 <= found.test.interval().high
     assert held / 600 > 0.95 - 3 * (0.05 * 0.95 / 600) ** 0.5
 
 
 def test_no_mean_where_protocols_differ() -> None:
     studies = [Study("a", 1.0, None, "paper-1"), Study("b", 1.1, None, "standard-1")]
     found = pool(studies)
-    assert found.mean is None
+    assert found.test is None
     assert found.refusal == "the studies differ in protocol (a: paper-1; b: standard-1)"
     assert describe(found) == [f"no mean: {found.refusal}"]
     unknown = pool([studies[0], Study("c", 1.0)])
     assert "c: unknown" in unknown.refusal
-    assert pool([studies[0], Study("c", 1.0, None, "paper-1")]).mean == pytest.approx(1.0)
+    alike = pool([studies[0], Study("c", 1.0, None, "paper-1")]).test
+    assert alike is not None
+    assert alike.mean == pytest.approx(1.0)
 
 
 def test_one_study_is_no_pool_and_two_of_one_name_are_refused() -> None:
-    assert pool(STUDIES[:1]).mean is None
-    assert pool([]).mean is None
+    assert pool(STUDIES[:1]).test is None
+    assert pool([]).test is None
     with pytest.raises(InputError, match="twice"):
         pool([STUDIES[0], STUDIES[0]])
 

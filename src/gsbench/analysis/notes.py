@@ -7,10 +7,9 @@ from collections.abc import Sequence
 
 from gsbench.analysis.cells import with_variants
 from gsbench.analysis.declaration import standing
-from gsbench.analysis.differences import ingredients_between, ingredients_sentence, is_mixed
+from gsbench.analysis.fairness import caveats
 from gsbench.analysis.pairing import choose_pairs, controls_of
-from gsbench.analysis.results import Arm, Experiment, TrialResult, by_key
-from gsbench.analysis.tuning import tuning_sentence
+from gsbench.analysis.results import Arm, Experiment, TrialResult, by_key, seeds_words
 from gsbench.runs.code import SHOWN
 from gsbench.runs.layout import TUNING
 from gsbench.runs.trial_record import FROM_MODEL, FROM_RENDERS
@@ -22,6 +21,13 @@ ORIGINS = (  # who trained (here or elsewhere), what was measured, and how that 
     (False, FROM_MODEL, "A model that another program trained, rendered here"),
     (False, FROM_RENDERS, "Renders of another program, measured as they are"),
 )
+
+
+def trials_notes(experiment: Experiment, trials: Sequence[TrialResult]) -> list[str]:
+    """All that must be known of ``trials`` of an experiment, and of the comparison that they are part of."""
+    of_trials = (held_out_notes, points_notes, machine_notes, cloud_notes)
+    notes = origin_notes(trials) + comparison_notes(experiment)
+    return notes + [line for say in of_trials for line in say(trials)]
 
 
 def origin_notes(trials: Sequence[TrialResult]) -> list[str]:
@@ -81,39 +87,6 @@ def compared_pairs(experiment: Experiment) -> tuple[list[TrialResult], list[tupl
         return trials, []
     arms = sorted({trial.arm for trial in trials})
     return trials, choose_pairs(arms, controls=controls_of(trials)) if arms else []
-
-
-EQUAL_COUNTS = 0.02  # relative: arms closer than this have one count, as governed ones do
-
-
-def caveats(trials: Sequence[TrialResult], first: Arm, second: Arm) -> str:
-    """Say where two arms of ``trials`` have unlike counts, differ in more than one ingredient, and where one was tuned
-    more; else "".
-    """
-    found = ingredients_between(trials, first, second)
-    mixed = ingredients_sentence(found, first, second) if is_mixed(found) else ""
-    counts = counts_sentence(trials, first, second)
-    return " ".join(filter(None, [counts, mixed, tuning_sentence(trials, (first, second))]))
-
-
-def counts_sentence(trials: Sequence[TrialResult], first: Arm, second: Arm) -> str:
-    """Say how many more Gaussians the second arm has, over the scenes that both have; "" where counts are equal."""
-    means = []
-    for arm in (first, second):
-        own = by_key([trial for trial in trials if trial.arm == arm], lambda trial: trial.scene)
-        counts = {scene: [trial.record.num_gaussians or 0 for trial in group] for scene, group in own.items()}
-        means.append({scene: sum(found) / len(found) for scene, found in counts.items() if all(found)})
-    shared = means[0].keys() & means[1].keys()
-    if not shared:
-        return ""
-    change = sum(means[1][scene] for scene in shared) / sum(means[0][scene] for scene in shared) - 1
-    if abs(change) <= EQUAL_COUNTS:
-        return ""
-    more = f"{abs(change):.0%}".replace("%", " %") + (" more" if change > 0 else " fewer")
-    return (
-        f"{second} has {more} Gaussians than {first}, so this does not compare at equal counts; "
-        "densify.cap=governor makes the counts equal."
-    )
 
 
 def machine_notes(trials: Sequence[TrialResult]) -> list[str]:
@@ -176,7 +149,5 @@ def _points_from(trial: TrialResult) -> str:
 
 def _arms(trials: Sequence[TrialResult]) -> str:
     """``adc seeds 0, 1; volumetric seed 0``"""
-    return "; ".join(
-        f"{densify} {'seed' if len(own) == 1 else 'seeds'} {', '.join(str(trial.seed) for trial in own)}"
-        for densify, own in by_key(trials, lambda trial: trial.densify).items()
-    )
+    groups = by_key(trials, lambda trial: trial.densify)
+    return "; ".join(f"{densify} {seeds_words(own)}" for densify, own in groups.items())

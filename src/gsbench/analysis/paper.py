@@ -1,33 +1,42 @@
-"""The paper's printed Tables 1 and 2 as data, the same tables from one's own trials, and how far they lie apart."""
+"""Printed numbers of papers as data, the paper's Tables 1 and 2 from one's own trials, and how far both lie apart."""
 
 from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from enum import Enum
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cache
 from importlib.resources import files
+from typing import Any
 
 import yaml
 
-from gsbench.analysis.cells import Cell
-from gsbench.analysis.quantities import Quantity, quantity
-from gsbench.analysis.results import Experiment, TrialResult
-from gsbench.analysis.tables import Column, Entry, Row, Table, build_table
+from gsbench.analysis.cells import Cell, check_averageable, make_cell
+from gsbench.analysis.quantities import Quantity, choose_quantities, quantity
+from gsbench.analysis.results import Arm, Experiment, TrialResult, by_key
+from gsbench.analysis.table_formats import Column, Entry, Row, Table
+from gsbench.analysis.tables import build_table
 from gsbench.errors import InputError
-from gsbench.words import signed
+from gsbench.words import closest, signed
 
-PAPER_TABLES = ("table1", "table2")
 OWN = "_own"  # ends the name of the same table with poses and gauge of each initialiser's own
 STAND_FOR = {"dim_paper": "dim"}  # initialisers that are one of the paper's arms under another name
 CONFIDENCE = 0.95
-TABLE1_QUANTITIES = ("ssim", "psnr", "lpips_vgg_raw", "gaussians_millions", "train_minutes")
-TABLE1_ARMS = (("dim", "adc"), ("dim", "volumetric"))
-TABLE2_ARMS = (("sfm", "adc"), ("dim", "adc"), ("sfm", "volumetric"), ("dim", "volumetric"))
-ARM_NAMES = {"adc": "3DGS", "volumetric": "Ours"}
-INIT_NAMES = {"sfm": "SfM", "dim": "DIM"}
+PAPER_TABLES = ("table1", "table2")
+QUANTITIES = {
+    "table1": ("ssim", "psnr", "lpips_vgg_raw", "gaussians_millions", "train_minutes"),
+    "table2": ("lpips_vgg_raw",),
+}
+ARMS = {
+    "table1": (("dim", "adc"), ("dim", "volumetric")),
+    "table2": (("sfm", "adc"), ("dim", "adc"), ("sfm", "volumetric"), ("dim", "volumetric")),
+}
+NAMES = {"adc": "3DGS", "volumetric": "Ours", "sfm": "SfM", "dim": "DIM"}
+ROUNDING, INTERVAL, DIFFERS = "=", "≈", "≠"  # how a measured cell agrees with the printed number
+
+Key = tuple[str, str, str, str]  # scene, init, densify, quantity
+Find = Callable[[str, Arm, str], "Printed | None"]  # the printed number of a scene, an arm and a quantity
 
 
 @dataclass(frozen=True)
@@ -41,89 +50,85 @@ class Printed:
         return float(self.text)
 
     @property
-    def half_step(self) -> float:
-        _, _, digits = self.text.partition(".")
-        return 0.5 * 10.0 ** -len(digits)
+    def decimals(self) -> int:
+        return len(self.text.partition(".")[2])
 
     @property
     def range(self) -> tuple[float, float]:
-        return self.value - self.half_step, self.value + self.half_step
-
-
-Key = tuple[str, str, str, str]  # scene, init, densify, quantity
+        half_step = 0.5 * 10.0**-self.decimals
+        return self.value - half_step, self.value + half_step
 
 
 @dataclass(frozen=True)
 class Paper:
-    """Both tables: ``table1`` and ``table2`` map (scene, init, densify, quantity) to the printed number."""
+    """The paper of the method: its ``tables`` by name, what it contradicts of itself (a sentence each), and its words
+    on settings beside the method.
+    """
 
-    table1: Mapping[Key, Printed]
-    table2: Mapping[Key, Printed]
-    contradictions: tuple[str, ...]  # of the paper with itself, a sentence each
-    setup: Mapping[str, str]  # its words on settings beside the method
-
-    def table(self, name: str) -> Mapping[Key, Printed]:
-        return {"table1": self.table1, "table2": self.table2}[name]
+    tables: Mapping[str, Mapping[Key, Printed]]
+    contradictions: tuple[str, ...]
+    setup: Mapping[str, str]
 
     def scenes(self, name: str) -> list[str]:
         """The scenes of a table in the printed order."""
-        return list(dict.fromkeys(key[0] for key in self.table(name)))
+        return list(dict.fromkeys(key[0] for key in self.tables[name]))
+
+
+@dataclass(frozen=True)
+class Published:
+    """Another paper's numbers; ``printed`` maps (scene, quantity) to what its method has there."""
+
+    name: str
+    title: str
+    source: str  # where the numbers were read
+    conventions: str  # under which they were measured, as far as the source says
+    densify: str  # the densifier of ours that is the paper's method
+    quantities: tuple[str, ...]
+    printed: Mapping[tuple[str, str], Printed]
+    setup: Mapping[str, str]
 
 
 @cache
 def load_paper() -> Paper:
     """The paper's tables from the file that ships with the package."""
-    content = yaml.safe_load(files("gsbench.analysis").joinpath("paper.yaml").read_text(encoding="utf-8"))
-    table1: dict[Key, Printed] = {}
-    for scene, (_, *pairs) in content["table1"]["scenes"].items():
-        for key, pair in zip(TABLE1_QUANTITIES, pairs, strict=True):
-            for (init, densify), text in zip(TABLE1_ARMS, pair, strict=True):
-                table1[scene, init, densify, key] = Printed(text)
-    table2 = {
-        (scene, init, densify, "lpips_vgg_raw"): Printed(text)
-        for scene, texts in content["table2"]["scenes"].items()
-        for (init, densify), text in zip(TABLE2_ARMS, texts, strict=True)
+    content = _read("paper.yaml")
+    tables = {
+        name: {
+            (scene, *arm, key): Printed(text)
+            for scene, rows in content[name]["scenes"].items()
+            for key, texts in zip(QUANTITIES[name], rows, strict=True)
+            for arm, text in zip(ARMS[name], texts, strict=True)
+        }
+        for name in PAPER_TABLES
     }
-    return Paper(table1, table2, tuple(content["contradictions"]), content["setup"])
+    return Paper(tables, tuple(content["contradictions"]), content["setup"])
 
 
-def setup_lines(setup: Mapping[str, str]) -> list[str]:
-    """Say in a line each what a paper writes on settings beside its method, to be held against one's own."""
-    return [f"The paper on {topic}: it {words}." for topic, words in setup.items()]
+def published_names() -> list[str]:
+    """The papers whose numbers ship with gsbench, beside the paper of the method."""
+    folder = files("gsbench.analysis").joinpath("published")
+    return sorted(entry.name.removesuffix(".yaml") for entry in folder.iterdir() if entry.name.endswith(".yaml"))
 
 
-class Agreement(Enum):
-    """Classes of agreement between a measured cell and the printed number, from the closest to the farthest."""
+@cache
+def load_published(name: str) -> Published:
+    """The numbers of the paper ``name``; raises InputError that lists the papers there are."""
+    known = published_names()
+    if name not in known:
+        raise InputError(f"no published numbers {name!r}{closest(name, known)} (there are: {', '.join(known)})")
+    content = _read(f"published/{name}.yaml")
+    quantities = tuple(content["quantities"])
+    printed = {
+        (scene, key): Printed(text)
+        for scene, texts in content["scenes"].items()
+        for key, text in zip(quantities, texts, strict=True)
+    }
+    title, source, conventions = (" ".join(content[key].split()) for key in ("title", "source", "conventions"))
+    return Published(name, title, source, conventions, content["densify"], quantities, printed, content["setup"])
 
-    ROUNDING = "="  # the mean lies within half a step of the last printed digit
-    INTERVAL = "≈"  # our t interval meets the range that the printed number stands for
-    DIFFERS = "≠"
 
-
-def paper_tables(
-    experiment: Experiment, name: str, trials: Sequence[TrialResult] | None = None, metrics: Sequence[str] | None = None
-) -> list[Table]:
-    """The measured table in the paper's layout and the table of differences from the printed numbers."""
-    trials = list(experiment.trials if trials is None else trials)
-    arms, notes = _arms(name, trials)
-    trials = [trial for trial in trials if (trial.init, trial.densify) in arms]
-    if not trials:
-        needed = ", ".join(f"init={init} densify={densify}" for init, densify in arms)
-        raise InputError(f"experiment {experiment.name!r} has no trial for {name} ({needed}); use --layout plain")
-    scenes = load_paper().scenes(name)
-    scenes += sorted({trial.scene for trial in trials} - set(scenes))
-    columns = ("densify",) if name == "table1" else ("init", "densify")
-    measured = build_table(
-        experiment,
-        trials,
-        rows=("scene",),
-        columns=columns,
-        metrics=metrics or (TABLE1_QUANTITIES if name == "table1" else ("lpips_vgg_raw",)),
-        title=f"{name.replace('table', 'Table ')}, measured (experiment {experiment.name})",
-        order=([(scene,) for scene in scenes], [arm[-len(columns) :] for arm in arms]),
-        names=ARM_NAMES | INIT_NAMES | {init: INIT_NAMES[known] for init, known in STAND_FOR.items()},
-    )
-    return [measured, _differences(name, measured, arms, trials, notes)]
+def _read(name: str) -> Any:
+    return yaml.safe_load(files("gsbench.analysis").joinpath(name).read_text(encoding="utf-8"))
 
 
 def layout_of(name: str) -> str | None:
@@ -132,58 +137,54 @@ def layout_of(name: str) -> str | None:
     return table if table in PAPER_TABLES else None
 
 
-def agreement(cell: Cell, printed: Printed) -> Agreement:
-    """Class a measured cell against a printed number; a single trial has no interval."""
-    assert cell.mean is not None
-    if abs(cell.mean - printed.value) <= printed.half_step:
-        return Agreement.ROUNDING
-    if cell.std is not None:
-        half = t_half_width(cell.std, cell.count)
-        low, high = printed.range
-        if cell.mean - half <= high and cell.mean + half >= low:
-            return Agreement.INTERVAL
-    return Agreement.DIFFERS
+def paper_tables(
+    experiment: Experiment, name: str, trials: Sequence[TrialResult] | None = None, metrics: Sequence[str] | None = None
+) -> list[Table]:
+    """The measured table in the paper's layout and the table of differences from the printed numbers.
 
-
-def compare_with_printed(
-    cell: Cell | None, printed: Printed | None, shown: Quantity, tally: Counter[Agreement]
-) -> list[Entry]:
-    """The printed number, and how far the measured cell is from it; how they agree is added to ``tally``."""
-    if printed is None or cell is None or cell.mean is None:
-        return [Entry(printed.text if printed else ""), Entry("—")]
-    found = agreement(cell, printed)
-    tally[found] += 1
-    decimals = max(shown.decimals, len(printed.text.partition(".")[2]))
-    delta = signed(cell.mean - printed.value, f".{decimals}f")
-    return [Entry(printed.text), Entry(f"{delta} {found.value}", cell=cell)]
-
-
-def legend(tally: Counter[Agreement]) -> str:
-    """Explain the marks, with the number of cells that have each."""
-    return (
-        f"Δ is measured minus printed. Of {sum(tally.values())} cells {tally[Agreement.ROUNDING]} are within rounding "
-        f"(=), {tally[Agreement.INTERVAL]} within our {CONFIDENCE:.0%} t interval of the mean (≈), "
-        f"{tally[Agreement.DIFFERS]} differ (≠). The paper prints no deviation, so the spread of its own trials is not "
-        "taken into account; a single trial has no interval."
-    )
-
-
-def t_half_width(std: float, count: int) -> float:
-    """Half the width of Student's 95 % interval of a mean of ``count`` values."""
-    from scipy.special import stdtrit  # here, for a quick start of what needs no interval
-
-    return float(stdtrit(count - 1, 0.5 + CONFIDENCE / 2)) * std / math.sqrt(count)
-
-
-def _arms(name: str, trials: Sequence[TrialResult]) -> tuple[list[tuple[str, str]], list[str]]:
-    """The (init, densify) arms of a table; where DIM was not run and one other initialiser was, that one stands in."""
+    Where DIM was not run and one other initialiser was, that one stands in for it in Table 1.
+    """
+    paper, arms = load_paper(), ARMS[name]
+    trials = list(experiment.trials if trials is None else trials)
     inits = {trial.init for trial in trials}
-    arms = [(_run_as(init, inits), densify) for init, densify in (TABLE1_ARMS if name == "table1" else TABLE2_ARMS)]
-    if name == "table1" and arms[0][0] not in inits and len(inits) == 1:
-        other = inits.pop()
-        note = f"Initial clouds from {other} replace the paper's DIM: the columns do not repeat its experiment."
-        return [(other, densify) for _, densify in TABLE1_ARMS], [note]
-    return arms, []
+    run_as = {of_paper: _run_as(of_paper, inits) for of_paper, _ in arms}
+    notes = []
+    if name == "table1" and run_as["dim"] not in inits and len(inits) == 1:
+        (run_as["dim"],) = inits
+        notes = [
+            f"Initial clouds from {run_as['dim']} replace the paper's DIM: the columns do not repeat its experiment."
+        ]
+    shown = [(run_as[init], densify) for init, densify in arms]
+    trials = [trial for trial in trials if (trial.init, trial.densify) in shown]
+    if not trials:
+        needed = ", ".join(f"init={init} densify={densify}" for init, densify in shown)
+        raise InputError(f"experiment {experiment.name!r} has no trial for {name} ({needed}); use --layout plain")
+    scenes = paper.scenes(name)
+    scenes += sorted({trial.scene for trial in trials} - set(scenes))
+    columns = ("densify",) if name == "table1" else ("init", "densify")
+    metrics = metrics or QUANTITIES[name]
+    title = name.replace("table", "Table ")
+    measured = build_table(
+        experiment,
+        trials,
+        rows=("scene",),
+        columns=columns,
+        metrics=metrics,
+        title=f"{title}, measured (experiment {experiment.name})",
+        order=([(scene,) for scene in scenes], [arm[-len(columns) :] for arm in shown]),
+        names=NAMES | {own: NAMES[of_paper] for of_paper, own in run_as.items() if own in STAND_FOR},
+    )
+    of_paper = {own: init for init, own in run_as.items()}
+    keys = [one.key for one in choose_quantities(trials, metrics)]
+    compared = [key for key in keys if key in QUANTITIES[name]]
+    if left_out := [key for key in keys if key not in compared]:
+        notes.append(f"Not compared, since the paper prints no such number: {', '.join(left_out)}.")
+
+    def find(scene: str, arm: Arm, key: str) -> Printed | None:
+        return paper.tables[name].get((scene, of_paper[arm.init], arm.densify, key))
+
+    title = f"{title}, difference from the printed values"
+    return [measured, _differences(title, "paper", trials, scenes, compared, find, notes, paper.setup)]
 
 
 def _run_as(init: str, inits: set[str]) -> str:
@@ -192,40 +193,83 @@ def _run_as(init: str, inits: set[str]) -> str:
     return others[0] if others else init
 
 
+def published_table(trials: Sequence[TrialResult], name: str) -> Table:
+    """Table of our arms on the paper's scenes beside the printed numbers, with the differences.
+
+    Raises InputError where no trial is of a scene of the paper, or where a cell would mix what may not be averaged.
+    """
+    paper = load_published(name)
+    scenes = list(dict.fromkeys(scene for scene, _ in paper.printed))
+    own = [trial for trial in trials if trial.scene in scenes]
+    if not own:
+        raise InputError(f"{name} has the scenes {', '.join(scenes)}, and no trial here is of one of them")
+    method = f"The printed numbers are of densify={paper.densify}; other arms are shown for orientation."
+    notes = [f"{paper.title}.", f"Read from {paper.source}.", f"Conventions: {paper.conventions}.", method]
+
+    def find(scene: str, arm: Arm, key: str) -> Printed | None:
+        return paper.printed.get((scene, key))
+
+    return _differences(f"Difference from {name}", name, own, scenes, paper.quantities, find, notes, paper.setup)
+
+
 def _differences(
-    name: str, measured: Table, arms: Sequence[tuple[str, str]], trials: Sequence[TrialResult], notes: Sequence[str]
+    title: str,
+    paper: str,
+    trials: Sequence[TrialResult],
+    scenes: Sequence[str],
+    keys: Sequence[str],
+    find: Find,
+    notes: Sequence[str],
+    setup: Mapping[str, str],
 ) -> Table:
-    paper = load_paper()
-    printed_table = paper.table(name)
-    paper_arms = dict(zip(arms, TABLE1_ARMS if name == "table1" else TABLE2_ARMS, strict=True))
-    keys = list(dict.fromkeys(key for key, _ in measured.keys))
-    compared = [key for key in keys if any(printed[3] == key for printed in printed_table)]
-    quantities = {key: quantity(key, trials) for key in compared}
-    tally: Counter[Agreement] = Counter()
+    """A scene and an arm a row: what the ``paper`` printed, and how far the mean of the trials is from it."""
+    shown = [quantity(key, trials) for key in keys]
+    expected = len({trial.seed for trial in trials})
+    marks: Counter[str] = Counter()
     rows = []
-    for row in measured.rows:
-        scene = row.labels[0]
-        for place, arm in enumerate(arms):
-            entries = []
-            for key in compared:
-                cell = row.entries[keys.index(key) * len(arms) + place].cell
-                printed = printed_table.get((scene, *paper_arms[arm], key))
-                entries += compare_with_printed(cell, printed, quantities[key], tally)
-            if any(entry.cell is not None for entry in entries):
-                rows.append(Row((scene, _arm_name(name, paper_arms[arm])), tuple(entries)))
-    heads = tuple(Column(quantities[key].name, heading) for key in compared for heading in ("paper", "Δ"))
-    left_out = [key for key in keys if key not in compared]
-    if left_out:
-        notes = [*notes, f"Not compared, since the paper prints no such number: {', '.join(left_out)}."]
-    return Table(
-        f"{name.replace('table', 'Table ')}, difference from the printed values",
-        ("scene", "arm"),
-        heads,
-        tuple(rows),
-        (legend(tally), *notes, *setup_lines(paper.setup)),
-        tuple((key, heading) for key in compared for heading in ("paper", "delta")),
+    ordered = sorted(trials, key=lambda trial: scenes.index(trial.scene))
+    for (scene, arm), group in by_key(ordered, lambda trial: (trial.scene, trial.arm)).items():
+        check_averageable(group, f"scene={scene} init={arm.init} densify={arm.densify}")
+        entries: list[Entry] = []
+        for one in shown:
+            cell, printed = make_cell(group, one, [scene], expected), find(scene, arm, one.key)
+            entries += [Entry(printed.text if printed else ""), _difference(cell, printed, one, marks)]
+        rows.append(Row((scene, arm.init, str(replace(arm, init=""))), tuple(entries)))
+    columns = [
+        Column(one.name, *heads) for one in shown for heads in ((paper, (one.key, paper)), ("Δ", (one.key, "delta")))
+    ]
+    said = [f"The paper on {topic}: it {words}." for topic, words in setup.items()]
+    legend = (
+        f"Δ is measured minus printed. Of {marks.total()} cells {marks[ROUNDING]} are within rounding ({ROUNDING}), "
+        f"{marks[INTERVAL]} within our {CONFIDENCE:.0%} t interval of the mean ({INTERVAL}), {marks[DIFFERS]} differ "
+        f"({DIFFERS}). The paper prints no deviation, so the spread of its own trials is not taken into account; a "
+        "single trial has no interval."
     )
+    headings = ("scene", "init", "densify")
+    return Table(title, headings, tuple(columns), tuple(rows), (legend, *notes, *said))
 
 
-def _arm_name(name: str, arm: tuple[str, str]) -> str:
-    return ARM_NAMES[arm[1]] if name == "table1" else f"{INIT_NAMES[arm[0]]} + {ARM_NAMES[arm[1]]}"
+def _difference(cell: Cell, printed: Printed | None, shown: Quantity, marks: Counter[str]) -> Entry:
+    """How far a cell is from the printed number; its mark is counted."""
+    if printed is None or cell.mean is None:
+        return Entry("—")
+    mark = agreement(cell, printed)
+    marks[mark] += 1
+    decimals = max(shown.decimals, printed.decimals)
+    return Entry(f"{signed(cell.mean - printed.value, f'.{decimals}f')} {mark}", cell=cell)
+
+
+def agreement(cell: Cell, printed: Printed) -> str:
+    """The mark of a measured cell beside a printed number: its mean lies within half a step of the last digit, its
+    interval meets what the number stands for, or neither. A single trial has no interval.
+    """
+    from gsbench.analysis.statistics import StudentT  # here, for a quick start of what needs no interval
+
+    assert cell.mean is not None
+    low, high = printed.range
+    if low <= cell.mean <= high:
+        return ROUNDING
+    if cell.std is None:
+        return DIFFERS
+    own = StudentT(cell.mean, cell.std / math.sqrt(cell.count), cell.count - 1).interval(1 - CONFIDENCE)
+    return INTERVAL if own.low <= high and own.high >= low else DIFFERS

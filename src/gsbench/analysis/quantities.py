@@ -9,11 +9,13 @@ from __future__ import annotations
 from collections.abc import Callable, Container, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from statistics import fmean
 
-from gsbench.analysis.results import TrialResult
+from gsbench.analysis.results import TrialResult, by_key
 from gsbench.errors import InputError
 from gsbench.eval.facts import LPIPS, find, from_record, known_keys
 from gsbench.eval.protocol import PAPER, protocol_of
+from gsbench.words import signed
 
 MILLION, THOUSAND, MINUTE = 1e6, 1e3, 60.0
 
@@ -68,6 +70,37 @@ FIXED_UNITS = {"gaussians_millions": ("gaussians", "M", MILLION, 2), "train_minu
 ALIASES = {"num_gaussians": "gaussians", "seconds": "train_time", "train": "train_time"}
 TEXTURED = Quantity("error_textured", "error in textured parts (levels)", -1, 2, _textured)
 AT = "@"  # psnr@7000 is the PSNR at iteration 7000 (eval.at)
+
+
+@dataclass(frozen=True)
+class Change:
+    """The relative change of a cost over so many ``scenes``: as a ratio of totals, and as the mean of their ratios."""
+
+    of_totals: float
+    of_scenes: float
+    scenes: int
+
+    def __str__(self) -> str:
+        totals, ratios = signed(self.of_totals, ".1%"), signed(self.of_scenes, ".1%")
+        if self.scenes == 1:
+            return totals
+        return f"{totals} as a ratio of totals, {ratios} as the mean of {self.scenes} scenes"
+
+
+def relative_change(baseline: Iterable[TrialResult], other: Iterable[TrialResult], read: Reader) -> Change | None:
+    """The change of a cost over the scenes on which both have a value above 0; None without one."""
+    one, two = (_means(own, read) for own in (baseline, other))
+    scenes = sorted(one.keys() & two.keys())
+    if not scenes:
+        return None
+    totals = sum(two[scene] for scene in scenes) / sum(one[scene] for scene in scenes)
+    return Change(totals - 1, fmean(two[scene] / one[scene] for scene in scenes) - 1, len(scenes))
+
+
+def _means(trials: Iterable[TrialResult], read: Reader) -> dict[str, float]:
+    """The mean of a cost by scene."""
+    known = by_key([trial for trial in trials if read(trial)], lambda trial: trial.scene)
+    return {scene: fmean(read(trial) or 0.0 for trial in own) for scene, own in known.items()}
 
 
 def choose_quantities(trials: Iterable[TrialResult], names: Iterable[str] | None = None) -> list[Quantity]:

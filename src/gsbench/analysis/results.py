@@ -253,6 +253,12 @@ def by_key(trials: Iterable[T], key: Callable[[T], K]) -> dict[K, list[T]]:
     return groups
 
 
+def seeds_words(trials: Iterable[TrialResult]) -> str:
+    """``seed 0`` or ``seeds 0, 1``"""
+    seeds = sorted(trial.seed for trial in trials)
+    return f"{'seed' if len(seeds) == 1 else 'seeds'} {', '.join(map(str, seeds))}"
+
+
 def load_experiment(runs_dir: Path, name: str) -> Experiment:
     """Read every trial of the experiment ``name``; raises ``InputError`` where there is no usable one."""
     experiment = read_experiment(experiment_home(runs_dir, name))

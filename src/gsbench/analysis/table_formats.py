@@ -1,26 +1,87 @@
-"""Writing a table as Markdown, CSV, LaTeX (booktabs) or HTML."""
+"""A table as plain data, and its forms: Markdown, CSV, LaTeX (booktabs) and HTML."""
 
 from __future__ import annotations
 
-import html
 import itertools
 import re
 from collections.abc import Callable
-from importlib.resources import files
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
 
-from gsbench.analysis.tables import Column, Entry, Table
+from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
+
+from gsbench.analysis.cells import Cell
+
+TEMPLATES = "gsbench.analysis.report"
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One cell as shown: ``text`` without markup, and the numbers behind it."""
+
+    text: str
+    bold: bool = False
+    cell: Cell | None = None
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column's group (the quantity, shared by neighbours) and its own heading; ``key``: both for machines."""
+
+    group: str
+    heading: str
+    key: tuple[str, str]
+
+
+@dataclass(frozen=True)
+class Row:
+    labels: tuple[str, ...]
+    entries: tuple[Entry, ...]
+    rule_above: bool = False
+
+
+@dataclass(frozen=True)
+class Table:
+    """A titled table with notes below it; cells of a ``wrapped`` one hold text that may need several lines."""
+
+    title: str
+    row_headings: tuple[str, ...]
+    columns: tuple[Column, ...]
+    rows: tuple[Row, ...]
+    notes: tuple[str, ...] = ()
+    wrapped: bool = False
+
+    @property
+    def groups(self) -> list[tuple[str, int]]:
+        """Neighbouring columns of one group, as (name, number of columns)."""
+        groups = itertools.groupby(self.columns, key=lambda column: column.group)
+        return [(name, len(list(group))) for name, group in groups]
+
+
+def fill(template: str, package: str = TEMPLATES, **values: Any) -> str:
+    """The page that a jinja2 template of ``package`` (or of the report) makes of ``values``, which are escaped."""
+    return _environment(package).get_template(template).render(**values)
+
+
+@cache
+def _environment(package: str) -> Environment:
+    loader = ChoiceLoader([PackageLoader(package, ""), PackageLoader(TEMPLATES, "")])
+    return Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
 
 
 def to_markdown(table: Table) -> str:
     """A GitHub-flavoured Markdown table under its title, with notes as a list."""
-    heads = [*table.row_headings, *(_flat_heading(column) for column in table.columns)]
-    lines = [f"### {table.title}", "", _markdown_row(heads)]
-    lines.append(_markdown_row([":---"] * len(table.row_headings) + ["---:"] * len(table.columns)))
-    for row in table.rows:
-        cells = [f"**{_pipe(e.text)}**" if e.bold else _pipe(e.text) for e in row.entries]
-        lines.append(_markdown_row([*map(_pipe, row.labels), *cells]))
+    heads = [*table.row_headings, *(f"{column.group} {column.heading}".strip() for column in table.columns)]
+    rule = [":---"] * len(table.row_headings) + ["---:"] * len(table.columns)
+    rows = [[*row.labels, *(f"**{e.text}**" if e.bold else e.text for e in row.entries)] for row in table.rows]
+    lines = [f"### {table.title}", "", *map(_markdown_row, [heads, rule, *rows])]
     lines += ["", *(f"- {note}" for note in table.notes)]
     return "\n".join(lines).rstrip() + "\n"
+
+
+def _markdown_row(cells: list[str]) -> str:
+    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
 
 
 def to_csv(table: Table) -> str:
@@ -29,11 +90,19 @@ def to_csv(table: Table) -> str:
 
     heads = [*table.row_headings, "quantity", "column", "mean", "std", "count", "expected", "best", "text", "trials"]
     cells = [
-        [*row.labels, quantity, arm, *_numbers(entry), int(entry.bold), entry.text, _trials(entry)]
+        [*row.labels, *column.key, *_numbers(entry.cell), int(entry.bold), entry.text, _trials(entry.cell)]
         for row in table.rows
-        for (quantity, arm), entry in zip(table.keys, row.entries, strict=True)
+        for column, entry in zip(table.columns, row.entries, strict=True)
     ]
     return str(pd.DataFrame(cells, columns=heads, dtype=object).to_csv(index=False, lineterminator="\n"))
+
+
+def _numbers(cell: Cell | None) -> list[object]:
+    return [None] * 4 if cell is None else [cell.mean, cell.std, cell.count, cell.expected]
+
+
+def _trials(cell: Cell | None) -> str:
+    return "" if cell is None else " ".join(trial.label for trial in cell.trials)
 
 
 def to_latex(table: Table) -> str:
@@ -47,7 +116,7 @@ def to_latex(table: Table) -> str:
     heads = [("", name) for name in table.row_headings] + [(one.group, one.heading) for one in table.columns]
     heads = [(escape_latex(group), escape_latex(name)) for group, name in heads]
     grouped = any(group for group, _ in heads)
-    rows = [[*map(escape_latex, row.labels), *(_latex_text(entry) for entry in row.entries)] for row in table.rows]
+    rows = [[*map(escape_latex, row.labels), *map(_latex_text, row.entries)] for row in table.rows]
     frame = pd.DataFrame(rows, columns=pd.MultiIndex.from_tuples(heads) if grouped else [name for _, name in heads])
     text = frame.to_latex(
         index=False,
@@ -63,39 +132,9 @@ def to_latex(table: Table) -> str:
     return f"% needs \\usepackage{{booktabs{',array' if table.wrapped else ''}}}\n{text}"
 
 
-def to_html(table: Table) -> str:
-    """A ``<figure>`` with the table, its caption and notes; no styles of its own."""
-    kind = "table wrapped" if table.wrapped else "table"
-    parts = [f'<figure class="{kind}"><table>\n<caption>{html.escape(table.title)}</caption>\n<thead>\n']
-    groups = _column_groups(table)
-    grouped = any(name for name, _ in groups)
-    if grouped:
-        heads = "".join(f'<th scope="colgroup" colspan="{size}">{html.escape(name)}</th>' for name, size in groups)
-        span = f'<td colspan="{len(table.row_headings)}"></td>'
-        parts.append(f"<tr>{span}{heads}</tr>\n")
-    labels = "".join(f'<th class="name" scope="col">{html.escape(name)}</th>' for name in table.row_headings)
-    heads = "".join(f'<th scope="col">{html.escape(column.heading)}</th>' for column in table.columns)
-    parts.append(f"<tr>{labels}{heads}</tr>\n</thead>\n<tbody>\n")
-    for row in table.rows:
-        labels = "".join(f'<th scope="row">{html.escape(label)}</th>' for label in row.labels)
-        cells = "".join(f"<td>{_html_text(entry)}</td>" for entry in row.entries)
-        rule = ' class="rule"' if row.rule_above else ""
-        parts.append(f"<tr{rule}>{labels}{cells}</tr>\n")
-    parts.append("</tbody>\n</table>\n")
-    if table.notes:
-        notes = "".join(f"<li>{html.escape(note)}</li>" for note in table.notes)
-        parts.append(f"<figcaption><ul>{notes}</ul></figcaption>\n")
-    return "".join(parts) + "</figure>\n"
-
-
 def to_html_page(table: Table) -> str:
     """The table as a page of its own, in the style of reports."""
-    style = files("gsbench.analysis.report").joinpath("style.css").read_text(encoding="utf-8")
-    return (
-        f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>{html.escape(table.title)}</title>\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<style>{style}</style></head>\n<body><main>\n{to_html(table)}</main></body></html>\n"
-    )
+    return fill("table_page.html.j2", table=table)
 
 
 FORMATS: dict[str, tuple[str, Callable[[Table], str]]] = {  # name -> file suffix, writer
@@ -123,39 +162,6 @@ def escape_latex(text: str) -> str:
     return escaped.encode("latin-1", "replace").decode("latin-1")
 
 
-def _column_groups(table: Table) -> list[tuple[str, int]]:
-    """Neighbouring columns of one group, as (name, number of columns)."""
-    return [
-        (name, len(list(group))) for name, group in itertools.groupby(table.columns, key=lambda column: column.group)
-    ]
-
-
-def _flat_heading(column: Column) -> str:
-    return f"{column.group} {column.heading}".strip()
-
-
-def _markdown_row(cells: list[str]) -> str:
-    return "| " + " | ".join(cells) + " |"
-
-
-def _pipe(text: str) -> str:
-    return text.replace("|", "\\|")
-
-
 def _latex_text(entry: Entry) -> str:
     text = escape_latex(entry.text)
     return f"\\textbf{{{text}}}" if entry.bold else text
-
-
-def _html_text(entry: Entry) -> str:
-    text = html.escape(entry.text)
-    return f"<strong>{text}</strong>" if entry.bold else text
-
-
-def _numbers(entry: Entry) -> list[object]:
-    cell = entry.cell
-    return [None] * 4 if cell is None else [cell.mean, cell.std, cell.count, cell.expected]
-
-
-def _trials(entry: Entry) -> str:
-    return " ".join(trial.label for trial in entry.cell.trials) if entry.cell else ""

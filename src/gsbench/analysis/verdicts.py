@@ -71,34 +71,36 @@ def judge_pairs(
     primary = None if declared is None else asked_quantity(declared.metric, trials)
     asked: list[tuple[Pair, Quantity]] = []
     for pair in pairs:
-        own = [trial for arm in pair for trial in by_arm.get(arm, [])]
-        shown = [one for one in choose_quantities(own) if not one.cost and one.direction != 0]
+        shown = [one for one in choose_quantities(_own(by_arm, pair)) if not one.cost]
         if primary is not None:
             shown = [primary, *(one for one in shown if one.key != primary.key)]
         asked += [(pair, one) for one in shown if one.direction]
     questions = [_question(by_arm, pair, one, declared) for pair, one in asked]
-    answers = judge(trials, _declaration(questions, declared))
+    answers = by_key(
+        zip(asked, judge(trials, _declaration(questions, declared)), strict=True), lambda answered: answered[0][0]
+    )
+    alone = declared is not None and declared.beforehand
     judged = []
     for pair in pairs:
         found, notes, missing = [], list[str](), ""
-        for (arms, one), answer in zip(asked, answers, strict=True):
-            if arms != pair:
-                continue
+        for (_, one), answer in answers.get(pair, []):
             if answer.pairs.rows:
                 found.append(answer)
                 notes += [f"{one.name}: {line}" for line in answer.notes]
                 continue
-            own = [trial for arm in pair for trial in by_arm.get(arm, [])]
-            reasons = [in_brief(trial.unavailable[one.key]) for trial in own if one.key in trial.unavailable]
+            reasons = [in_brief(t.unavailable[one.key]) for t in _own(by_arm, pair) if one.key in t.unavailable]
             reason = (*reasons, *answer.notes, f"no trials of {pair[0]} and {pair[1]} can be paired")[0]
             notes.append(f"{one.name}: {reason}")
-            missing = reason if primary is not None and one.key == primary.key else missing
+            missing = reason if one == primary else missing
         if primary is not None and not primary.direction:
             missing = "nobody said whether more or less of it is better"
             notes.append(f"{primary.name}: {missing}")
-        alone = declared is not None and declared.beforehand
         judged.append(PairVerdicts(*pair, tuple(found), tuple(notes), primary, alone, missing))
     return judged
+
+
+def _own(by_arm: Mapping[Arm, Sequence[TrialResult]], pair: Pair) -> list[TrialResult]:
+    return [trial for arm in pair for trial in by_arm.get(arm, [])]
 
 
 def _question(
@@ -204,9 +206,11 @@ def by_scene_lines(verdicts: Sequence[Verdict]) -> list[str]:
     lines = []
     for one in verdicts:
         decided = [scene for scene in one.scenes if scene.p is not None and scene.p < ALPHA]
-        better = [scene.scene for scene in decided if scene.mean * one.question.sign > 0]
-        worse = [scene.scene for scene in decided if scene.mean * one.question.sign < 0]
-        found = [f"{word} on {', '.join(names)}" for word, names in (("better", better), ("worse", worse)) if names]
+        sides = {
+            word: [scene.scene for scene in decided if scene.mean * one.question.sign * side > 0]
+            for word, side in (("better", 1), ("worse", -1))
+        }
+        found = [f"{word} on {', '.join(scenes)}" for word, scenes in sides.items() if scenes]
         if len(one.scenes) > 1 and found:
             warning = ": the scenes disagree, so their mean says little" if len(found) > 1 else ""
             lines.append(f"{one.quantity.name} by scene: {', '.join(found)}{warning}")
@@ -230,13 +234,9 @@ def declared_lines(declared: ActiveDeclaration, judged: Sequence[PairVerdicts]) 
 
 def families(judged: Sequence[PairVerdicts]) -> list[str]:
     """Lines that say how many tests each family had, and how it was adjusted."""
-    sizes: dict[str, int] = {}
-    looks = False
-    for one in judged:
-        for verdict in one.verdicts:
-            role = one.role(verdict)
-            sizes[role] = max(sizes.get(role, 0), verdict.family)
-            looks |= bool(verdict.question.seeds)
+    every = [(one.role(verdict), verdict) for one in judged for verdict in one.verdicts]
+    sizes = {role: max(own.family for which, own in every if which == role) for role, _ in every}
+    looks = any(verdict.question.seeds for _, verdict in every)
     lines = []
     if DECLARED in sizes:
         how = (

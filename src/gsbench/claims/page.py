@@ -4,19 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib.resources import files
 from typing import get_args
 
-from jinja2 import Environment, StrictUndefined
-
 from gsbench.analysis.cells import with_variants
-from gsbench.analysis.fairness import fairness_table
-from gsbench.analysis.notes import caveats, cloud_notes, machine_notes
+from gsbench.analysis.fairness import caveats, fairness_table
+from gsbench.analysis.notes import cloud_notes, machine_notes
 from gsbench.analysis.report.charts import ForestRow, forest_plot
-from gsbench.analysis.results import TrialResult, by_key
+from gsbench.analysis.results import TrialResult, by_key, seeds_words
 from gsbench.analysis.statistics import Outcome, plan_looks
-from gsbench.analysis.table_formats import to_html as table_to_html
-from gsbench.analysis.tables import Table
+from gsbench.analysis.table_formats import Table, fill
 from gsbench.analysis.verdicts import like_these_words, outlying_words
 from gsbench.claims.check import NOT_TESTABLE, ClaimVerdict
 from gsbench.claims.file import ClaimsFile
@@ -36,9 +32,9 @@ class Section:
     verdict: ClaimVerdict
     headline: str
     evidence: tuple[str, ...]
-    scenes: tuple[tuple[str, str], ...]
     fairness: tuple[Table, ...]  # one for each two arms that are paired: scenes may differ in the initialiser
     trials: tuple[tuple[str, str], ...]  # folder without the seed, and its seeds
+    chart: str
 
 
 @dataclass(frozen=True)
@@ -89,13 +85,7 @@ def to_text(page: Page) -> str:
 
 def to_html(page: Page) -> str:
     """The page as one HTML file, with charts and pictures in it; needs no network and no other file."""
-    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    template = environment.from_string(_resource("gsbench.claims", "page.html.j2"))
-    shown = [
-        (section, tuple(map(table_to_html, section.fairness)), _chart(section.verdict)) for section in page.sections
-    ]
-    style = _resource("gsbench.analysis.report", "style.css")
-    return template.render(page=page, sections=shown, symbols=SYMBOLS, style=style)
+    return fill("page.html.j2", "gsbench.claims", page=page, symbols=SYMBOLS)
 
 
 def _section(one: ClaimVerdict) -> Section:
@@ -120,9 +110,9 @@ def _section(one: ClaimVerdict) -> Section:
         one,
         headline,
         tuple(filter(None, evidence)),
-        tuple((scene.scene, verdict.shown(scene.mean)) for scene in verdict.scenes),
         fairness,
         _folders(verdict.pairs.trials),
+        _chart(one),
     )
 
 
@@ -155,8 +145,8 @@ def _late_words(one: ClaimVerdict) -> str:
 
 def _fairness(one: ClaimVerdict) -> tuple[tuple[Table, ...], str]:
     """The fairness sheets of a claim's arms, and what else than the idea may have made a difference (`caveats`)."""
-    trials = with_variants(one.verdict.pairs.trials)
-    both = dict.fromkeys((before.arm, after.arm) for before, after in _pairs(trials))
+    trials = with_variants(one.verdict.pairs.trials)  # baseline and arm in turn
+    both = dict.fromkeys((before.arm, after.arm) for before, after in zip(trials[::2], trials[1::2], strict=True))
     arms = [(before, after) for before, after in both if before != after]
     sentences = dict.fromkeys(caveats(trials, *two) for two in arms)
     return tuple(fairness_table(trials, *two) for two in arms), " ".join(filter(None, sentences))
@@ -174,31 +164,19 @@ def _chart(one: ClaimVerdict) -> str:
     verdict, answer = one.verdict, one.verdict.answer
     if answer is None or answer.interval is None:
         return ""
-    rows = [ForestRow(scene.scene, scene.mean, None, None) for scene in verdict.scenes]
-    rows.append(ForestRow("all", answer.mean, answer.interval.low, answer.interval.high))
+    rows = [ForestRow(scene.scene, scene.mean) for scene in verdict.scenes]
+    rows.append(ForestRow("all", answer.mean, answer.interval))
     unit = "log ratio" if one.claim.effect.relative else "difference"
     title = f"{one.claim.arm} against {one.claim.baseline}"
     return forest_plot(title, rows, f"{verdict.quantity.name}, {unit}", one.claim.sign)
 
 
-def _pairs(trials: Sequence[TrialResult]) -> list[tuple[TrialResult, TrialResult]]:
-    """Pairs of a verdict's trials, which stand baseline and arm in turn."""
-    return list(zip(trials[::2], trials[1::2], strict=True))
-
-
 def _folders(trials: Sequence[TrialResult]) -> tuple[tuple[str, str], ...]:
     """``("exp/garden/sfm-adc/1a2b3c4d", "seeds 0, 1, 2")`` for each arm of a scene."""
     groups = by_key(trials, lambda trial: trial.label.rpartition(SEED)[0])
-    return tuple(
-        (folder, f"{'seeds' if len(own) > 1 else 'seed'} {', '.join(str(trial.seed) for trial in own)}")
-        for folder, own in groups.items()
-    )
+    return tuple((folder, seeds_words(own)) for folder, own in groups.items())
 
 
 def _number(value: float) -> str:
     """Four digits, and none of powers of ten in large counts."""
     return f"{value:,.0f}" if abs(value) >= LARGE else f"{value:.4g}"
-
-
-def _resource(package: str, name: str) -> str:
-    return files(package).joinpath(name).read_text(encoding="utf-8")

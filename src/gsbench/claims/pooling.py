@@ -15,13 +15,12 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-from scipy import special
 
 from gsbench.analysis.cells import select_trials, with_variants
 from gsbench.analysis.fairness import budget_words
 from gsbench.analysis.pairing import Pairs, pair
-from gsbench.analysis.results import Arm, TrialResult
-from gsbench.analysis.statistics import ALPHA, Interval, student
+from gsbench.analysis.results import Arm, TrialResult, by_key
+from gsbench.analysis.statistics import Interval, StudentT, student
 from gsbench.claims.archive import unpack_archive
 from gsbench.errors import InputError
 from gsbench.runs.declaration import Question
@@ -47,18 +46,23 @@ class Study:
 
 @dataclass(frozen=True)
 class Pooled:
-    """``mean`` and what goes with it are None where ``refusal`` says why there is no mean.
-
-    ``deviation`` is that of the studies' effects; ``prediction`` is where the effect of a further study would lie.
-    """
+    """Studies with the ``test`` of their mean, None where ``refusal`` says why there is none."""
 
     studies: tuple[Study, ...]
     refusal: str = ""
-    mean: float | None = None
-    interval: Interval | None = None
-    p: float | None = None
-    deviation: float | None = None
-    prediction: Interval | None = None
+    test: StudentT | None = None
+
+    @property
+    def deviation(self) -> float:
+        """The deviation of the studies' effects."""
+        return float(np.std([study.effect for study in self.studies], ddof=1))
+
+    @property
+    def prediction(self) -> Interval:
+        """The interval in which the effect of a further study would lie."""
+        assert self.test is not None
+        reach = self.deviation * math.sqrt(1 + 1 / len(self.studies))
+        return replace(self.test, error=reach).interval()
 
 
 def pool(studies: Sequence[Study]) -> Pooled:
@@ -66,28 +70,30 @@ def pool(studies: Sequence[Study]) -> Pooled:
 
     Raises InputError for a study that stands twice.
     """
-    _check(studies)
-    refusal = _refusal(studies)
-    effects = np.array([study.effect for study in studies])  # [k]
-    test = None if refusal else student(effects[:, None])
-    if test is None:
-        return Pooled(tuple(studies), refusal)
-    deviation, count = float(effects.std(ddof=1)), len(studies)
-    reach = float(special.stdtrit(count - 1, 1 - ALPHA / 2)) * deviation * math.sqrt(1 + 1 / count)
-    prediction = Interval(test.mean - reach, test.mean + reach)
-    return Pooled(tuple(studies), "", test.mean, test.interval(), test.p, deviation, prediction)
+    names = [study.name for study in studies]
+    if twice := sorted({name for name in names if names.count(name) > 1}):
+        raise InputError(f"{twice[0]} is given twice: results that are counted twice look surer than they are")
+    refusal = ""
+    if len(studies) < MIN_STUDIES:
+        refusal = f"a mean needs {MIN_STUDIES} studies, and there are {len(studies)}"
+    elif len({study.protocol for study in studies}) > 1:
+        shown = "; ".join(f"{study.name}: {study.protocol or 'unknown'}" for study in studies)
+        refusal = f"the studies differ in protocol ({shown})"
+    effects = np.array([[study.effect] for study in studies])  # [k, 1]
+    return Pooled(tuple(studies), refusal, None if refusal else student(effects))
 
 
 def describe(pooled: Pooled) -> list[str]:
     """The result in sentences."""
-    if pooled.mean is None or pooled.interval is None or pooled.prediction is None:
+    test = pooled.test
+    if test is None:
         return [f"no mean: {pooled.refusal}"]
+    interval, further = test.interval(), pooled.prediction
     lines = [
-        f"mean {pooled.mean:+.4g} (95 % interval {pooled.interval.low:+.4g} to {pooled.interval.high:+.4g}, p "
-        f"{pooled.p:.3g}) "
+        f"mean {test.mean:+.4g} (95 % interval {interval.low:+.4g} to {interval.high:+.4g}, p {test.p:.3g}) "
         f"of {len(pooled.studies)} studies, each with the same weight",
         f"studies differ by a deviation of {pooled.deviation:.3g}; a further one would lie between "
-        f"{pooled.prediction.low:+.4g} and {pooled.prediction.high:+.4g}",
+        f"{further.low:+.4g} and {further.high:+.4g}",
     ]
     if len({study.budget for study in pooled.studies}) > 1:
         budgets = "; ".join(f"{study.name}: {study.budget or 'not known'}" for study in pooled.studies)
@@ -96,22 +102,6 @@ def describe(pooled: Pooled) -> list[str]:
             "questions, and this mean answers neither"
         )
     return lines
-
-
-def _check(studies: Sequence[Study]) -> None:
-    names = [study.name for study in studies]
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
-        raise InputError(f"{twice[0]} is given twice: results that are counted twice look surer than they are")
-
-
-def _refusal(studies: Sequence[Study]) -> str:
-    if len(studies) < MIN_STUDIES:
-        return f"a mean needs {MIN_STUDIES} studies, and there are {len(studies)}"
-    if len({study.protocol for study in studies}) > 1:
-        shown = "; ".join(f"{study.name}: {study.protocol or 'unknown'}" for study in studies)
-        return f"the studies differ in protocol ({shown})"
-    return ""
 
 
 @dataclass(frozen=True)
@@ -141,16 +131,15 @@ def read_studies(path: Path, wanted: Wanted, name: str) -> Found:
 
     Raises InputError, one line, where there is none.
     """
+    studies, notes = [], list[str]()
     with tempfile.TemporaryDirectory() as folder:
         every = unpack_archive(path, Path(folder)).trials
         trials = with_variants(select_trials(every, wanted.where))
-        studies, notes = [], []
-        protocols = sorted({trial.record.protocol for trial in trials})
-        for protocol in protocols:
-            own = [trial for trial in trials if trial.record.protocol == protocol]
+        by_protocol = sorted(by_key(trials, lambda trial: trial.record.protocol).items())
+        for protocol, own in by_protocol:
             groups = _groups(own, _pairs(own, wanted, path))
             for pairs in groups:
-                told_apart = [protocol] * (len(protocols) > 1) + [pairs[0][0].init] * (len(groups) > 1)
+                told_apart = [protocol] * (len(by_protocol) > 1) + [pairs[0][0].init] * (len(groups) > 1)
                 label = f"{name} ({', '.join(told_apart)})" if told_apart else name
                 found = [
                     pair(own, Question(metric=wanted.metric, baseline=first, arm=second)) for first, second in pairs

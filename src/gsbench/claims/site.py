@@ -11,38 +11,22 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from importlib.resources import files
-from itertools import groupby
 from pathlib import Path
-
-from jinja2 import Environment, StrictUndefined
-from PIL import Image
 
 from gsbench.analysis.cells import swept_settings
 from gsbench.analysis.declaration import standing
-from gsbench.analysis.images import read_image
 from gsbench.analysis.judgement import Verdict, judge
 from gsbench.analysis.notes import compared_pairs
 from gsbench.analysis.report.build import build_report
 from gsbench.analysis.results import Experiment
-from gsbench.analysis.table_formats import to_html
-from gsbench.analysis.tables import Table, build_table
+from gsbench.analysis.table_formats import Table, fill
+from gsbench.analysis.tables import build_table
 from gsbench.analysis.verdicts import headline, judge_pairs
 from gsbench.claims.archive import unpack_archive
 from gsbench.errors import InputError
 from gsbench.runs.declaration import read_declarations, standing_one
-from gsbench.runs.layout import RENDERS
 
-INDEX, REPORTS, PICTURES = "index.html", "reports", "pictures"
-WIDTH = 480  # px of a picture, at most
-QUALITY = 85  # of its JPEG
-
-
-@dataclass(frozen=True)
-class Picture:
-    """The first test view of a trial, as a file of the site."""
-
-    file: str
-    caption: str
+INDEX, REPORTS = "index.html", "reports"
 
 
 @dataclass(frozen=True)
@@ -54,8 +38,7 @@ class Part:
     facts: tuple[tuple[str, str], ...]
     claims: tuple[Verdict, ...]  # declared ones, with their verdicts
     lines: tuple[str, ...]  # verdicts on every two arms that are compared
-    tables: tuple[tuple[str, str], ...]  # quantity, and its arms × scenes as HTML
-    pictures: tuple[Picture, ...]
+    tables: tuple[Table, ...]  # of arms × scenes, one for each quantity
     notes: tuple[str, ...] = ()
 
 
@@ -71,7 +54,7 @@ def write_site(archives: Sequence[Path], out: Path, title: str, scratch: Path) -
         try:
             experiment = unpack_archive(archive, scratch / str(number))
             key = _key(experiment.name, {part.key for part in parts})
-            report, part = build_report(experiment), _part(experiment, key, out)
+            report, part = build_report(experiment), _part(experiment, key)
         except InputError as error:
             left_out.append(str(error))
             continue
@@ -79,24 +62,18 @@ def write_site(archives: Sequence[Path], out: Path, title: str, scratch: Path) -
         parts.append(part)
     if not parts:
         raise InputError(f"no archive can be shown ({left_out[0]})")
-    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    script = _resource("gsbench.claims", "site.js")
-    page = environment.from_string(_resource("gsbench.claims", "site.html.j2")).render(
-        title=title,
-        parts=parts,
-        left_out=left_out,
-        style=_resource("gsbench.analysis.report", "style.css"),
-        script=script,
-        script_hash=base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
-    )
+    script = files("gsbench.claims").joinpath("site.js").read_text(encoding="utf-8")
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    values = {"title": title, "parts": parts, "left_out": left_out, "script": script, "script_hash": digest}
+    page = fill("site.html.j2", "gsbench.claims", **values)
     (out / INDEX).write_text(page, encoding="utf-8")
     return left_out
 
 
-def _part(experiment: Experiment, key: str, out: Path) -> Part:
+def _part(experiment: Experiment, key: str) -> Part:
     trials, notes = experiment.trials, list[str]()
     claims: tuple[Verdict, ...] = ()
-    tables: tuple[tuple[str, str], ...] = ()
+    tables: tuple[Table, ...] = ()
     try:
         claims = _claims(experiment)
     except InputError as error:
@@ -118,8 +95,7 @@ def _part(experiment: Experiment, key: str, out: Path) -> Part:
         "gsbench": ", ".join(sorted({trial.record.versions.get("gsbench", "unknown") for trial in trials})),
     }
     lines = tuple(headline(own) for own in judged)
-    pictures = tuple(_pictures(experiment, key, out))
-    return Part(experiment.name, key, tuple(facts.items()), claims, lines, tables, pictures, tuple(notes))
+    return Part(experiment.name, key, tuple(facts.items()), claims, lines, tables, tuple(notes))
 
 
 def _claims(experiment: Experiment) -> tuple[Verdict, ...]:
@@ -131,33 +107,18 @@ def _claims(experiment: Experiment) -> tuple[Verdict, ...]:
     return tuple(verdict for verdict in judged if not verdict.question.versions)
 
 
-def _by_quantity(table: Table) -> Iterator[tuple[str, str]]:
+def _by_quantity(table: Table) -> Iterator[Table]:
     """A table of arms × scenes for each quantity of one that has all."""
-    for name, places in groupby(range(len(table.columns)), key=lambda place: table.columns[place].group):
-        first, *rest = places
-        kept = slice(first, first + 1 + len(rest))
+    end = 0
+    for name, size in table.groups:
+        kept = slice(end, end + size)
+        end += size
         columns = tuple(replace(column, group="") for column in table.columns[kept])
         rows = tuple(replace(row, entries=row.entries[kept], rule_above=False) for row in table.rows)
-        yield name, to_html(replace(table, title=name, columns=columns, rows=rows, notes=()))
-
-
-def _pictures(experiment: Experiment, key: str, out: Path) -> Iterator[Picture]:
-    """The first view of each trial whose archive has pictures, written anew: what a stranger sent is not passed on."""
-    for number, trial in enumerate(experiment.trials):
-        for path in trial.folder.pictures(RENDERS)[:1]:
-            image = Image.fromarray(read_image(path))
-            image.thumbnail((WIDTH, WIDTH))
-            file = f"{PICTURES}/{key}-{number}.jpg"
-            (out / PICTURES).mkdir(exist_ok=True)
-            image.save(out / file, quality=QUALITY)
-            yield Picture(file, f"{trial.scene}, {trial.arm}, seed {trial.seed}: {path.stem}")
+        yield replace(table, title=name, columns=columns, rows=rows, notes=())
 
 
 def _key(name: str, taken: set[str]) -> str:
     """A name of a file that no other archive has, also where capitals are no difference."""
     plain = re.sub(r"[^a-z0-9_-]+", "-", name.lower()).strip("-") or "experiment"
     return next(key for n in range(1, len(taken) + 2) if (key := plain if n == 1 else f"{plain}-{n}") not in taken)
-
-
-def _resource(package: str, name: str) -> str:
-    return files(package).joinpath(name).read_text(encoding="utf-8")

@@ -20,7 +20,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
     parser = ArgumentParser(
         prog="gsbench site",
         description="Write a static site from archives (gsbench export --results); it needs no server. It has sortable "
-        "tables of arms and scenes, all verdicts, pictures if an archive has them, and the report of each.",
+        "tables of arms and scenes, all verdicts, and the report of each, with pictures if the archive has them.",
     )
     parser.add_argument("archives", nargs="+", type=path, metavar="ARCHIVE")
     parser.add_argument("--out", type=path, required=True, metavar="DIR", help="the folder to write into")

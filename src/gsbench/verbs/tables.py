@@ -8,12 +8,10 @@ import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from gsbench.analysis.cells import select_trials, with_variants
+from gsbench.analysis.cells import select_trials, to_frame, with_variants
 from gsbench.analysis.fairness import fairness_table
-from gsbench.analysis.frame import to_frame
 from gsbench.analysis.notes import compared_pairs
-from gsbench.analysis.paper import PAPER_TABLES, layout_of, load_paper, paper_tables
-from gsbench.analysis.published import published_names, published_table
+from gsbench.analysis.paper import PAPER_TABLES, layout_of, load_paper, paper_tables, published_names, published_table
 from gsbench.analysis.results import Arm, Experiment, TrialResult, load_experiment
 from gsbench.analysis.table_formats import FORMATS
 from gsbench.analysis.tables import DEFAULT_ROWS, build_table

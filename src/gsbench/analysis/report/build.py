@@ -4,39 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from importlib.resources import files
 
-from jinja2 import Environment, StrictUndefined
-
+from gsbench.analysis import verdicts
 from gsbench.analysis.cells import with_variants
 from gsbench.analysis.declaration import standing
-from gsbench.analysis.images import read_image
+from gsbench.analysis.images import png_uri, read_image
 from gsbench.analysis.pairing import BASELINE, choose_pairs, controls_of
 from gsbench.analysis.paper import layout_of, load_paper, paper_tables
-from gsbench.analysis.report.pictures import data_uri
 from gsbench.analysis.report.sections import (
     compare_arms,
     event_charts,
+    event_table,
     provenance,
     search_part,
     training_charts,
     volume_charts,
 )
 from gsbench.analysis.results import Experiment, TrialResult, by_key
-from gsbench.analysis.table_formats import to_html
-from gsbench.analysis.tables import Table, build_table
-from gsbench.analysis.verdicts import (
-    SYMBOLS,
-    VERDICT,
-    WORDS,
-    by_scene_lines,
-    detail_lines,
-    families,
-    headline,
-    judge_pairs,
-    secondary,
-    seeds_to_resolve,
-)
+from gsbench.analysis.table_formats import Table, fill
+from gsbench.analysis.tables import build_table
 from gsbench.runs.layout import FIGURES
 from gsbench.words import signed
 
@@ -49,51 +35,40 @@ def build_report(experiment: Experiment, baseline: str = BASELINE) -> str:
     search = search_part(experiment.folder)
     # Among points of a search, which were chosen by results, no test holds.
     pairs = [] if search else choose_pairs(arms, baseline, controls_of(trials))
-    judged = judge_pairs(trials, pairs, declared)
-    versus = [compare_arms(trials, own) for own in judged]
+    judged = verdicts.judge_pairs(trials, pairs, declared)
     quantity = next((one.declared for one in judged if one.declared is not None), None)
     layout = layout_of(experiment.name)
     tables = [build_table(experiment)] if layout is None else paper_tables(experiment, layout)
     volumes, volume_notes = volume_charts(trials, arms)
-    rows = provenance(trials)
-    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    environment.filters["signed"] = _signed
-    return environment.from_string(_resource("template.html.j2")).render(
+    return fill(
+        "report.html.j2",
         name=experiment.name,
-        style=_resource("style.css"),
-        script=_resource("script.js"),
         arms=[str(arm) for arm in arms],
         scenes=sorted({trial.scene for trial in trials}),
         seeds=experiment.seeds,
         trials=trials,
-        versus=versus,
+        versus=[compare_arms(trials, own) for own in judged],
         declared=declared.sentences(quantity.name) if declared and quantity else [],
-        families=families(judged),
-        tables=[to_html(_without_verdicts(table)) for table in tables],
+        families=verdicts.families(judged),
+        tables=[_without_verdicts(table) for table in tables],
         contradictions=[] if layout is None else load_paper().contradictions,
         search=search,
-        to_html=to_html,
-        words=WORDS,
-        symbols=SYMBOLS,
-        headline=headline,
-        secondary=secondary,
-        by_scene_lines=by_scene_lines,
-        detail_lines=detail_lines,
-        seeds_to_resolve=seeds_to_resolve,
+        say=verdicts,
+        signed=_signed,
         training=training_charts(trials, arms),
+        event_table=event_table(trials, arms),
         events=event_charts(trials, arms),
         volumes=volumes,
         volume_notes=volume_notes,
         figures=trial_figures(trials),
-        provenance=rows,
-        columns=list(dict.fromkeys(key for row in rows for key in row)),
+        provenance=provenance(trials),
         warnings=experiment.warnings,
     )
 
 
 def _without_verdicts(table: Table) -> Table:
     """The table without the notes that repeat the verdicts, which stand at the top of the page."""
-    return replace(table, notes=tuple(note for note in table.notes if not note.startswith(VERDICT)))
+    return replace(table, notes=tuple(note for note in table.notes if not note.startswith(verdicts.VERDICT)))
 
 
 def trial_figures(trials: Sequence[TrialResult]) -> list[tuple[str, str]]:
@@ -105,13 +80,9 @@ def trial_figures(trials: Sequence[TrialResult]) -> list[tuple[str, str]]:
     for group in by_key(trials, lambda trial: (trial.scene, trial.arm)).values():
         trial = group[0]
         for path in sorted((trial.path / FIGURES).glob("*.png")):
-            key = path.stem.replace("_", " "), trial.scene, data_uri(read_image(path))
+            key = path.stem.replace("_", " "), trial.scene, png_uri(read_image(path))
             found.setdefault(key, []).append(f"{trial.init}-{trial.densify}, seed {trial.seed}")
     return [(f"{name}: {scene}, {'; '.join(arms)}", uri) for (name, scene, uri), arms in found.items()]
-
-
-def _resource(name: str) -> str:
-    return files("gsbench.analysis.report").joinpath(name).read_text(encoding="utf-8")
 
 
 def _signed(value: float | None, decimals: int) -> str:

@@ -1,156 +1,132 @@
-"""Charts as inline SVG: no script, no network, sharp on paper, and described in words for those who cannot see them."""
+"""Charts as inline SVG: no script, no network, sharp on paper, and described in words for those who cannot see them.
+
+Here values find their places; ``charts.html.j2`` writes the elements.
+"""
 
 from __future__ import annotations
 
-import html
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+from gsbench.analysis.statistics import Interval
+from gsbench.analysis.table_formats import fill
 from gsbench.words import true_minus
 
 WIDTH, HEIGHT = 380, 250  # px at full size; text is 12 px
-LEFT, RIGHT, TOP, BOTTOM = 58, 18, 26, 44
+LEFT, RIGHT, TOP, BOTTOM = 58, 18, 26, 44  # margins
+FOREST_LEFT, FOREST_TOP, FOREST_ROW = 132, 12, 26
 COLORS = ("#4477aa", "#cc3311", "#228833", "#aa3377", "#b8860b", "#0099a8")  # told apart also by colour-blind readers
 DASHES = ("", "6 3", "2 3", "8 3 2 3", "1 2", "10 4")
 TICKS = 5
 THOUSANDS = 1e4  # from here on numbers are written with k or M
 
+Points = Sequence[tuple[float, float]]
+
 
 @dataclass(frozen=True)
-class Series:
-    """One line: a name and points (x, y)."""
+class Line:
+    """A line of a chart with its name, in px."""
 
     name: str
-    points: Sequence[tuple[float, float]]
+    points: Points
+    color: str
+    dash: str
 
 
 @dataclass(frozen=True)
 class ForestRow:
-    """A difference with its interval; ``low`` and ``high`` are None where no interval is known."""
+    """A difference with its interval, where that is known."""
 
     label: str
     mean: float
-    low: float | None
-    high: float | None
+    interval: Interval | None = None
+
+    def color(self, better: int) -> str:
+        """Grey where the interval holds zero, green on the side that is ``better``, else red."""
+        if self.interval is None or not self.interval.excludes_zero():
+            return "#555555"
+        return "#1b7837" if self.mean * better > 0 else "#b2182b"
 
 
 def line_chart(
     title: str,
-    series: Sequence[Series],
+    series: Sequence[tuple[str, Points]],
     x_label: str,
     y_label: str,
-    log_x: bool = False,
-    log_y: bool = False,
-    marker: tuple[float, str] | None = None,
+    log: bool = False,
+    marker: float | None = None,
 ) -> str:
-    """Lines over common axes; ``marker`` is a labelled vertical line. What a log axis cannot show is dropped."""
-    shown = [
-        Series(s.name, [p for p in s.points if (p[0] > 0 or not log_x) and (p[1] > 0 or not log_y)]) for s in series
-    ]
-    shown = [s for s in shown if s.points]
+    """Lines, each with its name, over common axes, which are both linear or both logarithmic; "" without any point.
+
+    ``marker`` is a vertical line. What a log axis cannot show is dropped.
+    """
+    shown = [(name, [(x, y) for x, y in points if not log or (x > 0 and y > 0)]) for name, points in series]
+    shown = [(name, points) for name, points in shown if points]
     if not shown:
         return ""
-    xs = [x for s in shown for x, _ in s.points] + ([marker[0]] if marker else [])
-    ys = [y for s in shown for _, y in s.points]
-    x_axis = _Axis(xs, log_x, LEFT, WIDTH - RIGHT)
-    y_axis = _Axis(ys, log_y, HEIGHT - BOTTOM, TOP)
-    parts = [_frame(x_axis, y_axis, x_label, y_label)]
-    if marker:
-        x = x_axis.place(marker[0])
-        parts.append(f'<line class="marker" x1="{x:.1f}" x2="{x:.1f}" y1="{TOP}" y2="{HEIGHT - BOTTOM}"/>')
-        parts.append(_text(x + 4, TOP + 10, marker[1], "start"))
-    for index, one in enumerate(shown):
-        color, dash = COLORS[index % len(COLORS)], DASHES[index % len(DASHES)]
-        path = " ".join(f"{x_axis.place(x):.1f},{y_axis.place(y):.1f}" for x, y in one.points)
-        parts.append(
-            f'<polyline fill="none" stroke="{color}" stroke-width="2" stroke-dasharray="{dash}" points="{path}"/>'
-        )
-        if len(one.points) <= TICKS:
-            parts += [
-                f'<circle cx="{x_axis.place(x):.1f}" cy="{y_axis.place(y):.1f}" r="3.5" fill="{color}"/>'
-                for x, y in one.points
-            ]
-    ends = "; ".join(f"{s.name} {_ends(s.points)}" for s in shown)
-    return _figure(title, f"{y_label} against {x_label}: {ends}.", parts, HEIGHT, [s.name for s in shown])
-
-
-def bar_chart(title: str, labels: Sequence[str], series: Sequence[tuple[str, Sequence[float]]], y_label: str) -> str:
-    """Bars grouped by label, one colour for each series; the axis starts at zero."""
-    values = [value for _, row in series for value in row]
-    if not values:
-        return ""
-    y_axis = _Axis([0.0, *values], False, HEIGHT - BOTTOM, TOP)
-    slot = (WIDTH - LEFT - RIGHT) / len(labels)
-    bar = 0.8 * slot / len(series)
-    parts = [_y_grid(y_axis, y_label)]
-    base = y_axis.place(0.0)
-    for place, label in enumerate(labels):
-        start = LEFT + place * slot + 0.1 * slot
-        for index, (name, row) in enumerate(series):
-            top = y_axis.place(row[place])
-            height = abs(base - top)
-            parts.append(
-                f'<rect x="{start + index * bar:.1f}" y="{min(top, base):.1f}" width="{bar * 0.92:.1f}" '
-                f'height="{height:.1f}" fill="{COLORS[index % len(COLORS)]}"><title>{_escape(name)}, {_escape(label)}: '
-                f"{short_number(row[place])}</title></rect>"
-            )
-        for row_index, word in enumerate(label.split()):
-            parts.append(_text(LEFT + (place + 0.5) * slot, HEIGHT - BOTTOM + 15 + 13 * row_index, word, "middle"))
-    words = "; ".join(
-        f"{label}: " + ", ".join(f"{name} {short_number(row[place])}" for name, row in series)
-        for place, label in enumerate(labels)
+    places = [point for _, points in shown for point in points]
+    x = Axis([x for x, _ in places] + ([] if marker is None else [marker]), log, LEFT, WIDTH - RIGHT)
+    y = Axis([y for _, y in places], log, HEIGHT - BOTTOM, TOP)
+    lines = [
+        Line(name, [(x.place(a), y.place(b)) for a, b in points], COLORS[k % len(COLORS)], DASHES[k % len(DASHES)])
+        for k, (name, points) in enumerate(shown)
+    ]
+    words = f"{title}. {y_label} against {x_label}: {'; '.join(f'{name} {_ends(points)}' for name, points in shown)}."
+    marked = None if marker is None else (x.place(marker), f"V_th {marker:g}")
+    return fill(
+        "line_chart.html.j2",
+        title=title,
+        words=words,
+        lines=lines,
+        x=x,
+        y=y,
+        x_label=x_label,
+        y_label=y_label,
+        marker=marked,
+        width=WIDTH,
+        height=HEIGHT,
+        left=LEFT,
+        right=WIDTH - RIGHT,
+        top=TOP,
+        bottom=HEIGHT - BOTTOM,
+        few=TICKS,
     )
-    return _figure(title, f"{y_label}. {words}.", parts, HEIGHT, [name for name, _ in series], dashed=False)
 
 
 def forest_plot(title: str, rows: Sequence[ForestRow], x_label: str, better: int) -> str:
     """Differences with intervals, one row each, about a line at zero; ``better`` is the sign of an improvement."""
     if not rows:
         return ""
-    left, step = 132, 26
-    top = 12
-    height = top + step * len(rows) + BOTTOM
-    ends = [value for row in rows for value in (row.mean, row.low, row.high, 0.0) if value is not None]
-    axis = _Axis(ends, False, left, WIDTH - RIGHT, ticks=3)
-    bottom = height - BOTTOM
-    parts = []
-    for tick in axis.ticks:
-        x = axis.place(tick)
-        parts.append(f'<line class="grid" x1="{x:.1f}" x2="{x:.1f}" y1="{top}" y2="{bottom}"/>')
-        parts.append(_text(x, bottom + 15, axis.label(tick), "middle"))
-    zero = axis.place(0.0)
-    parts.append(f'<line class="axis" x1="{zero:.1f}" x2="{zero:.1f}" y1="{top}" y2="{bottom}"/>')
-    for index, row in enumerate(rows):
-        y = top + step * (index + 0.5)
-        known = row.low is not None and row.high is not None
-        decided = known and (row.low > 0 or row.high < 0)  # type: ignore[operator]
-        color = "#555555" if not decided else "#1b7837" if row.mean * better > 0 else "#b2182b"
-        if known:
-            parts.append(
-                f'<line x1="{axis.place(row.low):.1f}" x2="{axis.place(row.high):.1f}" y1="{y}" y2="{y}" '  # type: ignore[arg-type]
-                f'stroke="{color}" stroke-width="2"/>'
-            )
-        parts.append(f'<circle cx="{axis.place(row.mean):.1f}" cy="{y}" r="4.5" fill="{color}"/>')
-        parts.append(_text(left - 8, y + 4, row.label, "end"))
-    parts.append(_text((left + WIDTH - RIGHT) / 2, height - 6, x_label, "middle"))
-    words = "; ".join(
+    known = [row.interval for row in rows if row.interval is not None]
+    ends = [0.0, *(row.mean for row in rows), *(end for one in known for end in (one.low, one.high))]
+    words = [
         f"{row.label} {short_number(row.mean)}"
-        + (
-            f", interval {short_number(row.low)} to {short_number(row.high)}"
-            if row.low is not None and row.high is not None
-            else ""
-        )
+        + (f", interval {short_number(row.interval.low)} to {short_number(row.interval.high)}" if row.interval else "")
         for row in rows
+    ]
+    bottom = FOREST_TOP + FOREST_ROW * len(rows)
+    return fill(
+        "forest_plot.html.j2",
+        title=title,
+        words=f"{title}. {x_label}. {'; '.join(words)}.",
+        rows=[(FOREST_TOP + FOREST_ROW * (k + 0.5), row, row.color(better)) for k, row in enumerate(rows)],
+        x=Axis(ends, False, FOREST_LEFT, WIDTH - RIGHT, ticks=3),
+        x_label=x_label,
+        width=WIDTH,
+        height=bottom + BOTTOM,
+        left=FOREST_LEFT,
+        right=WIDTH - RIGHT,
+        top=FOREST_TOP,
+        bottom=bottom,
     )
-    return _figure(title, f"{x_label}. {words}.", parts, height, [])
 
 
 ROUND = (1, 2, 2.5, 5, 10)  # steps between ticks, of a power of ten
 
 
-class _Axis:
+class Axis:
     """Maps values to pixels, with ticks at round values."""
 
     def __init__(self, values: Sequence[float], log: bool, start: float, end: float, ticks: int = TICKS) -> None:
@@ -182,13 +158,9 @@ class _Axis:
 
     def _log_ticks(self) -> list[float]:
         decades = range(math.ceil(self._low), math.floor(self._high) + 1)
-        step = max(1, math.ceil(len(decades) / TICKS))
-        ticks = [10.0**exponent for exponent in decades[::step]]
-        return (
-            ticks
-            if len(ticks) > 1
-            else [10.0**value for value in (self._low, (self._low + self._high) / 2, self._high)]
-        )
+        if len(decades) < 2:
+            return [10.0**value for value in (self._low, (self._low + self._high) / 2, self._high)]
+        return [10.0**exponent for exponent in decades[:: max(1, math.ceil(len(decades) / TICKS))]]
 
 
 def _round_ticks(low: float, high: float, count: int) -> list[float]:
@@ -204,47 +176,7 @@ def _round_ticks(low: float, high: float, count: int) -> list[float]:
     return [index * step for index in indices]
 
 
-def _frame(x_axis: _Axis, y_axis: _Axis, x_label: str, y_label: str) -> str:
-    bottom = HEIGHT - BOTTOM
-    parts = [_y_grid(y_axis, y_label)]
-    parts += [_text(x_axis.place(tick), bottom + 16, x_axis.label(tick), "middle") for tick in x_axis.ticks]
-    parts.append(_text((LEFT + WIDTH - RIGHT) / 2, HEIGHT - 8, x_label, "middle"))
-    return "".join(parts)
-
-
-def _y_grid(axis: _Axis, label: str) -> str:
-    parts = []
-    for tick in axis.ticks:
-        y = axis.place(tick)
-        parts.append(f'<line class="grid" x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{y:.1f}" y2="{y:.1f}"/>')
-        parts.append(_text(LEFT - 6, y + 4, axis.label(tick), "end"))
-    parts.append(_text(0, 12, label, "start"))
-    return "".join(parts)
-
-
-def _figure(
-    title: str, words: str, parts: Sequence[str], height: float, names: Sequence[str], dashed: bool = True
-) -> str:
-    dashes = DASHES if dashed else ("",)
-    keys = "".join(
-        f'<li><svg viewBox="0 0 26 8" width="26" height="8" aria-hidden="true"><line x1="0" x2="26" y1="4" y2="4" '
-        f'stroke="{COLORS[i % len(COLORS)]}" stroke-width="3" stroke-dasharray="{dashes[i % len(dashes)]}"/></svg>'
-        f"{_escape(name)}</li>"
-        for i, name in enumerate(names)
-    )
-    legend = f'<ul class="legend">{keys}</ul>' if len(names) > 1 else ""
-    return (
-        f'<figure class="chart"><figcaption>{_escape(title)}</figcaption>'
-        f'<svg viewBox="0 0 {WIDTH} {height}" role="img" aria-label="{_escape(f"{title}. {words}")}">'
-        f"{''.join(parts)}</svg>{legend}</figure>"
-    )
-
-
-def _text(x: float, y: float, text: str, anchor: str) -> str:
-    return f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}">{_escape(text)}</text>'
-
-
-def _ends(points: Sequence[tuple[float, float]]) -> str:
+def _ends(points: Points) -> str:
     """The first and the last point in words."""
     (x0, y0), (x1, y1) = points[0], points[-1]
     return f"from {short_number(y0)} at {short_number(x0)} to {short_number(y1)} at {short_number(x1)}"
@@ -253,11 +185,8 @@ def _ends(points: Sequence[tuple[float, float]]) -> str:
 def short_number(value: float) -> str:
     """A number as short as a tick label needs it, such as 26k or −0.02."""
     size = abs(value)
-    for limit, suffix in ((1e6, "M"), (THOUSANDS, "k")):
+    for limit, unit, suffix in ((1e6, 1e6, "M"), (THOUSANDS, 1e3, "k")):
         if size >= limit:
-            return true_minus(f"{value / {'M': 1e6, 'k': 1e3}[suffix]:.3g}{suffix}")
+            return true_minus(f"{value / unit:.3g}{suffix}")
     text = f"{value:.0e}" if 0 < size < 1e-4 else f"{value:.3g}" if size < 1000 else f"{value:.0f}"
     return true_minus(text)
-
-
-_escape: Callable[[str], str] = html.escape
