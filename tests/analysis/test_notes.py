@@ -16,7 +16,7 @@ from gsbench.runs.declaration import Arm
 from tests.analysis.synthetic import Plan, write_runs
 
 ADC, VOLUMETRIC = Arm("sfm", "adc"), Arm("sfm", "volumetric")
-COMPARED = "this is no comparison at one count, which densify.cap=governor makes."
+COMPARED = "so this does not compare at equal counts; densify.cap=governor makes the counts equal."
 
 
 def trials_of(tmp_path: Path, **plan: object) -> tuple[TrialResult, ...]:
@@ -46,7 +46,7 @@ def test_unlike_counts_are_said_over_the_scenes_that_both_have(
     made = trials_of(tmp_path, scenes=list(counts))
     trials = [with_record(trial, num_gaussians=counts[trial.scene][trial.densify == "volumetric"]) for trial in made]
     sentence = counts_sentence(trials, ADC, VOLUMETRIC)
-    expected = f"sfm-volumetric has {said} Gaussians than sfm-adc: {COMPARED}" if said else ""
+    expected = f"sfm-volumetric has {said} Gaussians than sfm-adc, {COMPARED}" if said else ""
     assert sentence == expected
     assert counts_sentence(trials, ADC, Arm("sfm", "mcmc")) == ""
 
@@ -77,14 +77,14 @@ def test_whose_views_made_the_points_is_said_once_for_each_initialiser(tmp_path:
     made = load_experiment(tmp_path, "exp").trials
     assert points_notes(made) == [
         "Initial points of dim: from training views alone (init.points_from=train).",
-        "Initial points of sfm: from all views, test views too (init.points_from=all).",
+        "Initial points of sfm: from all views, test views included (init.points_from=all).",
     ]
     observed = [with_record(trial, init_report={"mean_track_length": 3.1}) for trial in made]
-    assert "Initial points of random: from all views, test views too (init.points_from=all)." in points_notes(observed)
+    assert "Initial points of random: from all views, test views included (init.points_from=all)." in points_notes(observed)
     assert points_notes([trial for trial in made if trial.init == "random"]) == []
 
 
-@pytest.mark.parametrize(("lost", "rest"), [(1, ""), (3, ""), (4, "; and 1 more"), (5, "; and 2 more")])
+@pytest.mark.parametrize(("lost", "rest"), [(1, ""), (3, ""), (4, " and 1 more"), (5, " and 2 more")])
 def test_of_what_is_left_out_three_are_named_and_all_are_counted(tmp_path: Path, lost: int, rest: str) -> None:
     paths = write_runs(tmp_path, Plan())
     for path in paths[:lost]:
