@@ -241,8 +241,8 @@ def _tried_here(trials: Sequence[TrialResult], own: TrialResult) -> list[str]:
     if len(choices) < 2 or not keys:
         return []
     return [
-        f"{own.arm}: {counted(len(choices), 'choice')} of the settings of its class were run here, which differ in "
-        f"{listed(keys)}, all measured on the held-out views that the verdict uses, too."
+        f"{own.arm}: {counted(len(choices), 'choice')} of its settings were run here. They differ in {listed(keys)}, "
+        "and all were measured on the test views that the verdict uses."
     ]
 
 
