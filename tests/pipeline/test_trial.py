@@ -7,10 +7,11 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
 
 from gsbench.config.compose import compose_one
 from gsbench.errors import InputError, TrainingError
-from gsbench.pipeline.parts import Parts
+from gsbench.pipeline.parts import Parts, build, build_own_rasterizer, build_rasterizer
 from gsbench.pipeline.trial import _recorded_failures
 from gsbench.runs.trial_folder import TrialFolder
 
@@ -51,3 +52,95 @@ def test_threads_are_those_that_are_set_or_what_parallel_trials_leave(monkeypatc
     monkeypatch.setattr("gsbench.pipeline.parts.available_threads", lambda parallel: 100 + parallel)
     for words, threads in ((["threads=3"], 3), (["threads=auto", "launch.parallel=2"], 102)):
         assert Parts(compose_one(["scene=courtyard", *words]).values).threads == threads
+
+
+OWN = """
+from dataclasses import dataclass
+from gsbench.densify import ADC
+from gsbench.raster.reference import ReferenceRasterizer
+
+@dataclass
+class Picky(ADC):
+    least: float = 1.0
+    def __post_init__(self):
+        if self.least < 0:
+            raise KeyError("least")
+        super().__post_init__()
+
+class Bare(ReferenceRasterizer):
+    def __init__(self, least=2.0):
+        self.least = least
+
+class Ender(ADC):
+    def __init__(self):
+        raise SystemExit(3)
+
+class Named(ReferenceRasterizer):
+    name = "named"
+
+class Nameless(ReferenceRasterizer):
+    name = None
+
+class Taken(ReferenceRasterizer):
+    name = "cpu"
+
+class Nothing:
+    pass
+
+function = len
+"""
+
+
+@pytest.fixture
+def own_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "own_classes.py").write_text(OWN)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "own_classes", raising=False)
+
+
+@pytest.mark.parametrize(
+    ("group", "values", "said"),
+    [
+        ("densify", {"_target_": "own_classes.Picky", "least": 2.0}, None),
+        ("densify", {"_target_": "own_classes.Picky", "lest": 2.0}, r"densify\.lest"),
+        ("densify", {"_target_": "own_classes.Picky", "least": -1.0}, r"own_classes\.Picky cannot be made .KeyError"),
+        ("raster", {"_target_": "own_classes.Bare", "least": 2.0}, "has options but is no dataclass"),
+        ("raster", {"_target_": "own_classes.Bare"}, None),
+        ("densify", {"_target_": "own_classes.Ender"}, "cannot be made .SystemExit: 3"),
+        ("densify", {"_target_": "own_classes.Nothing"}, "is not a class for densify: it has no "),
+        ("densify", {"_target_": "own_classes.function"}, "is not a class for densify"),
+        ("densify", {"_target_": "gsbench.densify.ADC", "gradient_treshold": 1}, "did you mean gradient_threshold"),
+        ("densify", {"_target_": "gsbench.densify.ADC", "stop": 1, "start": 5}, r"densify\.stop must be above"),
+        ("init", {"_target_": "gsbench.init.Random", "count": 0}, "init"),
+    ],
+)
+def test_a_part_that_cannot_be_made_is_refused_with_its_setting(
+    own_module: None, group: str, values: dict[str, object], said: str | None
+) -> None:
+    if said is None:
+        made = build(group, values, ["own_classes"])
+        assert type(made).__name__ == str(values["_target_"]).rpartition(".")[2]
+        assert getattr(made, "least", 2.0) == 2.0
+    else:
+        with pytest.raises(InputError, match=said):
+            build(group, values, ["own_classes"])
+
+
+@pytest.mark.parametrize(("name", "sound"), [("Named", True), ("Nameless", False), ("Taken", False)])
+def test_a_rasterizer_of_ones_own_goes_by_a_name_of_its_own(own_module: None, name: str, sound: bool) -> None:
+    values = {"name": "own", "_target_": f"own_classes.{name}"}
+    if sound:
+        assert build_rasterizer(values, ["own_classes"], torch.device("cpu")).name == "named"
+    else:
+        with pytest.raises(InputError, match="needs an attribute name"):
+            build_own_rasterizer(values, ["own_classes"])
+    for densify, given in (("adc", "auto"), ("adc", "own"), ("taming", "auto")):
+        words = ["scene=courtyard", "device=cpu", f"densify={densify}", "allow_targets=[own_classes]"]
+        parts = Parts(compose_one(words).values | {"raster": values | {"name": given}})
+        if sound and densify == "adc":
+            parts.check(here=True)
+        elif sound:
+            with pytest.raises(InputError, match="raster=named does not give them"):
+                parts.check(here=False)
+    assert build_own_rasterizer({"name": "cpu"}, []) is None
+    assert build_rasterizer({"name": "reference"}, [], torch.device("cpu")).name == "reference"

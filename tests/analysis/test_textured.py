@@ -1,0 +1,40 @@
+"""The error in textured parts, against its definition pixel by pixel."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from gsbench.analysis.images import textured_error
+from gsbench.analysis.results import load_experiment
+from gsbench.errors import InputError
+from gsbench.runs.layout import FROM_PIXELS, MASKS
+from tests.analysis.synthetic import Plan, write_runs
+
+
+def test_it_is_the_mean_error_where_the_fifth_of_most_texture_lies(tmp_path: Path) -> None:
+    """Steps grow from left to right, so texture does; the render is off by the tenth of a column's number."""
+    write_runs(tmp_path, Plan(scenes=("garden",), densifiers=("adc",), seeds=(0,), views=1, pictures=True))
+    (trial,) = load_experiment(tmp_path, "exp").trials
+    column = np.arange(100)
+    truth = np.repeat((9 + column**2 // 50)[None], 20, axis=0)
+    render = truth - column // 10
+    for folder, pixels in (("ground_truth", truth), ("renders", render)):
+        picture = np.repeat(pixels[..., None], 3, axis=2).astype(np.uint8)
+        Image.fromarray(picture).save(trial.path / folder / "view000.png")
+    assert textured_error(trial) == pytest.approx(8.5, abs=0.2)  # of the last twenty columns
+    counts = np.full((20, 100), 255, np.uint8)
+    counts[:, 50:] = 0
+    (trial.path / MASKS).mkdir()
+    Image.fromarray(counts).save(trial.path / MASKS / "view000.png")
+    assert textured_error(trial) == pytest.approx(4.0, abs=0.2)  # of the left half, its last ten columns
+    for picture in (trial.path / "renders").iterdir():
+        picture.unlink()
+    with pytest.raises(InputError, match="holds no renders"):
+        textured_error(trial)
+    (trial.path / FROM_PIXELS).write_text(json.dumps({"error_textured": 3.25}))
+    assert textured_error(trial) == 3.25
