@@ -154,3 +154,43 @@ def test_features_are_extracted_of_eight_images_at_a_time_or_two_a_thread(
         assert (options.sift.max_num_features, options.sift.first_octave) == (70, 1)
         assert (options.sift.peak_threshold, options.sift.edge_threshold) == (0.01, 9.0)
         assert Path(call["reader_options"].mask_path) == (masks or Path())
+
+
+def test_what_colmap_cannot_read_gets_a_png_under_its_name(images: Path, tmp_path: Path) -> None:
+    assert made.readable_images(images, list(SIZES), tmp_path / "work") == images
+    Image.new("RGB", (40, 30), (1, 2, 3)).save(images / "left" / "c.WEBP", lossless=True)
+    names = ["a.png", "left/c.WEBP"]
+    folder = made.readable_images(images, names, tmp_path / "work")
+    assert folder != images
+    assert sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*.*")) == sorted(names)
+    assert (folder / "a.png").resolve() == images / "a.png"
+    with Image.open(folder / "left" / "c.WEBP") as copy:
+        assert (copy.format, copy.getpixel((3, 4))) == ("PNG", (1, 2, 3))
+    assert made.readable_images(images, names, tmp_path / "work") == folder  # made anew
+
+
+def test_masks_are_named_as_colmap_looks_for_them(images: Path, tmp_path: Path) -> None:
+    assert made.colmap_masks({}, tmp_path) is None
+    given = {"a.png": images / "b.png", "left/b.png": images / "c.png"}
+    for _ in range(2):
+        folder = made.colmap_masks(given, tmp_path)
+        assert folder is not None
+        for name, mask in given.items():
+            assert (folder / f"{name}.png").resolve() == mask
+        assert len([path for path in folder.rglob("*.png") if path.is_symlink()]) == 2
+
+
+def test_the_references_cameras_are_known_and_have_its_placed_images() -> None:
+    model = pycolmap.Reconstruction()
+    for number, focal in ((1, 50.0), (2, 60.0)):
+        model.add_camera_with_trivial_rig(
+            pycolmap.Camera.create_from_model_name(number, "PINHOLE", focal, 40 * number, 30)
+        )
+    for number, (name, camera) in enumerate([("d", 1), ("c", 2), ("b", 1), ("a", 2)], start=1):
+        image = pycolmap.Image(name=name, camera_id=camera, image_id=number)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
+    groups = made.reference_groups(model)
+    assert [names for _, names in groups] == [["a", "c"], ["b", "d"]]
+    assert [(camera.mean_focal_length(), camera.width) for camera, _ in groups] == [(60.0, 80), (50.0, 40)]
+    assert all(camera.has_prior_focal_length for camera, _ in groups)
+    assert not any(camera.has_prior_focal_length for camera in model.cameras.values())  # copies

@@ -12,6 +12,7 @@ from PIL import Image
 
 from gsbench.errors import InputError
 from gsbench.init import Sfm
+from gsbench.init.colmap import mapping
 from gsbench.init.colmap.alignment import align_poses
 from gsbench.init.colmap.database import (
     assume_focal_lengths,
@@ -125,3 +126,105 @@ def test_copies_of_one_view_are_no_scene(tmp_path: Path, mapper: Any) -> None:
     database, _ = small_baseline(tmp_path, spread=0.0)
     with pytest.raises(InputError, match="structure from motion"):
         mapped(database, mapper)
+
+
+class Model:
+    """A reconstruction of which only the size is asked."""
+
+    def __init__(self, images: int, points: int = 10) -> None:
+        self.images, self.points = images, points
+
+    def num_reg_images(self) -> int:
+        return self.images
+
+    def num_points3D(self) -> int:  # noqa: N802 - as pycolmap calls it
+        return self.points
+
+
+@pytest.mark.parametrize(
+    ("found", "best", "tried"),
+    [
+        ([[(9, 1)], [(10, 1)]], (9, 1), 1),  # of ten images: enough
+        ([[(8, 1)], [(10, 1)]], (10, 1), 2),
+        ([[(8, 5)], [(8, 9)], [(7, 99)]], (8, 9), 3),
+        ([[(8, 9)], [(8, 5)], []], (8, 9), 3),
+        ([[(4, 1), (6, 1), (5, 9)]], (6, 1), 1),
+        ([[], [(3, 1)]], (3, 1), 2),
+    ],
+)
+def test_ways_are_tried_until_one_places_nine_of_ten(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    found: list[list[tuple[int, int]]],
+    best: tuple[int, int],
+    tried: int,
+) -> None:
+    (tmp_path / "images").mkdir()
+    names = [f"{k}.png" for k in range(10)]
+    for name in names:
+        Image.new("RGB", (40, 30)).save(tmp_path / "images" / name)
+    create_database(tmp_path / "database.db", guessed_groups(tmp_path / "images", names, "single", "PINHOLE", 30.0))
+    monkeypatch.setattr(mapping, "_is_plausible", lambda model: True)
+    ways = [(f"way {k}", lambda sizes=sizes: [Model(*size) for size in sizes]) for k, sizes in enumerate(found)]
+    monkeypatch.setattr(mapping, "_ways", lambda *_: iter(ways))
+    result = mapped(tmp_path / "database.db", "auto")
+    assert (result.model.num_reg_images(), result.model.num_points3D()) == best
+    place = next(k for k, sizes in enumerate(found) if best in sizes)
+    assert (result.way, result.models) == (f"way {place}", len(found[place]))
+    assert result.tried == tuple((f"way {k}", max(sizes, default=(0, 0))[0]) for k, sizes in enumerate(found[:tried]))
+    assert bool(result.warnings) == (tried > 1)
+    for sizes, said in (([], "found no pair of images"), ([(2, 99)], "placed only 2 of 10 images")):
+        ways[:] = [("only", lambda sizes=sizes: [Model(*size) for size in sizes])]
+        with pytest.raises(InputError, match=said):
+            mapped(tmp_path / "database.db", "auto")
+
+
+@pytest.mark.parametrize("prior", [True, False])
+@pytest.mark.parametrize("mapper", ["incremental", "global", "auto"])
+def test_the_ways_of_a_mapper(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mapper: Any, prior: bool) -> None:
+    """From the defaults to assumed focal lengths, these only where none is known."""
+    calls: list[tuple[object, ...]] = []
+    monkeypatch.setattr(mapping, "cameras_without_prior", lambda database: not prior)
+    monkeypatch.setattr(
+        mapping, "_with_focal_lengths", lambda database, copy, factor, *_: (database, copy.name, factor)
+    )
+    monkeypatch.setattr(
+        mapping,
+        "_incremental",
+        lambda found, images, output, *rest: calls.append(("incremental", found, rest[-1])) or [],
+    )
+    monkeypatch.setattr(mapping, "_global", lambda database, *_: calls.append(("global", database)) or [])
+    database = tmp_path / "a.db"
+    ways = list(mapping._ways(database, tmp_path, tmp_path / "out", Sfm(mapper=mapper), no_progress, 9))
+    for _, run in ways:
+        run()
+    assumed = [] if prior else [(database, f"assumed-{factor:g}.db", factor) for factor in mapping.FOCAL_FACTORS]
+    small = mapping.SMALL_ANGLE_DEG
+    expected = {
+        "incremental": [("incremental", database, None)],
+        "global": [("global", database)],
+        "auto": [
+            ("incremental", database, None), ("incremental", database, small), ("global", database),
+            *(("incremental", copy, small) for copy in assumed),
+        ],
+    }  # fmt: skip
+    assert calls == expected[mapper]
+    assert len({name for name, _ in ways}) == len(ways)
+    assert small < 16  # COLMAP's own
+
+
+@pytest.mark.parametrize(("share", "plausible"), [(0.9, False), (1.1, True)])
+def test_half_of_the_points_must_be_seen_under_an_angle(share: float, plausible: bool) -> None:
+    """Two cameras on either side of points at a distance of one; a third stands beside the first."""
+    half = np.tan(np.radians(share * mapping.MIN_ANGLE_DEG) / 2)
+    model = pycolmap.Reconstruction()
+    model.add_camera_with_trivial_rig(pycolmap.Camera.create_from_model_name(1, "PINHOLE", 100.0, 100, 80))
+    for number, x in enumerate((-half, half, -half), start=1):
+        pose = pycolmap.Rigid3d(np.column_stack([np.eye(3), [-x, 0, 0]]))
+        image = pycolmap.Image(name=f"{number}", keypoints=np.zeros((3, 2)), camera_id=1, image_id=number)
+        model.add_image_with_trivial_frame(image, pose)
+    for index, images in enumerate([(1, 2, 3), (1, 2), (1, 3)]):
+        track = pycolmap.Track([pycolmap.TrackElement(number, index) for number in images])
+        model.add_point3D(np.array([0.0, 0.0, 1.0]), track, np.zeros(3, dtype=np.uint8))
+    assert mapping._is_plausible(model) == plausible
+    assert not mapping._is_plausible(pycolmap.Reconstruction())
