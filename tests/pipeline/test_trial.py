@@ -104,7 +104,7 @@ def own_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         ("densify", {"_target_": "own_classes.Picky", "least": 2.0}, None),
         ("densify", {"_target_": "own_classes.Picky", "lest": 2.0}, r"densify\.lest"),
         ("densify", {"_target_": "own_classes.Picky", "least": -1.0}, r"own_classes\.Picky cannot be made .KeyError"),
-        ("raster", {"_target_": "own_classes.Bare", "least": 2.0}, "has options but is no dataclass"),
+        ("raster", {"_target_": "own_classes.Bare", "least": 2.0}, "has options but is not a dataclass"),
         ("raster", {"_target_": "own_classes.Bare"}, None),
         ("densify", {"_target_": "own_classes.Ender"}, "cannot be made .SystemExit: 3"),
         ("densify", {"_target_": "own_classes.Nothing"}, "is not a class for densify: it has no "),
