@@ -77,6 +77,14 @@ def test_the_weight_follows_an_aim_that_falls_to_nothing() -> None:
     assert acted == list(range(15_001, 23_001, 50))
 
 
+@pytest.mark.parametrize(("budget", "place"), [(20, 19), (17, 16), (50, 49), (70, 49)])
+def test_the_aim_starts_from_the_last_gaussian_within_the_budget(budget: int, place: int) -> None:
+    densifier, gaussians = begun(max_gaussians=budget)
+    densifier.step = 15_000
+    densifier.regularizer(gaussians)
+    assert densifier.aim == pytest.approx(0.8 * sorted(gaussians.opacities.tolist(), reverse=True)[place])
+
+
 def test_it_grows_to_three_times_the_budget_and_selects_down_to_it() -> None:
     densifier = GNS(max_gaussians=40)
     trainable, _ = started(densifier, 0)

@@ -115,6 +115,7 @@ def test_an_own_metric_gets_the_mask_if_it_asks(pair) -> None:
 
     class Masked(Plain):
         def measure_masked(self, image, truth, mask):
+            assert torch.equal(image[mask], torch.from_numpy(render)[mask] / 255)
             return float((image - truth).abs()[mask].mean())
 
     found = evaluator(extra={"plain": Plain(), "masked": Masked()}).evaluate_view(render, truth, mask)

@@ -259,6 +259,15 @@ def test_detection_settings_are_the_extractors_own_unless_given(
     assert own.find_weights() == (name, None)
     assert replace(own, matcher="lightglue").find_weights() == (name, f"{extractor}_lightglue_v0-1_arxiv-pth")
     assert ("transformers" in own.packages()) == (extractor == "superpoint")
+    for one in (found, given):  # what features depend on, and no more, makes other features
+        model = {"aliked_model": "n16"} if extractor == "aliked" else {}
+        assert one.extraction() == {
+            "extractor": extractor, "max_image_size": 1600, "max_keypoints": 2048,
+            "keypoint_threshold": one.keypoint_threshold, "nms_radius": one.nms_radius,
+        } | model  # fmt: skip
+    assert found.matching() == {"matcher": "mutual_nearest", "max_ratio": 0.95}
+    light = replace(own, matcher="lightglue").feature_settings().matching()
+    assert light == {"matcher": "lightglue", "filter_threshold": 0.1}
 
 
 class TestErrors:

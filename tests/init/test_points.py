@@ -151,6 +151,7 @@ def test_bad_files_in_one_line(courtyard: Capture, tmp_path: Path, name: str, ma
     [
         (np.eye(3), "4 rows of 4 numbers"),
         (np.diag([1.0, 1, -1, 1]), "mirrors"),
+        (np.diag([1.0, 1, 0, 1]), "flattens"),
         (np.diag([1.0, 2, 1, 1]), "unevenly"),
         (np.diag([1.0, 1, 1, 2]), "last 0 0 0 1"),
     ],

@@ -285,3 +285,11 @@ def test_a_name_that_is_none_is_refused() -> None:
         ValueError, match=r"train\.resolution_schedule must be 'none', 'pictures' or 'pictures_and_count'"
     ):
         TrainConfig(name="x", resolution_schedule="spectrum")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("scales", "full"),
+    [((8.0, 4.0, 2.0, 1.0), 200), ((8.0, 2.5, 1.9, 1.0), 100), ((1.9, 1.5, 1.2, 1.0), 0), ((3.0, 1.0, 1.0, 1.0), 0)],
+)
+def test_full_pictures_begin_where_the_last_scale_of_two_or_more_ends(scales: tuple[float, ...], full: int) -> None:
+    assert Levels((0, 100, 200, 300), scales).full_from == full

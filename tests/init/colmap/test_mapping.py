@@ -213,6 +213,25 @@ def test_the_ways_of_a_mapper(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, m
     assert small < 16  # COLMAP's own
 
 
+def test_mapping_tells_its_progress_from_none_to_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """COLMAP may place an image twice, in two models: more than all is never told."""
+    told: list[tuple[str, int, int]] = []
+
+    def place(*_: object, next_image_callback: Any, options: Any) -> dict[int, Model]:
+        for _ in range(4):
+            next_image_callback()
+        return {0: Model(2), 1: Model(2)}
+
+    monkeypatch.setattr(pycolmap, "incremental_mapping", place)
+    monkeypatch.setattr(pycolmap, "global_mapping", lambda *_, options: {0: Model(3)})
+    given = tmp_path, tmp_path, tmp_path, Sfm(), lambda *state: told.append(state), 3
+    assert [model.images for model in mapping._incremental(*given, None)] == [2, 2]
+    assert told == [("map", done, 3) for done in (0, 1, 2, 3, 3, 3)]
+    told.clear()
+    assert [model.images for model in mapping._global(*given)] == [3]
+    assert told == [("map", 0, 3), ("map", 3, 3)]
+
+
 @pytest.mark.parametrize(("share", "plausible"), [(0.9, False), (1.1, True)])
 def test_half_of_the_points_must_be_seen_under_an_angle(share: float, plausible: bool) -> None:
     """Two cameras on either side of points at a distance of one; a third stands beside the first."""
