@@ -12,7 +12,8 @@ import torch
 from gsbench.config.compose import compose_one
 from gsbench.errors import InputError, TrainingError
 from gsbench.pipeline.parts import Parts, build, build_own_rasterizer, build_rasterizer
-from gsbench.pipeline.trial import _recorded_failures
+from gsbench.pipeline.trial import _recorded_failures, run_trial
+from gsbench.runs import layout
 from gsbench.runs.trial_folder import TrialFolder
 
 
@@ -144,3 +145,21 @@ def test_a_rasterizer_of_ones_own_goes_by_a_name_of_its_own(own_module: None, na
                 parts.check(here=False)
     assert build_own_rasterizer({"name": "cpu"}, []) is None
     assert build_rasterizer({"name": "reference"}, [], torch.device("cpu")).name == "reference"
+
+
+@pytest.mark.parametrize("place", ["scene", "trial", "log.txt", "store/views"])
+def test_nothing_is_written_through_a_link_in_the_runs_folder(tmp_path: Path, place: str) -> None:
+    """Whoever sent the folder would choose the file that is written to."""
+    trial = compose_one(["scene=courtyard", f"runs={tmp_path / 'runs'}"])
+    outside = tmp_path / "outside"
+    outside.mkdir()
+    own = trial.files
+    link = {
+        "scene": own.path.parents[1], "trial": own.path, "log.txt": own.path / "log.txt",
+        "store/views": own.runs / layout.STORE / layout.VIEWS,
+    }[place]  # fmt: skip
+    link.parent.mkdir(parents=True)
+    link.symlink_to(outside / "private" if place == "log.txt" else outside)
+    with pytest.raises(InputError, match=r"not a regular file|is a link"):
+        run_trial(trial)
+    assert not list(outside.iterdir())
