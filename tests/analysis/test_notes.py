@@ -80,8 +80,9 @@ def test_whose_views_made_the_points_is_said_once_for_each_initialiser(tmp_path:
         "Initial points of sfm: from all views, test views included (init.points_from=all).",
     ]
     observed = [with_record(trial, init_report={"mean_track_length": 3.1}) for trial in made]
-    line = "Initial points of random: from all views, test views included (init.points_from=all)."
-    assert line in points_notes(observed)
+    assert "Initial points of random: from all views, test views included (init.points_from=all)." in points_notes(
+        observed
+    )
     assert points_notes([trial for trial in made if trial.init == "random"]) == []
 
 

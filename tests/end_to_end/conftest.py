@@ -16,6 +16,7 @@ import pytest
 from filelock import FileLock
 
 from gsbench.cli import run
+from tests.processes import heed_interrupts
 
 Run = Callable[..., "subprocess.CompletedProcess[str]"]
 
@@ -118,7 +119,10 @@ def trial_of(settings: Sequence[str], runs: Path, capture: Path, *words: str) ->
 CLOCKED = ("seconds", "peak_memory_mb", "measured", "made_of")
 
 
-def start(environment: dict[str, str], cwd: Path, runs: Path, *arguments: str) -> subprocess.Popen[str]:
+def start(
+    environment: dict[str, str], cwd: Path, runs: Path, *arguments: str, new_group: bool = False
+) -> subprocess.Popen[str]:
+    """The program, started; with ``new_group``, as from a terminal: with what it starts it can be sent Ctrl-C."""
     return subprocess.Popen(
         [sys.executable, "-m", "gsbench.cli", *arguments],
         cwd=cwd,
@@ -126,6 +130,8 @@ def start(environment: dict[str, str], cwd: Path, runs: Path, *arguments: str) -
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
+        start_new_session=new_group,
+        preexec_fn=heed_interrupts if new_group else None,
     )
 
 

@@ -112,6 +112,21 @@ def holders(runs: Path) -> dict[str, int]:
     return found
 
 
+def test_ctrl_c_stops_trials_in_processes_of_their_own_with_checkpoints(
+    environment: dict[str, str], tmp_path: Path
+) -> None:
+    """A terminal sends Ctrl-C to every process of the command."""
+    runs = tmp_path / "runs"
+    process = start(environment, tmp_path, runs, *LOCAL, "seed=0,1", "train.iterations=100000", new_group=True)
+    wait_for(runs, "store/train/.*.partial/metrics.jsonl", process)
+    os.killpg(process.pid, signal.SIGINT)
+    output, _ = process.communicate(timeout=300)
+    assert process.returncode == 128 + signal.SIGINT, output
+    assert "Traceback" not in output
+    assert output.strip().splitlines()[-1].startswith("gsbench: stopped")
+    wait_for(runs, "store/train/.*.partial/checkpoint-*.pt", process)
+
+
 def test_one_killed_trial_harms_no_other_and_the_next_command_mends_it(
     environment: dict[str, str], tmp_path: Path
 ) -> None:

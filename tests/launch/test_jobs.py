@@ -44,7 +44,7 @@ def test_a_job_that_left_nothing_is_told_by_its_log(folder: Path) -> None:
     outcome = collected(folder)
     assert outcome.status == "failed"
     assert "ended without a result" in outcome.message
-    assert "its last words: RuntimeError: no luck" in outcome.message
+    assert "its last lines: RuntimeError: no luck" in outcome.message
 
 
 def test_one_trial_of_each_cloud_begins_first() -> None:

@@ -27,7 +27,7 @@ from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.isolate import telling_tail
 from gsbench.system.own_modules import allowed_modules, take_over
 from gsbench.system.resources import assign_gpu, assign_threads, take_slot
-from gsbench.system.stopping import Stopped, stop_on_signals
+from gsbench.system.stopping import PASSED_ON, SIGNALS, Stopped, interrupts_ignored, stop_on_signals
 from gsbench.tracking import Mirror
 from gsbench.words import counted
 
@@ -59,7 +59,7 @@ class TrialJob:
         launch = self.values["launch"]
         by_submitit = signal.getsignal(signal.SIGUSR2) if hasattr(signal, "SIGUSR2") else None
         try:
-            with stop_on_signals(), ExitStack() as stack:
+            with stop_on_signals(PASSED_ON if launch["name"] == "local" else SIGNALS), ExitStack() as stack:
                 if launch["name"] == "local":
                     slot = stack.enter_context(take_slot(TrialFolder.of(self.values).runs, launch["parallel"]))
                     assign_gpu(slot, self.visible_gpus)
@@ -122,7 +122,8 @@ def _run(trials: Sequence[Trial], executor: Executor, parallel: int, mirror: Mir
         while waiting or running:
             while waiting and len(running) < parallel:
                 trial = waiting.pop(0)
-                running[trial.folder] = executor.submit(job_of(trial))
+                with interrupts_ignored():  # Ctrl-C comes to all processes; this one passes it on, below
+                    running[trial.folder] = executor.submit(job_of(trial))
                 mirror.follow(trial.folder, trial.values["tracking"])
             ended = [folder for folder, job in running.items() if job.done()]
             for folder in ended:
@@ -152,12 +153,15 @@ def collect(job: Job[Outcome], folder: Path, trials: Sequence[Trial]) -> Outcome
     """The outcome of an ended job, by the trial's files; where they say nothing, by the last words of the job's log."""
     values = next(trial.values for trial in trials if trial.folder == folder)
     files, log_file = TrialFolder(folder), job.paths.stderr
-    if not files.why_not_done(values):
+    reason = files.why_not_done(values)
+    if not reason:
         return outcome_of_results(folder, files.record())
     if files.has_failed():
         failure = files.failure()
         return Outcome(folder, "failed", f"{failure.reason}; log: {log_file}", failure.bad_input)
-    said = f"; its last words: {telling_tail(log_file)}" if log_file.is_file() else ""
+    if files.sound_record() is not None:
+        return Outcome(folder, "failed", f"its results no longer hold ({reason}): give the command again")
+    said = f"; its last lines: {telling_tail(log_file)}" if log_file.is_file() else ""
     return Outcome(
         folder, "failed", f"the process ended without a result (killed, or out of memory){said}; log: {log_file}"
     )

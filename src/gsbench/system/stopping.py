@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from types import FrameType
 
 SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGUSR2") if hasattr(signal, name))
+# Of a process that ignores Ctrl-C, since the one that started it passes it on.
+PASSED_ON = tuple(signum for signum in SIGNALS if signum != signal.SIGINT)
 
 
 class Stopped(KeyboardInterrupt):
@@ -29,7 +31,7 @@ class Stopped(KeyboardInterrupt):
 
 
 class _State:
-    active = False  # within stop_on_signals
+    signals: Sequence[int] = ()  # that stop, within stop_on_signals
     deferring = 0  # depth of blocks that stop where it suits them
     requested: int | None = None
 
@@ -40,26 +42,39 @@ def requested() -> bool:
 
 
 @contextmanager
-def stop_on_signals() -> Iterator[None]:
+def stop_on_signals(signals: Sequence[int] = SIGNALS) -> Iterator[None]:
     """Raise `Stopped` in the main thread when a signal comes; the earlier handlers are back afterwards."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    earlier = {signum: signal.signal(signum, _on_signal) for signum in SIGNALS}
-    was_active, _State.active = _State.active, True
+    earlier = {signum: signal.signal(signum, _on_signal) for signum in signals}
+    before, _State.signals = _State.signals, signals
     try:
         yield
     finally:
-        _State.active = was_active
+        _State.signals = before
         for signum, handler in earlier.items():
             signal.signal(signum, handler)
         _State.requested = None
 
 
+@contextmanager
+def interrupts_ignored() -> Iterator[None]:
+    """Ignore Ctrl-C for a moment, so that processes started within the block ignore it for good."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    handler = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, handler)
+
+
 def take_signals_back() -> None:
     """Install the handlers again, within `stop_on_signals`: importing pycolmap replaces that of SIGTERM."""
-    if _State.active and threading.current_thread() is threading.main_thread():
-        for signum in SIGNALS:
+    if threading.current_thread() is threading.main_thread():
+        for signum in _State.signals:
             signal.signal(signum, _on_signal)
 
 
