@@ -153,13 +153,15 @@ def collect(job: Job[Outcome], folder: Path, trials: Sequence[Trial]) -> Outcome
     """The outcome of an ended job, by the trial's files; where they say nothing, by the last words of the job's log."""
     values = next(trial.values for trial in trials if trial.folder == folder)
     files, log_file = TrialFolder(folder), job.paths.stderr
-    reason = files.why_not_done(values)
-    if not reason:
-        return outcome_of_results(folder, files.record())
+    record = files.sound_record()
+    lacking = () if record is None else record.awaited  # weights that a trial which has just ended did not find
+    reason = files.why_not_done(values, lambda options: lacking)
+    if record is not None and not reason:
+        return outcome_of_results(folder, record)
     if files.has_failed():
         failure = files.failure()
         return Outcome(folder, "failed", f"{failure.reason}; log: {log_file}", failure.bad_input)
-    if files.sound_record() is not None:
+    if record is not None:
         return Outcome(folder, "failed", f"its results no longer hold ({reason}): give the command again")
     said = f"; its last lines: {telling_tail(log_file)}" if log_file.is_file() else ""
     return Outcome(
