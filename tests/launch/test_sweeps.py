@@ -284,7 +284,7 @@ def test_finished_trial_is_recognised_until_something_changes(runs: Path) -> Non
         ("no inputs", "results.json does not say what it was made of"),
         ("an input less", "results.json is damaged: it lacks 'made_of.entries'"),
         ("inputs of another kind", "results.json is damaged: made_of.sources is "),
-        ("weights", "it lacks lpips_vgg, which can"),
+        ("weights", "it lacks lpips_vgg, which can be computed now"),
         ("half a file", "results.json is not JSON"),
     ],
 )
@@ -411,7 +411,8 @@ def test_dry_run_tells_states_and_time(runs: Path) -> None:
     assert [line.split()[0] for line in lines[:4]] == ["done", "missing", "missing", "missing"]
     assert "as in other: nothing to compute" in lines[1]
     assert lines[4] == "4 trials: 1 done, 3 missing"
-    assert lines[5] == "time: about 15 min, 2 at once, estimated from 2 finished trials"  # 2 x 900 / 2
+    # 2 x (600 + 1200) / 2, two at once
+    assert lines[5] == "time: about 15 min, 2 at once, estimated from 2 finished trials"
     assert FinishedTrials(runs).elsewhere(TrialFolder.of(trials[1].values)) == "other"
     assert describe_plan(trials[1:2])[1:] == [
         "1 trial: 1 missing",

@@ -249,6 +249,7 @@ def plain(values: Any) -> Any:
     """
     if isinstance(values, DictConfig):
         own = OmegaConf.masked_copy(values, [str(key) for key in values if key != "hydra"])
+        OmegaConf.copy_cache(values, own)  # one ${now:…} for all trials of a sweep
         return plain(OmegaConf.to_container(own, resolve=True, enum_to_str=True))
     if isinstance(values, dict):
         return {key: plain(value) for key, value in values.items()}
