@@ -14,7 +14,7 @@ from gsbench.analysis.declaration import standing
 from gsbench.analysis.judgement import Verdict, judge
 from gsbench.analysis.results import read_experiment
 from gsbench.config.compose import Trial
-from gsbench.launch.record import add_to_plan, declare, declared_metrics, planned_trials
+from gsbench.launch.record import add_to_plan, declare
 from gsbench.launch.serial import Outcome, outcome_of_results
 from gsbench.runs.declaration import read_declarations
 from gsbench.runs.layout import CONFIG, RESULTS
@@ -37,7 +37,7 @@ class Fake:
 
     def __call__(self, trials: Sequence[Trial]) -> list[Outcome]:
         add_to_plan(trials)
-        declare(declared_metrics(trials), planned_trials(trials))
+        declare(trials)
         self.batches.append([])
         outcomes = []
         for trial in trials:

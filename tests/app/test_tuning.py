@@ -22,7 +22,7 @@ from gsbench.analysis.tables import build_table
 from gsbench.app.tuning import TuneSettings
 from gsbench.config.compose import Trial
 from gsbench.errors import GsbenchError
-from gsbench.launch.record import add_to_plan, declare, declared_metrics, planned_trials
+from gsbench.launch.record import add_to_plan, declare
 from gsbench.launch.serial import Outcome, outcome_of_error, outcome_of_results
 from gsbench.runs.declaration import Arm
 from gsbench.runs.experiments import TuningRecord, read_tuning
@@ -65,7 +65,7 @@ class Fake:
 
     def __call__(self, trials: Sequence[Trial]) -> list[Outcome]:
         add_to_plan(trials)
-        declare(declared_metrics(trials), planned_trials(trials))
+        declare(trials)
         self.batches.append(len(trials))
         return [self.run(trial) for trial in trials]
 

@@ -153,7 +153,7 @@ def test_a_combination_whose_trials_are_missing_has_no_verdict(tmp_path: Path) -
         (["densify=adc", "densify.split_shrink=1.5,2"], "only scene and seed"),
         (["densify=adc", "--switches", "opacity_rest"], "did you mean opacity_reset"),
         (["densify=adc", "+densify.switches.a.off.split_shrnk=2"], "split_shrnk"),
-        (["densify=adc", "--fast"], "--fast is not an option"),
+        (["densify=adc", "--fast"], "unrecognized arguments: --fast"),
         (["densify=adc", "launch.stop_when_decided=true", "eval.primary=psnr", "seed=0,1"], "stop_when_decided"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else None,

@@ -14,7 +14,7 @@ from gsbench.analysis.results import load_experiment
 from gsbench.cli import run
 from gsbench.config.compose import Trial, compose_one
 from gsbench.errors import InputError
-from gsbench.launch.record import declare, declare_questions, declared_metrics, planned_trials
+from gsbench.launch.record import declare, declare_questions, declared_metrics
 from gsbench.runs.declaration import Declaration, Question, read_declarations
 from tests.end_to_end.conftest import SMALL
 
@@ -35,13 +35,13 @@ def test_a_declaration_is_kept_with_its_time_and_changes_are_added(
     undeclared, psnr, ssim = (
         composed(tmp_path, *words) for words in ([], ["eval.primary=psnr"], ["eval.primary=ssim"])
     )
-    declare(declared_metrics([undeclared]), planned_trials([undeclared]))
+    declare([undeclared])
     assert read_declarations(tmp_path / "exp") == []
     for trials in ([psnr, psnr], [psnr], [undeclared]):  # said again, or not said: it stands
-        declare(declared_metrics(trials), planned_trials(trials))
+        declare(trials)
         assert [one.primary for one in read_declarations(tmp_path / "exp")] == ["psnr"]
     with caplog.at_level(logging.WARNING):
-        declare(declared_metrics([ssim]), planned_trials([ssim]))
+        declare([ssim])
     assert {one.primary for one in read_declarations(tmp_path / "exp")} == {"psnr", "ssim"}
     assert "about ssim, and the report will say that psnr was declared before" in caplog.text
 
@@ -51,7 +51,7 @@ def test_trials_are_declared_with_the_metric_and_those_of_later_commands_are_add
 ) -> None:
     def say(*commands: tuple[str, ...]) -> list[dict[str, list[int]]]:
         trials = [composed(tmp_path, *words) for words in commands]
-        declare(declared_metrics(trials), planned_trials(trials))
+        declare(trials)
         lines = (tmp_path / "exp" / "declared.jsonl").read_text().splitlines()
         return [json.loads(line)["trials"] for line in lines]
 
@@ -86,7 +86,7 @@ def test_claims_are_kept_beside_declared_metrics(tmp_path: Path, caplog: pytest.
     first = declare_questions(home, claims("psnr", "2020-01-01T00:00:00Z"))
     assert declare_questions(home, claims("psnr", "2021-01-01T00:00:00Z")) == first  # it stands, with its time
     declared = [composed(tmp_path, "eval.primary=psnr")]
-    declare(declared_metrics(declared), planned_trials(declared))
+    declare(declared)
     assert not caplog.text
     with caplog.at_level(logging.WARNING):
         declare_questions(home, claims("ssim", "2022-01-01T00:00:00Z"))

@@ -23,7 +23,7 @@ from gsbench.errors import InputError
 from gsbench.records import read_if_sound
 from gsbench.runs.declaration import Declaration, declared_now, read_declarations, standing_one
 from gsbench.runs.layout import FAILED, SEED
-from gsbench.runs.trial_folder import Failure, TrialFolder
+from gsbench.runs.trial_folder import Failure
 from gsbench.words import some_of, without_places
 
 Lacking = Callable[[Sequence[Trial]], Sequence[str]]  # a line for each thing that is not here
@@ -143,7 +143,7 @@ def prepare(file: ClaimsFile, runs: Path, lacking: Lacking, permissions: Sequenc
             if reason:
                 reasons.setdefault(reason, []).append(scene)
                 continue
-            baseline, arm_key = (_folder_of(trial) for trial in trials)
+            baseline, arm_key = (trial.files.key for trial in trials)
             if baseline == arm_key:
                 raise InputError(f"claim {claim.id}: {claim.baseline} and {claim.arm} are the same trial on {scene}")
             first |= {baseline: trials[0], arm_key: trials[1]}
@@ -211,12 +211,6 @@ def _check_same_claims(file: ClaimsFile, declaration: Declaration) -> None:
             )
     if unknown := declared.keys() - {claim.id for claim in file.claims}:
         raise InputError(f"the file lacks claims that were declared: {', '.join(sorted(unknown))}")
-
-
-def _folder_of(trial: Trial) -> str:
-    """The folder of the trial within its experiment, without the seed."""
-    folder = TrialFolder.of(trial.values).path
-    return "/".join(folder.parts[-3:]).rpartition(SEED)[0]
 
 
 def _composed(words: Sequence[str], runs: Path, where: str) -> Trial:

@@ -16,7 +16,7 @@ from gsbench.config.compose import Trial
 from gsbench.config.schema import COMPONENTS
 from gsbench.errors import InputError
 from gsbench.files import FORBIDDEN, checked_runs_folder, make_runs_folder, storage_errors
-from gsbench.launch.record import add_to_plan, declare, declared_metrics, planned_trials
+from gsbench.launch.record import add_to_plan, declare, declared_metrics
 from gsbench.launch.serial import Outcome, outcome_of_results, run_serial
 from gsbench.runs.code import OWN
 from gsbench.runs.keys import STAGES
@@ -55,7 +55,7 @@ def _run(trials: Sequence[Trial], launcher: str) -> list[Outcome]:
 
 def _begin(trials: Sequence[Trial], unfinished: Sequence[Trial]) -> None:
     """Refuse what can be known to fail, then make the runs folder, tidy the store, write plan and declaration."""
-    metrics = declared_metrics(trials)
+    declared_metrics(trials)
     runs, launcher = checked_runs_folder(trials[0].values["runs"]), trials[0].values["launch"]["name"]
     # A node of a cluster may have folders and devices that this machine lacks.
     if launcher != "slurm" and (missing := missing_folders(unfinished)):
@@ -74,7 +74,7 @@ def _begin(trials: Sequence[Trial], unfinished: Sequence[Trial]) -> None:
         return
     Store(runs / STORE).sweep(STAGES)
     add_to_plan(trials)
-    declare(metrics, planned_trials(trials))
+    declare(trials)
 
 
 def _skip_finished(trials: Sequence[Trial]) -> tuple[list[Outcome], list[Trial]]:

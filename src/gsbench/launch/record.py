@@ -10,7 +10,7 @@ import logging
 import os
 import shutil
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -24,16 +24,14 @@ from gsbench.parsing import DamagedError
 from gsbench.records import Amount, Record, read_typed
 from gsbench.runs.declaration import (
     Declaration,
-    Planned,
     declared_now,
     open_question,
     read_declarations,
     record_text,
-    trial_key,
     united,
 )
 from gsbench.runs.experiments import make_home
-from gsbench.runs.layout import DECLARED, PLAN, RESULTS, SEED
+from gsbench.runs.layout import DECLARED, PLAN, RESULTS
 from gsbench.settings import is_folder_name
 from gsbench.system.locks import hold
 
@@ -145,38 +143,31 @@ def declared_metrics(trials: Sequence[Trial]) -> dict[Path, str | None]:
     return found
 
 
-def planned_trials(trials: Sequence[Trial]) -> dict[Path, Planned]:
-    """The trials that a command asks for, by the folder of their experiment, whether they are done or not."""
-    found: dict[Path, dict[str, set[int]]] = {}
-    for trial in trials:
-        scene, arm, leaf = trial.folder.parts[-3:]
-        key = trial_key(scene, arm, leaf.partition(SEED)[0])
-        found.setdefault(trial.files.home, {}).setdefault(key, set()).add(trial.values["seed"])
-    return {home: {key: tuple(sorted(seeds)) for key, seeds in planned.items()} for home, planned in found.items()}
+def declare(trials: Sequence[Trial]) -> None:
+    """Add to each experiment's record what these trials declare, where it does not stand there yet.
 
-
-def declare(metrics: Mapping[Path, str | None], planned: Mapping[Path, Planned]) -> None:
-    """Add to each experiment's record what its trials declare, where it does not stand there yet.
-
-    That is a metric (`declared_metrics`) and the trials that a command asks for (`planned_trials`). A declaration is
-    not taken back by a command without one: the trials that such a command adds are added to it, with their time.
+    That is a metric (`declared_metrics`) and the trials themselves, whether they are done or not. A declaration is not
+    taken back by a command without one: the trials that such a command adds are added to it, with their time.
     """
-    for home, given in metrics.items():
+    for home, given in declared_metrics(trials).items():
+        seeds: dict[str, set[int]] = {}
+        for trial in trials:
+            if trial.files.home == home:
+                seeds.setdefault(trial.files.key, set()).add(trial.values["seed"])
+        asked = {key: tuple(sorted(own)) for key, own in seeds.items()}
         make_home(home)
         with hold(home / f".{DECLARED}.lock", "the declarations"):
             every = read_declarations(home)
-            known = [one for one in every if not one.of_claims]
-            latest = known[-1] if known else None
-            metric = latest.primary if given is None and latest is not None else given
+            latest = next((one for one in reversed(every) if not one.of_claims), None)
+            metric = given or (None if latest is None else latest.primary)
             if metric is None:
                 continue
-            if given is None and latest is not None:
+            if latest is not None and given is None:
                 log.info("%s: %s stays declared, since %s", home.name, latest.primary, latest.when)
             before = {} if latest is None else latest.planned
-            together = united(before, planned[home])
+            together = united(before, asked)
             same = latest is not None and latest.primary == metric
-            known_trials = latest is not None and latest.names_trials
-            if same and (together == before or not known_trials):
+            if latest is not None and same and (together == before or not latest.names_trials):
                 continue
             added = declared_now(questions=(open_question(metric),), trials=dict(together))
             write_text(home / DECLARED, record_text([*every, added]))

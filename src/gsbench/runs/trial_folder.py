@@ -133,6 +133,11 @@ class TrialFolder:
         return self.path.parents[2]
 
     @property
+    def key(self) -> str:
+        """The folder within its experiment, without the seed (`gsbench.runs.declaration.trial_key`)."""
+        return self.path.relative_to(self.home).as_posix().rpartition(SEED)[0]
+
+    @property
     def lock(self) -> Path:
         """The lock that the process which runs the trial holds."""
         return self.path / LOCK

@@ -30,9 +30,8 @@ DEFAULT_METRIC = "psnr"
 
 def main(argv: Sequence[str], runs: Path) -> int:
     """The verb: the exit code says, as that of a sweep, whether some trial failed; raises InputError for bad input."""
-    options, settings = _parser().parse_known_args(argv)
-    if unknown := [word for word in settings if word.startswith("-")]:
-        raise InputError(f"ablate: {unknown[0]} is not an option (see gsbench ablate --help)")
+    options = _parser().parse_args(argv)
+    settings = options.settings
     words = [*settings, *([] if _names_experiment(settings) else [f"name={_default_name(settings)}"])]
     first = _trials(words)
     densify = _only_densifier(first)
@@ -55,7 +54,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
     home = flat[0].files.home
     code = run_trials(flat)
     if code == 0:
-        keys = {run: {t.values["scene"]["name"]: _key(t, home) for t in group} for run, group in trials.items()}
+        keys = {run: {t.values["scene"]["name"]: t.files.key for t in group} for run, group in trials.items()}
         metric = options.metric or flat[0].values["eval"].get("primary") or DEFAULT_METRIC
         print("\n".join(table(judge_runs(read_experiment(home).trials, keys, metric))))
         print(f"all metrics and pictures: gsbench report {home.name}")
@@ -67,7 +66,9 @@ def _parser() -> ArgumentParser:
         prog="gsbench ablate",
         description="Train a densifier with its parts switched off in all combinations (docs/claims.md), and judge "
         "each against the densifier with all of them.",
-        epilog="All other words are settings, as of a sweep: densify=volumetric_once scene=courtyard seed=0,1,2 …",
+    )
+    parser.add_argument(
+        "settings", nargs="*", metavar="KEY=VALUE", help="as of a sweep: densify=volumetric_once seed=0,1,2 …"
     )
     parser.add_argument(
         "--switches", type=names, default=(), metavar="A,B", help="only these; default: all it declares"
@@ -78,16 +79,10 @@ def _parser() -> ArgumentParser:
 
 
 def _trials(words: Sequence[str]) -> list[Trial]:
-    """The trials of a sweep's words, without what Hydra knows of them as jobs of one command."""
-    trials = [Trial(trial.values, trial.overrides) for trial in compose_trials(words, multirun=True)]
+    trials = compose_trials(words, multirun=True)
     if trials[0].values["launch"]["stop_when_decided"]:
         raise InputError("ablate needs all seeds of all runs: leave launch.stop_when_decided out")
     return trials
-
-
-def _key(trial: Trial, home: Path) -> str:
-    """The trial's folder within the experiment, without the seed."""
-    return trial.folder.relative_to(home).as_posix().rpartition(SEED)[0]
 
 
 def _only_densifier(trials: Sequence[Trial]) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import os
 import sys
 import tempfile
@@ -47,7 +48,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
     with tempfile.TemporaryDirectory(prefix="gsbench-bisect-") as scratch:
         trees = WorkTrees(Path.cwd(), Path(scratch).resolve())
         commits = trees.commits(options.good, options.bad)
-        search = _begin(options.settings, options.metric, options.least, options.seeds, trees, commits)
+        search = _begin(options, trees, commits)
         found = first_worse(len(commits) - 1, search.result)
     print("\n".join([*search.table(), "", *_conclusion(found, search)]))
     return FOUND if found is not None and found[1] - found[0] == 1 else NOT_FOUND
@@ -111,16 +112,9 @@ class Search:
         return lines
 
 
-def _begin(
-    settings: Sequence[str],
-    metric: str,
-    least: str | None,
-    seeds: int,
-    trees: WorkTrees,
-    commits: Sequence[tuple[str, str, str]],
-) -> Search:
+def _begin(options: argparse.Namespace, trees: WorkTrees, commits: Sequence[tuple[str, str, str]]) -> Search:
     """Look at the words, and declare the question of all steps before the first."""
-    first = first_trials("bisect", settings, metric)
+    first = first_trials("bisect", options.settings, options.metric)
     some = next(iter(first.values()))
     for trial in first.values():
         place = trial.values["scene"].get("path")
@@ -128,8 +122,9 @@ def _begin(
             raise InputError(f"scene.path={place}: commits are trained in other folders, so give the whole path")
     arms = {scene: (trial.folder.parent.name,) * 2 for scene, trial in first.items()}
     share = ERROR_RATE / most_steps(len(commits) - 1)
-    declaration = ask(metric, least, arms, range(max(0, seeds)), some.values, share)
-    kept = [word for word in settings if not word.startswith(("name=", "runs="))]
+    seeds = range(max(0, options.seeds))
+    declaration = ask(options.metric, options.least, arms, seeds, some.values, share)
+    kept = [word for word in options.settings if not word.startswith(("name=", "runs="))]
     runs = checked_runs_folder(str(some.files.runs))
     make_runs_folder(runs)
     home = runs / f"{some.values['name']}_{sha256_of([commits[0][0], commits[-1][0], *kept])[:SHOWN]}"
