@@ -20,9 +20,14 @@ import os
 from subprocess import Popen
 
 from gsbench.densify import ADC
+from hydra.experimental.callback import Callback
 
 class Mine(ADC):
     pass
+
+class Calls(Callback):
+    def __init__(self, **rest):
+        self.rest = rest
 """
 
 

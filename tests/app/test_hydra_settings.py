@@ -36,8 +36,6 @@ def test_a_sweep_has_one_time() -> None:
         "hydra.sweep.dir=elsewhere",
         "hydra.output_subdir=x",
         "+hydra.job.env_set.OMP_NUM_THREADS='1'",
-        "+hydra.callbacks.log._target_=hydra.experimental.callbacks.LogJobReturnCallback",
-        "hydra/launcher=basic",
     ],
 )
 def test_what_hydra_alone_would_read_is_refused(word: str) -> None:
@@ -54,10 +52,13 @@ def test_what_hydra_alone_would_read_is_refused(word: str) -> None:
         (["-m", "hydra/sweeper=basic", "seed=0,1"], "gsbench has its own"),
         (["-m", "densify=glob([av]*)"], """'densify=glob("[av]*")'"""),
         (["-m", "densify=choice([av,b)"], "is not a setting like key=value"),
+        (["-m", "hydra/launcher=joblib", "seed=0,1", "hydra.launcher.jobs=3"], "n_jobs"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else None,
 )
 def test_what_cannot_be_is_refused_in_a_line(words: list[str], text: str, capsys: pytest.CaptureFixture[str]) -> None:
+    if "hydra/launcher=joblib" in words:
+        pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     assert cli.run([*words, "--dry-run"]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert text in line

@@ -173,6 +173,14 @@ def test_more_seeds_after_looking_are_another_plan_and_lose_the_place(sweep: Cal
     assert verdict.late
 
 
+@pytest.mark.slow
+def test_another_launcher_of_hydras_gets_one_look_at_a_time(sweep: Callable[..., int]) -> None:
+    fake = Fake(noise)
+    assert sweep(fake, "hydra/launcher=basic", "launch=serial") == 0
+    assert len(fake.batches) == 8  # a call for each trial
+    assert [seed for ((_, seed),) in fake.batches] == [0, 0, 1, 1, 2, 2, 3, 3]
+
+
 def test_settings_make_arms_and_the_report_opens_with_the_looks(
     sweep: Callable[..., int], runs: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -25,9 +25,33 @@ from tests.strange import place as place
 
 pytestmark = pytest.mark.usefixtures("place")
 MKDIR = {"_target_": "os.mkdir", "path": "exploded"}
+LOG_CALLBACK = "hydra.experimental.callbacks.LogJobReturnCallback"
+
+
+def calls(**settings: Any) -> dict[str, Any]:
+    """Settings with one of Hydra's own callbacks, and beside its name what a stranger adds."""
+    return {"hydra": {"callbacks": {"x": {"_target_": LOG_CALLBACK} | settings}}}
+
 
 STRANGE: dict[str, tuple[dict[str, Any], str]] = {  # settings of a file, and a part of the line that refuses them
-    "a callback": ({"hydra": {"callbacks": {"x": MKDIR}}}, "hydra.callbacks: gsbench runs the trials itself"),
+    "a callback": ({"hydra": {"callbacks": {"x": MKDIR}}}, "allow_targets=[os]"),
+    "below a callback": (calls(inner=MKDIR), "allow_targets=[os]"),
+    "in a list below a callback": (calls(inner=[{"a": [[MKDIR]]}]), "callbacks.x.inner.0.a.0.0."),
+    "among positional arguments": (calls(_args_=[MKDIR]), "_args_: gsbench makes no"),
+    "a module of the folder": (calls(inner={"_target_": "bomb.Bomb"}), "allow_targets=[bomb]"),
+    "beside Hydra's callbacks": (calls(_target_="hydra.experimental.callbacks.pickle.loads"), "allow_targets=[hydra]"),
+    "what gsbench's modules import": (
+        calls(_target_="gsbench.files.os.mkdir", path="exploded"), "is not a class for hydra.callbacks.x"
+    ),
+    "a class of gsbench in a strange place": (
+        calls(_target_="gsbench.logs._QuietFileHandler", filename="exploded"), "is not a class for hydra.callbacks.x"
+    ),
+    "a copy for a callback": ({"hydra": {"callbacks": {"x": "${densify}"}}}, "write the settings"),
+    "a copy in a callback": (calls(inner="${hydra.launcher}"), "write the settings"),
+    "all callbacks as a copy": ({"hydra": {"callbacks": "${train}"}}, "hydra.callbacks"),
+    "a callback that allows itself": (
+        {"allow_targets": ["os"], "hydra": {"callbacks": {"x": MKDIR}}}, "no file can allow it"
+    ),
     "below the sweeper": (
         {"hydra": {"mode": "MULTIRUN", "sweeper": {"params": {"in": MKDIR}}}}, "sweeper.params.in._target_=os.mkdir"
     ),
@@ -35,6 +59,11 @@ STRANGE: dict[str, tuple[dict[str, Any], str]] = {  # settings of a file, and a 
     "a sweeper": ({"hydra": {"sweeper": {"_target_": "hydra_plugins.bomb.Bomb"}}}, "gsbench has its own"),
     "a launcher": ({"hydra": {"launcher": {"_target_": "hydra_plugins.gsbench.os.mkdir"}}}, "hydra.launcher: gsbench"),
     "beside the launcher": ({"hydra": {"launcher": {"in": MKDIR}}}, "hydra.launcher"),
+    "a copy for the launcher": ({"hydra": {"launcher": "${densify}"}}, "hydra.launcher"),
+    "a launcher that hands lines to a shell": (
+        {"hydra": {"launcher": {"_target_": "hydra_plugins.hydra_submitit_launcher.submitit_launcher.SlurmLauncher"}}},
+        "gsbench works with basic and joblib",
+    ),
     "a name in parts": (
         {"name": "mkdir", "densify": {"_target_": "os.${name}", "path": "exploded"}}, "write the name itself"
     ),
@@ -115,9 +144,11 @@ JOBS: dict[str, tuple[dict[str, Any], str]] = {  # the words that a file's sweep
 
 
 @pytest.mark.parametrize("place_of_words", ["params", "grids"])
+@pytest.mark.parametrize("launcher", ["gsbench", "basic"])
 @pytest.mark.parametrize("case", JOBS)
 def test_nor_what_only_the_jobs_of_a_sweep_say(
     case: str,
+    launcher: str,
     place_of_words: str,
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
@@ -125,7 +156,8 @@ def test_nor_what_only_the_jobs_of_a_sweep_say(
     words, said = JOBS[case]
     words = words | {"seed": "0,1"}
     node = {"params": words} if place_of_words == "params" else {"grids": [words]}
-    assert said in ask(experiment({"hydra": {"mode": "MULTIRUN", "sweeper": node}}), capsys, monkeypatch)
+    run = [*experiment({"hydra": {"mode": "MULTIRUN", "sweeper": node}}), f"hydra/launcher={launcher}"]
+    assert said in ask(run, capsys, monkeypatch)
     assert not Path("exploded").exists()
 
 
@@ -229,6 +261,29 @@ def test_trust_in_a_module_extends_to_gsbenchs_classes_in_it() -> None:
     allow_modules(["mine"])
     assert load_class("mine.ADC", "densify", ["mine"]).__module__.startswith("gsbench.")
     assert load_class("mine.Mine", "densify", ["mine"]).__name__ == "Mine"
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"_target_": "mine.Popen", "args": "true"}, "is subprocess.Popen"),
+        ({"_target_": "mine.Mine"}, "is not a class of hydra.experimental.callback.Callback"),
+        ({"_target_": "mine.Calls", "in": {"_target_": "mine.Popen"}}, "is subprocess.Popen"),
+        ({"_target_": "mine.Calls", "in": {"_target_": "mine.os.mkdir"}}, "cannot be imported"),
+        ({"size": 3}, "hydra.callbacks.x names no _target_"),
+    ],
+)
+def test_callbacks_are_classes_of_the_allowed_module(
+    settings: dict[str, Any], said: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = [*experiment({"hydra": {"callbacks": {"x": settings}}}), "allow_targets=[mine]"]
+    assert said in ask(run, capsys, monkeypatch)
+
+
+def test_an_allowed_callback_is_made(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    nested = {"_target_": "mine.Calls", "in": {"_target_": "mine.Calls"}}
+    run = [*experiment({"hydra": {"callbacks": {"x": nested}}}), "allow_targets=[mine]"]
+    assert "the trials began" in ask(run, capsys, monkeypatch)
 
 
 def test_only_allowed_modules_of_the_folder_are_found_and_behind_what_is_installed(place: Path) -> None:

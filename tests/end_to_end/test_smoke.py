@@ -200,3 +200,11 @@ def test_slurms_job_command_runs_the_trial(gsbench: Run, runs: Path, tmp_path: P
     )
     assert ran.returncode == 0, ran.stderr
     assert list(trials_of(runs, "x")) == ["none-1"]
+
+
+def test_hydra_multirun_with_another_launcher(gsbench: Run, runs: Path) -> None:
+    words = ["-m", *TINY, "densify=none", "hydra/launcher=basic", "name=x", "seed=0,1"]
+    done = gsbench(*words, GSBENCH_RUNS=str(runs))
+    assert done.returncode == 0, done.stderr
+    assert list(trials_of(runs, "x")) == ["none-0", "none-1"]
+    assert "2 trials: 2 done" in gsbench("status", "x", GSBENCH_RUNS=str(runs)).stdout

@@ -18,7 +18,7 @@ import pytest
 import gsbench
 from gsbench import settings
 from gsbench.cli import run
-from gsbench.config import jobs
+from gsbench.config import compose
 from gsbench.densify import Volumetric
 from gsbench.gaussians.trainable import TrainableGaussians
 from tests.end_to_end.conftest import SMALL
@@ -83,19 +83,19 @@ def test_from_the_yaml_to_the_split(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         monkeypatch.setattr(owner, name, watched)
 
     compositions = 0
-    look_at = jobs.look_at  # at each job's configuration, as Hydra has composed it
+    look_at = compose.look_at  # at what Hydra has composed: for the command line, and for each job
 
     def counted(*given: Any) -> Any:
         nonlocal compositions
         compositions += 1
         return look_at(*given)
 
-    monkeypatch.setattr(jobs, "look_at", counted)
+    monkeypatch.setattr(compose, "look_at", counted)
     watch(settings, "_converted", lambda value, field, cls, key: key == KEY)
     watch(Volumetric, "split_by_volume")
     watch(TrainableGaussians, "edit", lambda *given: calls["split_by_volume"] > 0)
     assert run(["-m", *TRIAL, f"runs={tmp_path}"]) == 0
-    assert compositions == 1  # before the sweep: not again when a trial begins
+    assert compositions == 2  # before the sweep: not again when a trial begins
     assert calls["_converted"] == 2  # checked before the sweep, built when the trial begins
     assert len(stacks) == 3
     passed = way(stacks)

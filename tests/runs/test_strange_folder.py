@@ -6,6 +6,8 @@ import os
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
@@ -19,6 +21,7 @@ from gsbench.parsing import DamagedError, read_bytes
 from gsbench.runs.experiments import list_experiments
 from gsbench.runs.keys import Step
 from gsbench.runs.store import Store
+from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.locks import describe_holder, hold, is_held
 from tests.finished import write_results
 from tests.runs.toy import TOY, build, toy_inputs
@@ -59,7 +62,8 @@ def _forget(folder: Path) -> None:
 
 
 def _declare(folder: Path) -> None:
-    declare({folder.parents[2]: "psnr"}, {folder.parents[2]: {}})
+    trial: Any = SimpleNamespace(files=TrialFolder(folder), values={"seed": 0, "eval": {"primary": "psnr"}})
+    declare([trial])
 
 
 # What is a link in a trial's folder, and what then runs.

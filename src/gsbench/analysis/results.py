@@ -360,7 +360,7 @@ def read_trial(path: Path, runs_dir: Path, settings: Configurations) -> TrialRes
 
 def _why_unfinished(path: Path) -> str:
     if (path / FAILED).exists():
-        return f"failed, {TrialFolder(path).failure()}"
+        return f"failed, {TrialFolder(path).failure().reason}"
     return f"unfinished, no {RESULTS} yet" if (path / CONFIG).is_file() else "foreign, not a trial"
 
 

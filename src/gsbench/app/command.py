@@ -7,6 +7,7 @@ Before Hydra runs, one look at the whole configuration refuses what cannot be (`
 from __future__ import annotations
 
 import logging
+import os
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -22,12 +23,16 @@ from gsbench.analysis.quantities import COSTS
 from gsbench.config.command_words import check_words, is_sweep, parse
 from gsbench.config.compose import Trial, compose_whole, look_at, ready_trial, typed
 from gsbench.config.hydra_entry import explained, hydra_ready, run_main
-from gsbench.config.trust import PERMISSIONS
+from gsbench.config.trust import PERMISSIONS, check_composed, load_callbacks
 from gsbench.errors import GsbenchError, InputError
 from gsbench.eval.options import EvalConfig
 from gsbench.launch.batch import check_parts, missing_folders, need_no_check, run_batch
 from gsbench.launch.dry_run import describe_plan
 from gsbench.launch.serial import Outcome
+from gsbench.logs import set_up_logging
+from gsbench.system.own_modules import allow_modules
+
+OWN = "gsbench"  # the name of gsbench's own launcher
 
 log = logging.getLogger(__name__)
 
@@ -80,22 +85,36 @@ def run_trials(trials: Sequence[Trial]) -> int:
 class Task:
     """The function that Hydra runs. ``handle`` runs trials; where it shall ``look_only``, it says what would run.
 
-    ``allowed`` is what the command line permits, ``grids`` are what gsbench's sweeper joins. ``trials`` and
-    ``outcomes`` are what has come together, over all batches of a sweep.
+    ``allowed`` is what the command line permits, with the user's modules in ``folder``; ``grids`` are what gsbench's
+    sweeper joins. ``trials`` and ``outcomes`` are what has come together, over all batches of a sweep.
     """
 
     handle: Callable[[Sequence[Trial]], list[Outcome]]
     look_only: bool = False
     allowed: tuple[str, ...] = ()
+    folder: str = field(default_factory=os.getcwd)
     grids: Any = None
     trials: list[Trial] = field(default_factory=list)
     outcomes: list[Outcome] = field(default_factory=list)
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Task, (self.handle, self.look_only, self.allowed, self.folder)  # nothing of what came together here
+
     def __call__(self, config: DictConfig) -> None:
-        """One trial, as Hydra calls it."""
-        given: Any = HydraConfig.get().overrides
-        for_hydra, words = typed(given)
-        self.launch([ready_trial(look_at(config, self.allowed), [*for_hydra, *words])])
+        """One trial, as Hydra or another launcher calls it, perhaps in a process of its own; raises how it failed."""
+        allow_modules(self.allowed, self.folder)
+        set_up_logging()
+        hydra: Any = HydraConfig.instance().cfg
+        # A job's files may say other things of Hydra than those that were looked at.
+        check_composed(hydra, self.allowed)
+        for_hydra, words = typed(hydra.hydra.overrides)
+        trial = ready_trial(look_at(config, self.allowed), [*for_hydra, *words])
+        if hydra.hydra.mode == RunMode.RUN:
+            self.launch([trial])
+            return
+        (outcome,) = self.handle([trial])  # of a sweep, whose launcher hands on what is raised
+        if outcome.status == "failed":
+            raise (InputError if outcome.bad_input else GsbenchError)(outcome.message)
 
     def launch(self, trials: Sequence[Trial]) -> None:
         """Run a batch of trials."""
@@ -117,12 +136,17 @@ def run_app(words: Sequence[str], multirun: bool, task: Task) -> None:
         raise InputError(f"{swept[0]} lists several values: add -m to run one trial for each")
     with explained(words):
         check_sweep_settings(config, multirun)
+        check_launcher(config, multirun)
     task.allowed = tuple(config[PERMISSIONS])
     task.grids = OmegaConf.to_container(config.hydra.sweeper, resolve=False).get("grids")  # type: ignore[union-attr]
     # Hydra would resolve ${…} in the grids when it makes the sweeper; there it is for each trial to do.
     chosen = [*words, *["hydra.sweeper.grids=[]"] * bool(task.grids)]
+    if task.look_only:  # no callback hears of a look
+        chosen += [f"~hydra.callbacks.{name}" for name in config.hydra.callbacks]
+    else:
+        load_callbacks(config.hydra.callbacks, task.allowed)
     with explained(words, (HydraException, OmegaConfBaseException, OSError)):
-        run_main(task, [*chosen, f"hydra.mode={(RunMode.MULTIRUN if multirun else RunMode.RUN).name}"])
+        run_main(task, [*chosen, f"hydra.mode={(RunMode.MULTIRUN if multirun else RunMode.RUN).name}"], task.allowed)
 
 
 def list_trials(trials: Sequence[Trial]) -> list[Outcome]:
@@ -146,6 +170,17 @@ def check_sweep_settings(config: DictConfig, multirun: bool) -> None:
         )
     if config.launch.stop_when_decided and not multirun:
         raise InputError("launch.stop_when_decided adds seeds to a sweep: add -m, two densifiers and seed=0,1,2,3")
+
+
+def check_launcher(config: DictConfig, multirun: bool) -> None:
+    """Refuse another launcher than gsbench's where it cannot run trials, or where two would."""
+    launcher = config.hydra.runtime.choices["hydra/launcher"]
+    if launcher == OWN:
+        return
+    if not multirun:
+        raise InputError(f"hydra/launcher={launcher} launches sweeps: add -m, or leave it out")
+    if config.launch.name != "serial":
+        raise InputError(f"hydra/launcher={launcher} and launch={config.launch.name} are two launchers: choose one")
 
 
 def summarize(outcomes: Sequence[Outcome], trials: Sequence[Trial]) -> int:

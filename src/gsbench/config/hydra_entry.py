@@ -18,6 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from gsbench.config.command_words import GROUPS, options
 from gsbench.config.schema import register_schemas
+from gsbench.config.trust import HYDRAS_CALLBACKS
 from gsbench.errors import GsbenchError, InputError
 from gsbench.system.install import conf_dir
 from gsbench.words import closest
@@ -25,7 +26,7 @@ from gsbench.words import closest
 CONFIG_NAME = "config"  # conf/config.yaml
 # Hydra 1.3 wants to be told whose defaults hold; from 1.4 on there is one set of them, and being told is warned of.
 VERSION_BASE: dict[str, Any] = {"version_base": "1.3"} if hydra.__version__.startswith("1.3.") else {}
-# From 1.4 on Hydra makes objects within this context of the named classes alone.
+# From 1.4 on Hydra makes objects within this context of the named classes alone (``mine.*``: all of a module).
 WHITELIST: Callable[[Sequence[str]], AbstractContextManager[Any]] = getattr(
     hydra.utils, "execution_whitelist", lambda names: nullcontext()
 )
@@ -46,15 +47,19 @@ def hydra_ready() -> Iterator[None]:
         HydraConfig.instance().cfg = None
 
 
-def run_main(task: Callable[[Any], Any], argv: Sequence[str]) -> None:
-    """Run ``task`` as the app that ``hydra.main`` makes of it, with the words ``argv``; raises what it raises."""
+def run_main(task: Callable[[Any], Any], argv: Sequence[str], allowed: Sequence[str] = ()) -> None:
+    """Run ``task`` as the app that ``hydra.main`` makes of it, with the words ``argv``; raises what it raises.
+
+    The classes of callbacks are those that ``allowed`` names, and Hydra's own.
+    """
+    names = [name for name in allowed if all(part.isidentifier() for part in name.split("."))]
     register_schemas()
     saved, sys.argv = sys.argv, ["gsbench", *argv]
     full = os.environ.get("HYDRA_FULL_ERROR")
     os.environ["HYDRA_FULL_ERROR"] = "1"  # else Hydra prints errors itself, and exits
     stderr, sys.stderr = sys.stderr, _WithoutHydrasLine(sys.stderr)
     try:
-        with WHITELIST([]):
+        with WHITELIST([*HYDRAS_CALLBACKS, *names, *(f"{name}.*" for name in names)]):
             hydra.main(**VERSION_BASE, config_path=str(conf_dir()), config_name=CONFIG_NAME)(task)()
     finally:
         sys.argv, sys.stderr = saved, stderr
@@ -82,7 +87,7 @@ class _WithoutHydrasLine:
 MAX_MESSAGE = 400  # characters of an error of Hydra's that is not understood
 HINTS = {  # where a word may name a class of the user's, or a plug-in of Hydra's that is not installed
     **{group: f"; a class of your own is named by {group}._target_" for group in ("densify", "init", "raster")},
-    "hydra/launcher": "; gsbench runs the trials itself, as launch=serial, local or slurm says",
+    "hydra/launcher": "; other launchers are separate packages; launch=serial, local or slurm need none",
     "hydra/sweeper": "; gsbench has its own; a search is an interval and hydra.sweeper.tune.points",
 }
 

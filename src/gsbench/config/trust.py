@@ -60,15 +60,18 @@ BARE = re.compile(r"[\w./+-]+")  # what needs no quotes in a list on the command
 SPECIAL_KEYS = (  # what Hydra reads beside _target_
     "_recursive_", "_convert_", "_args_", "_partial_", "_isolate_", "_execution_whitelist_"
 )  # fmt: skip
-OWN_LAUNCHER, OWN_SWEEPER = "hydra_plugins.gsbench.GsbenchLauncher", "hydra_plugins.gsbench.GsbenchSweeper"
-# Settings of Hydra's that stay as conf/config.yaml has them, and why. Some start code: callbacks, launchers, sweepers
-# and logging name classes, and a variable can name what Python, a library or a program loads.
+OWN_SWEEPER = "hydra_plugins.gsbench.GsbenchSweeper"
+# Launchers that are looked for among the installed plug-ins. Others can run a line in a shell, as submitit's can.
+LAUNCHERS = ("GsbenchLauncher", "BasicLauncher", "JoblibLauncher")
+HYDRAS_CALLBACKS = tuple(
+    f"hydra.experimental.callbacks.{name}" for name in ("LogJobReturnCallback", "PickleJobInfoCallback")
+)
+# Settings of Hydra's that stay as conf/config.yaml has them, and why. Some start code: sweepers and logging name
+# classes, and a variable can name what Python, a library or a program loads.
 RUNS_TRIALS = "gsbench runs the trials itself, as launch=serial, local or slurm says: leave it out"
 IN_LOG = "log.txt in a trial's folder holds everything: leave it out"
 NO_LOGGING = {"version": 1, "root": None, "disable_existing_loggers": False}
 FIXED: dict[str, tuple[Any, str]] = {
-    "launcher": ({"_target_": OWN_LAUNCHER}, RUNS_TRIALS),
-    "callbacks": ({}, RUNS_TRIALS),
     "output_subdir": (None, RUNS_TRIALS),
     "run": ({"dir": "."}, RUNS_TRIALS),
     "sweep": ({"dir": "${runs}/.hydra", "subdir": "."}, RUNS_TRIALS),
@@ -244,7 +247,8 @@ def _check_place(place: tuple[str, ...], target: Any, allowed: Sequence[str]) ->
         return  # a schema, Hydra or `_check_hydra` says what is wrong with it
     group = ".".join(place)
     # Of gsbench's own classes each is for its group: `densify._target_=gsbench.init.…` would run another's constructor.
-    check_target(target, group, allowed, homes_of(place))
+    own = HYDRAS_CALLBACKS if place[:2] == ("hydra", "callbacks") and len(place) == 3 else homes_of(place)
+    check_target(target, group, allowed, own)
     if is_allowed(target, (PACKAGE,)) and not PUBLIC_CLASS.fullmatch(target):
         load_class(target, group, allowed)  # such as gsbench.densify.adc.torch.load
 
@@ -258,14 +262,16 @@ def _check_hydra(hydra: dict[str, Any]) -> None:
             found = {**fixed, **(found or {})}
         if found != fixed:
             raise InputError(f"hydra.{name}: {why}")
-    sweeper = hydra["sweeper"]
+    launcher, sweeper = hydra["launcher"], hydra["sweeper"]
     if sweeper.get(TARGET) != OWN_SWEEPER:
         raise InputError("hydra.sweeper: gsbench has its own, which searches intervals, too: leave hydra/sweeper out")
-    # ${…} may stand for a mapping with a class in it, of which Hydra would make an object when it makes the sweeper.
-    copies = [(place, key) for place, key, value in _entries(sweeper.get("tune"), ("tune",)) if "${" in str(value)]
-    copies += [((), key) for key, value in sweeper.items() if isinstance(value, str) and "${" in value]
-    for place, key in copies:
-        raise InputError(f"hydra.sweeper.{'.'.join((*place, key))}: write the settings themselves here, without ${{…}}")
+    # ${…} may stand for a mapping with a class in it, of which Hydra would make an object when it makes these.
+    made = {"callbacks": hydra["callbacks"], "launcher": launcher, "sweeper": sweeper | {"params": None, "grids": None}}
+    for place, key, value in _entries(made, ("hydra",)):
+        if isinstance(value, str) and "${" in value:
+            raise InputError(f"{'.'.join((*place, key))}: write the settings themselves here, without ${{…}}")
+    if not isinstance(launcher, dict) or launcher.get(TARGET) not in known_launchers():
+        raise InputError("hydra.launcher: gsbench works with basic and joblib, beside launch=serial, local and slurm")
     # A job is composed after this look: its words may search packages.
     for place, key, value in _entries(sweeper, ("hydra", "sweeper")):
         for text in (key, value) if key != TARGET else ():
@@ -274,6 +280,29 @@ def _check_hydra(hydra: dict[str, Any]) -> None:
                     f"{'.'.join(place)}: {text} cannot differ from job to job, and no file can allow it: "
                     "type it on the command line"
                 )
+
+
+def known_launchers() -> set[str]:
+    """The import paths of `LAUNCHERS`, as far as they are installed."""
+    from hydra.core.plugins import Plugins
+    from hydra.plugins.launcher import Launcher
+
+    every = Plugins.instance().discover(Launcher)
+    return {f"{found.__module__}.{found.__name__}" for found in every if found.__name__ in LAUNCHERS}
+
+
+def load_callbacks(callbacks: Any, allowed: Sequence[str]) -> None:
+    """Import the classes that ``hydra.callbacks`` names, of which Hydra will make objects; refuse what is none."""
+    from hydra.experimental.callback import Callback
+
+    for name, callback in (callbacks or {}).items():
+        if not isinstance(callback, Mapping) or not callback.get(TARGET):
+            raise InputError(f"hydra.callbacks.{name} names no {TARGET}: the class to use")
+        for place, target in targets_in(callback, ("hydra", "callbacks", str(name))):
+            found = load_class(target, ".".join(place), [*allowed, *HYDRAS_CALLBACKS])
+            if not isinstance(found, type) or (len(place) == 3 and not issubclass(found, Callback)):
+                wanted = "a class of hydra.experimental.callback.Callback" if len(place) == 3 else "a class"
+                raise InputError(f"{'.'.join(place)}.{TARGET}={target} is not {wanted}")
 
 
 def is_external(densify: Mapping[str, Any]) -> bool:

@@ -53,6 +53,12 @@ def _run(trials: Sequence[Trial], launcher: str) -> list[Outcome]:
         return run_local(trials, mirror)
 
 
+def begin_for_another_launcher(trials: Sequence[Trial]) -> None:
+    """Do all that precedes the first trial where another launcher will run them, perhaps several at once."""
+    with storage_errors(checked_runs_folder(trials[0].values["runs"])):
+        _begin(trials, [trial for trial in trials if _why_not_done(trial)])
+
+
 def _begin(trials: Sequence[Trial], unfinished: Sequence[Trial]) -> None:
     """Refuse what can be known to fail, then make the runs folder, tidy the store, write plan and declaration."""
     declared_metrics(trials)

@@ -1,0 +1,116 @@
+"""gsbench as a Hydra app, through the real program: launchers of others, and callbacks."""
+
+from __future__ import annotations
+
+import json
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+
+from tests.end_to_end.conftest import Run
+
+pytestmark = pytest.mark.slow
+SECONDS = 900  # a trial of three iterations on a machine that has much else to do
+
+TINY = [
+    *("scene=courtyard", "scene.views=6", "scene.width=64", "scene.height=48", "init=random", "init.count=300"),
+    *("densify=none", "train.iterations=3", "raster=reference", "device=cpu", "threads=1", "tracking=none"),
+    *("eval.download=false", "eval.lpips=[]"),
+]
+CALLBACK = """
+from hydra.experimental.callback import Callback
+
+class Note(Callback):
+    def __init__(self, path):
+        self.path = path
+
+    def note(self, text):
+        with open(self.path, "a") as stream:
+            stream.write(text + "\\n")
+
+    def on_multirun_start(self, config, **rest):
+        self.note("sweep begins")
+
+    def on_job_start(self, config, **rest):
+        self.note(f"{config.hydra.job.num} begins with seed {config.seed}")
+
+    def on_job_end(self, config, job_return, **rest):
+        self.note(f"{config.hydra.job.num} ends {job_return.status.name}")
+
+    def on_multirun_end(self, config, **rest):
+        self.note("sweep ends")
+"""
+EXPERIMENT = """# @package _global_
+name: own-${densify.name}
+hydra:
+  mode: MULTIRUN
+  callbacks:
+    note:
+      _target_: notes.Note
+      path: notes.txt
+  sweeper:
+    params:
+      seed: 0,1
+"""
+
+
+def results_below(folder: Path) -> list[dict[str, float]]:
+    return [json.loads(path.read_text()) for path in sorted(folder.rglob("results.json"))]
+
+
+def test_an_experiment_file_has_all_of_hydra(gsbench: Run, tmp_path: Path) -> None:
+    (tmp_path / "conf" / "experiment").mkdir(parents=True)
+    (tmp_path / "conf" / "experiment" / "own.yaml").write_text(EXPERIMENT)
+    (tmp_path / "notes.py").write_text(CALLBACK)
+    words = ["--config-dir", "conf", "+experiment=own", *TINY, "hydra/launcher=basic", "allow_targets=[notes]"]
+    listed = gsbench(*words, "--dry-run", GSBENCH_RUNS="runs", timeout=SECONDS)
+    assert "2 trials: 2 missing" in listed.stdout, listed.stderr
+    assert not (tmp_path / "notes.txt").exists()  # where nothing runs, no callback is called
+
+    done = gsbench(*words, GSBENCH_RUNS="runs", timeout=SECONDS)
+    assert done.returncode == 0, done.stderr
+    results = results_below(tmp_path / "runs" / "own-none")
+    assert [result["seed"] for result in results] == [0, 1]
+    notes = (tmp_path / "notes.txt").read_text().splitlines()
+    assert (notes[0], notes[-1]) == ("sweep begins", "sweep ends")
+    ends = [f"{i} ends COMPLETED" for i in (0, 1)]
+    assert sorted(notes[1:-1]) == sorted([*(f"{i} begins with seed {i}" for i in (0, 1)), *ends])
+
+
+def test_another_launcher_runs_a_trial_a_job(gsbench: Run, tmp_path: Path) -> None:
+    if find_spec("hydra_plugins.hydra_joblib_launcher") is None:
+        pytest.skip("needs hydra-joblib-launcher (group dev)")
+    words = ["-m", *TINY, "hydra/launcher=joblib", "name=x", "seed=0,1"]
+    done = gsbench(*words, GSBENCH_RUNS="runs", timeout=SECONDS)
+    assert done.returncode == 0, done.stderr
+    results = sorted((tmp_path / "runs" / "x").rglob("results.json"))
+    assert len(results) == 2
+    assert "2 trials: 2 done" in gsbench("status", "x", GSBENCH_RUNS="runs", timeout=SECONDS).stdout
+    written = [path.stat().st_mtime_ns for path in results]
+    assert gsbench(*words, GSBENCH_RUNS="runs", timeout=SECONDS).returncode == 0
+    assert [path.stat().st_mtime_ns for path in results] == written  # nothing is done twice
+
+
+def test_a_failed_trial_of_another_launcher_is_one_line_and_exit_code_1(gsbench: Run, tmp_path: Path) -> None:
+    (tmp_path / "own.py").write_text(
+        "from gsbench.densify import NoDensifier\n"
+        "class Own(NoDensifier):\n"
+        "    def observe(self, *rest, **named):\n"
+        "        raise RuntimeError('no luck')\n"
+    )
+    words = [
+        "-m",
+        *TINY,
+        "hydra/launcher=basic",
+        "name=x",
+        "seed=0,1",
+        "densify._target_=own.Own",
+        "allow_targets=[own]",
+    ]
+    done = gsbench(*words, GSBENCH_RUNS="runs", timeout=SECONDS)
+    assert done.returncode == 1
+    assert "Traceback" not in done.stderr
+    failed = [line for line in done.stderr.splitlines() if line.startswith("gsbench: failed")]
+    assert len(failed) == 2
+    assert "2 trials: 2 failed" in gsbench("status", "x", GSBENCH_RUNS="runs", timeout=SECONDS).stdout
