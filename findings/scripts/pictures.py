@@ -17,7 +17,7 @@ from PIL import Image
 from gsbench.analysis.results import TrialResult, read_experiment, read_views
 
 PICTURES = Path(__file__).parents[1] / "pictures"
-DENSIFIERS = ("adc", "volumetric", "volumetric-1", "volumetric_once", "volumetric_once-1", "longaxis")
+DENSIFIERS = ("adc", "volumetric", "volumetric-1", "volumetric_once", "volumetric_once-1", "no_shrink", "longaxis")
 CLOUDS = ("sfm", "sfm_dense", "dim", "random")
 LPIPS = "lpips_squeeze"  # less is better
 GAP = 4  # px between pictures
@@ -33,6 +33,7 @@ def _cap(trial: TrialResult) -> str:
 # By the name of the picture, of the experiment findings_NAME: arm, control, and which trials make a pair of rows each.
 SHOWN: dict[str, tuple[str, str, KindOf, Sequence[str]]] = {
     "plants": ("volumetric", "adc", _split, ("interpolation", "extrapolation")),
+    "parts": ("no_shrink", "adc", _split, ("interpolation",)),
     "volume": ("volumetric", "adc", _split, ("interpolation", "extrapolation")),
     "dimension": ("volumetric-1", "adc", _split, ("interpolation", "extrapolation")),
     "full": ("volumetric", "adc", _cap, ("governor", "soft")),

@@ -313,6 +313,7 @@ def first_differences(name: str, arms: Sequence[str], against: str) -> str:
 
 def sections() -> list[tuple[str, list[Callable[[], str] | str]]]:
     """The sections of `TABLES`: a title, then sentences and tables."""
+    parts = ("volumetric", "volumetric_once", "no_shrink")
     both, more = ("volumetric", "volumetric_once"), ("volumetric-1", "volumetric_once-1")
     clouds = ("dim", "sfm_dense", "jittered", "sfm_all_views", "carved", "random")
     steered = ("absgrad", "longaxis", "mcmc", "volumetric", "volumetric_once")
@@ -326,6 +327,10 @@ def sections() -> list[tuple[str, list[Callable[[], str] | str]]]:
             by_volume, made(shares_table, "plants", ("volumetric",)),
             "Together with the eight scenes below, exploratory:", made(correlations_table, ("plants", "volume")),
             held_out, made(views_table, "plants"),
+        ]),
+        ("Which part of the rule", [
+            made(claims_table, "parts"), "LPIPS by scene:", made(scenes_table, "parts", parts),
+            "All metrics:", made(metrics_table, "parts", parts), by_volume, made(shares_table, "parts", parts),
         ]),
         ("Eight scenes at one count", [
             made(claims_table, "volume"), "LPIPS by scene:", made(scenes_table, "volume", both),
