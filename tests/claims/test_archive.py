@@ -92,6 +92,34 @@ def test_no_pixels_and_no_paths_of_the_machine(tmp_path: Path) -> None:
     )
 
 
+def test_it_is_an_ro_crate(tmp_path: Path) -> None:
+    """The rules of RO-Crate 1.2, sections 3 (root data entity), 4 (data entities) and 2 (packaging)."""
+    file = export(tmp_path)
+    content = members(file)
+    crate = json.loads(content["ro-crate-metadata.json"])
+    by_id = {entity["@id"]: entity for entity in crate["@graph"]}
+    assert len(by_id) == len(crate["@graph"])
+    assert crate["@context"] == "https://w3id.org/ro/crate/1.2/context"
+    descriptor, root = by_id["ro-crate-metadata.json"], by_id["./"]
+    assert descriptor["@type"] == "CreativeWork"
+    assert descriptor["conformsTo"] == {"@id": "https://w3id.org/ro/crate/1.2"}
+    assert descriptor["about"] == {"@id": "./"}
+    assert root["@type"] == "Dataset"
+    assert all(root[key] for key in ("name", "description", "datePublished"))
+    parts = {entity["@id"] for entity in root["hasPart"]}
+    assert parts == content.keys() - {"ro-crate-metadata.json"}
+    assert all(by_id[part]["@type"] == "File" for part in parts)
+    assert all(int(by_id[part]["contentSize"]) == len(content[part]) for part in parts)
+
+    def references(value: object) -> set[str]:
+        if isinstance(value, dict):
+            own = {value["@id"]} if value.keys() == {"@id"} else set()
+            return own.union(*map(references, value.values()))
+        return set().union(*map(references, value)) if isinstance(value, list) else set()
+
+    assert references(crate["@graph"]) <= by_id.keys() | {"https://w3id.org/ro/crate/1.2"}
+
+
 def cut(file: Path) -> None:
     file.write_bytes(file.read_bytes()[:-600])
 

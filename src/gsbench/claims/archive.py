@@ -1,4 +1,4 @@
-"""An experiment's results as one small file that others can read: a zip archive of JSON lines and CSV.
+"""An experiment's results as one small file that others can read: a zip archive, and an RO-Crate 1.2 at once.
 
 It holds, without any pixels but where pictures are asked for:
 
@@ -8,7 +8,8 @@ It holds, without any pixels but where pictures are asked for:
 - ``declared.jsonl``: what was declared before trials ran, where something was;
 - ``from_pixels.jsonl``: what declared claims ask of the trials' pictures, where they ask something;
 - ``pictures/``: renders and photographs of test views by trial, where they were asked for;
-- ``archive.json``: the version of this format and the sha256 of the files above.
+- ``archive.json``: the version of this format and the sha256 of the files above;
+- ``ro-crate-metadata.json``: the same in the terms of RO-Crate (w3id.org/ro/crate/1.2), for other tools.
 
 Paths of the machine are left out: of folders the last name is kept. The same results make the same archive, bit by bit.
 """
@@ -34,6 +35,7 @@ from gsbench import __version__
 from gsbench.analysis.images import FromPixels, textured_error
 from gsbench.analysis.quantities import TEXTURED
 from gsbench.analysis.results import Experiment, TrialResult, read_experiment, read_views
+from gsbench.claims.crate import crate_metadata
 from gsbench.errors import InputError
 from gsbench.files import atomic
 from gsbench.parsing import read_bytes, read_yaml
@@ -44,7 +46,7 @@ from gsbench.words import readable_bytes, without_places
 
 FORMAT, VERSION = "gsbench results", 1
 PIXELS = "from_pixels.jsonl"
-MANIFEST = "archive.json"
+MANIFEST, CRATE = "archive.json", "ro-crate-metadata.json"
 TRIALS, CONFIGURATIONS = "results.jsonl", "configurations.jsonl"
 PICTURES_FOLDER, PICTURES = "pictures", (RENDERS, GROUND_TRUTH)
 MOST_BYTES = 1 << 28  # of a file when unpacked; more than any experiment has
@@ -99,10 +101,12 @@ def write_archive(experiment: Experiment, out: Path, pictures: bool = False) -> 
         "sha256": {name: hashlib.sha256(content).hexdigest() for name, content in contents.items()},
     }
     contents[MANIFEST] = (json.dumps(manifest, indent=1) + "\n").encode()
+    crate = crate_metadata(experiment.name, kept, {name: len(content) for name, content in contents.items()})
+    contents[CRATE] = (json.dumps(crate, indent=1) + "\n").encode()
     with atomic(out, sync=False) as temporary, zipfile.ZipFile(temporary, "w") as archive:
-        for name, content in contents.items():
+        for name in (CRATE, *(name for name in contents if name != CRATE)):
             info = zipfile.ZipInfo(name, FIXED_DATE)
-            archive.writestr(info, content, zipfile.ZIP_DEFLATED, compresslevel=9)
+            archive.writestr(info, contents[name], zipfile.ZIP_DEFLATED, compresslevel=9)
     return left_out
 
 
