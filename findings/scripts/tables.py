@@ -34,6 +34,13 @@ METRICS = {LPIPS: ("LPIPS", 3), "psnr": ("PSNR, dB", 2), "ssim": ("SSIM", 3), "m
 METRICS |= {"fsim": ("FSIMc", 4), "flip": ("FLIP", 3)}
 SPLITS = {"interpolation": "between", "extrapolation": "sector"}  # as the page calls what a split asks
 GROWTH = ("event_split_volume", "event_split_gradient", "event_cloned")
+CAPTURE_FACTS = {
+    "points_per_pixel": "points by pixels of all views",
+    "camera_distance": "distance of points to the nearest camera, extents",
+    "depth_spread": "spread of depths in a view",
+    "texture": "texture, mean slope of luminance",
+    "camera_angle": "angle to the nearest camera",
+}
 FEWEST_SCENES = 6  # from here on the scenes are the units of an interval, below it the pairs of trials
 KEYS = ["split", "scene", "seed"]  # of a pair of trials
 
@@ -197,8 +204,13 @@ def shares_table(name: str, arms: Sequence[str]) -> str:
 
 
 def correlations_table(names: Sequence[str], arm: str = "volumetric") -> str:
-    """A split a row: over the scenes of all archives, Spearman's correlation of LPIPS minus adc's with two facts."""
-    rows = []
+    """A fact a row: over the scenes of all archives, Spearman's correlation of LPIPS minus adc's with it, by split.
+
+    What captures are like is measured by ``scenes.py``; the courtyard is none.
+    """
+    captures = pd.read_csv(ARCHIVES / "scenes.csv", index_col="scene")[list(CAPTURE_FACTS)]
+    columns = []
+    facts_shown = {"share": "share split by volume", "points": "initial points", **CAPTURE_FACTS}
     for split, word in SPLITS.items():
         facts = []
         for name in names:
@@ -210,11 +222,15 @@ def correlations_table(names: Sequence[str], arm: str = "volumetric") -> str:
             facts.append(
                 pd.DataFrame({"change": change, "share": share, "points": own.groupby("scene").num_init_points.mean()})
             )
-        joined = pd.concat(facts)
-        found = [stats.spearmanr(joined.change, joined[key]) for key in ("share", "points")]
-        cells = [f"{signed(one.statistic, '.2f')} (p {p_text(one.pvalue)})" for one in found]
-        rows.append([f"{word}, {len(joined)} scenes", *cells])
-    return table(["LPIPS of the rule minus adc's, by scene", "share split by volume", "initial points"], rows)
+        joined = pd.concat(facts).join(captures)
+        cells = []
+        for key in facts_shown:
+            own = joined[["change", key]].dropna()
+            one = stats.spearmanr(own.change, own[key])
+            cells.append(f"{signed(one.statistic, '.2f')} (p {p_text(one.pvalue)}, {len(own)} scenes)")
+        columns.append((word, cells))
+    rows = [[title, *(cells[k] for _, cells in columns)] for k, title in enumerate(facts_shown.values())]
+    return table(["LPIPS of the rule minus adc's goes with", *(word for word, _ in columns)], rows)
 
 
 def views_table(name: str) -> str:
