@@ -38,7 +38,7 @@ CAPTURE_FACTS = {
     "points_per_pixel": "points by pixels of all views",
     "camera_distance": "distance of points to the nearest camera, extents",
     "depth_spread": "spread of depths in a view",
-    "texture": "texture, mean slope of luminance",
+    "texture": "texture, mean slope of grey values",
     "camera_angle": "angle to the nearest camera",
 }
 FEWEST_SCENES = 6  # from here on the scenes are the units of an interval, below it the pairs of trials

@@ -158,7 +158,7 @@ def test_another_program_is_refused_with_masks(captures: tuple[Path, Path], tmp_
     words = ["init=random", "densify=external/program", "densify.command='echo {data} {output}'"]
     words += ["allow_targets=[echo]", "densify.version=1", "densify.result=point_cloud.ply", f"runs={tmp_path}"]
     assert run([*[word for word in QUICK if "densify" not in word], f"scene.path={captures[0]}", *words]) != 0
-    assert "another program is not told of masks" in capfd.readouterr().err
+    assert "another program gets no masks" in capfd.readouterr().err
 
 
 @pytest.mark.parametrize("make", [Sfm, SiftKornia, Dim])

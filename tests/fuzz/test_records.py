@@ -84,7 +84,8 @@ READS_ITSELF = {
     "analysis/paper.py", "datasets/catalog.py",  # of the package
     "launch/batch.py", "init/base.py",  # text of this very process
     "analysis/configurations.py",  # arms of the package; those of trials are read by TrialFolder
-    "claims/stopping.py", "verbs/ablate.py",  # text of this process; words of a command line
+    "claims/stopping.py",  # text of this process
+    "system/install.py",  # what pip wrote of the package
     "claims/archive.py",  # archives, which anybody may have made
     "scene/load.py",  # prepared views, beside the store
     "parsing.py",

@@ -17,7 +17,7 @@ import tests.raster.conftest  # noqa: F401 - makes the interpreter quicker
 from gsbench.bench.measure import NEVER, standing_still
 from gsbench.bench.scenes import make_scene
 from gsbench.densify import ADC, MCMC
-from gsbench.raster import create_rasterizer, validate
+from gsbench.raster import create_rasterizer, staged
 from gsbench.raster.staged import Readback
 from gsbench.train.loss import torch_photometric_loss
 from gsbench.train.trainer import Trainer
@@ -32,7 +32,7 @@ DENSIFIERS = {
 
 def main(raster: str) -> None:
     Readback.arrived = property(lambda self: False)  # type: ignore[assignment, method-assign]
-    validate._check_background = lambda background: None  # on a GPU its values are not looked at there
+    staged._check_background = lambda background: None  # on a GPU its values are not looked at there
     gaussians, scene = make_scene("trained", 20, 20, 12)
     for name, densifier in DENSIFIERS.items():
         rasterizer = create_rasterizer(raster, torch.device("cpu"))

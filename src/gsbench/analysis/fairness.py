@@ -21,7 +21,7 @@ from gsbench.analysis.differences import (
 )
 from gsbench.analysis.pairing import pair_trials
 from gsbench.analysis.quantities import COSTS, relative_change
-from gsbench.analysis.results import Arm, TrialResult, by_key
+from gsbench.analysis.results import Arm, TrialResult, by_key, read_experiment
 from gsbench.analysis.table_formats import Column, Entry, Row, Table
 from gsbench.records import read_if_sound
 from gsbench.runs.experiments import Point, TuningRecord
@@ -170,9 +170,9 @@ def tuning_lines(trials: Sequence[TrialResult], pair: Sequence[Arm]) -> list[str
     """
     lines = [sentence] if (sentence := tuning_sentence(trials, pair)) else []
     for arm in pair:
-        own = next(trial for trial in trials if trial.arm == arm)
-        lines += [_search_line(own, name, record) for name, record in _searches(own).items()]
-        lines += _tried_here(trials, own)
+        own = [trial for trial in trials if trial.arm == arm]
+        lines += [_search_line(own, name, record) for name, record in _searches(own[0]).items()]
+        lines += _tried_here(trials, own[0])
     return lines or [NOTHING]
 
 
@@ -213,8 +213,8 @@ def _searches(trial: TrialResult) -> dict[str, TuningRecord]:
     return found
 
 
-def _search_line(trial: TrialResult, experiment: str, search: TuningRecord) -> str:
-    """Say what a search tried of an arm and chose, and whether the arm's trials have that."""
+def _search_line(own: Sequence[TrialResult], experiment: str, search: TuningRecord) -> str:
+    """Say what a search tried of an arm and chose, and whether the arm's trials ``own`` came later and have that."""
     best = search.best
     if best is None:
         return f"{search.arm}: the search {experiment} found nothing."
@@ -226,10 +226,20 @@ def _search_line(trial: TrialResult, experiment: str, search: TuningRecord) -> s
     more = len(search.points) - MOST_VALUES
     line = (
         f"{search.arm}: {chosen} is the best of {counted(len(search.points), 'point')} by {search.metric} of {VIEWS} "
-        f"({listed(search.scenes)}; seed {', '.join(map(str, search.seeds))}; the search {experiment}). "
+        f"({listed(search.scenes)}; seed {', '.join(map(str, search.seeds))}; the search {experiment}), "
+        f"{_when(own, experiment)}. "
         f"Tried: {', '.join(tried)}{f' and {more} more' if more > 0 else ''}."
     )
-    return line if _has_values(trial, best) else f"{line} These trials have other values."
+    return line if _has_values(own[0], best) else f"{line} These trials have other values."
+
+
+def _when(own: Sequence[TrialResult], experiment: str) -> str:
+    """Say whether the trials of the search were measured before these: a search that ends later may follow them."""
+    times = [trial.measured for trial in read_experiment(own[0].path.parents[3] / experiment).trials]
+    if not times:
+        return "whose own trials are missing"
+    later = sum(trial.measured < max(times) for trial in own)
+    return f"ended when {later} of these {len(own)} trials had been measured" if later else "before any of these trials"
 
 
 def _tried_here(trials: Sequence[TrialResult], own: TrialResult) -> list[str]:
