@@ -95,7 +95,7 @@ def standing(folder: Path, trials: Sequence[TrialResult]) -> ActiveDeclaration |
     first_result = min((trial.measured for trial in trials), default=math.inf)
     whole = since[0]
     for later in since[1:]:
-        if later.moment <= first_result:
+        if later.moment < first_result:  # times are whole seconds: what is of the same second may be later
             whole = later
     named = replace(whole, time=since[0].time)
     seen = tuple(trial for trial in trials if trial.measured < named.moment)
