@@ -28,11 +28,11 @@ WHEELS_AT_ONCE=50000000          # bytes
 
 if [ "${GPU_DAY_TINY:-}" ]; then
   export TRITON_INTERPRET=1 OMP_NUM_THREADS=1
-  DEVICE=cpu RASTERS=(triton cpu) PEERS=() COUNTS=(3) SCENES=(trained) SIZE=16x16 SMALL=16x16 REPEATS=1
+  DEVICE=cpu RASTERS=(triton cpu) COUNTS=(3) SCENES=(trained) SIZE=16x16 SMALL=16x16 REPEATS=1
   CONTRACT="triton and nothing_to_see"
   TRAIN=(scene=courtyard scene.views=8 scene.width=32 scene.height=24 init=random init.count=6 train=7k train.iterations=2)
 else
-  DEVICE=cuda RASTERS=(triton gsplat) PEERS=(gsplat-rasterization) SIZE=1600x1060 SMALL=48x32 REPEATS=10
+  DEVICE=cuda RASTERS=(triton gsplat) SIZE=1600x1060 SMALL=48x32 REPEATS=10
   COUNTS=(100000 1000000 3000000) SCENES=(trained random skewed)
   CONTRACT="triton or on_a_gpu"
   TRAIN=(scene=colmap "scene.path=$BROUGHT/bonsai" init=dataset train=7k)
@@ -88,7 +88,7 @@ setup() {
       "${found[@]}" || return 1
   fi
   step machine 100 "$PYTHON" scripts/gpu_day.py machine && cat "$RESULTS/machine.out"
-  if [ ! -e "$STATE/gsplat.exit" ] && [ ${#PEERS[@]} -gt 0 ]; then # it goes on when this command has ended
+  if [ ! -e "$STATE/gsplat.exit" ] && [ "$DEVICE" = cuda ]; then # it goes on when this command has ended
     TORCH_CUDA_ARCH_LIST=$("$PYTHON" -c 'import torch; print("%d.%d" % torch.cuda.get_device_capability())') MAX_JOBS=12 \
       setsid --fork bash -c '"$0" -c "from gsplat.cuda._backend import _C; assert _C" >"$1.log" 2>&1; echo $? >"$1.exit"' \
       "$PYTHON" "$STATE/gsplat" </dev/null >/dev/null 2>&1
@@ -109,19 +109,19 @@ check() {
 }
 
 wait_for_gsplat() {
-  [ ${#PEERS[@]} -gt 0 ] || return 0
+  [ "$DEVICE" = cuda ] || return 0
   local until=$((SECONDS + ${1}))
   until [ -e "$STATE/gsplat.exit" ] || [ "$SECONDS" -ge "$until" ]; do sleep 2; done
   [ "$(cat "$STATE/gsplat.exit" 2>/dev/null)" = 0 ] && return
   echo "gsplat is not compiled (yet): triton alone" && tail -n 20 "$STATE/gsplat.log"
   cp "$STATE/gsplat.log" "$RESULTS/" 2>/dev/null
-  RASTERS=(triton) PEERS=()
+  RASTERS=(triton)
 }
 
 bench() { # NAME LIMIT ARGUMENT…
   local name=$1 limit=$2 rasters
   shift 2
-  rasters=$(IFS=, && echo "${RASTERS[*]}${PEERS:+,${PEERS[*]}}")
+  rasters=$(IFS=, && echo "${RASTERS[*]}")
   step "bench-$name" "$limit" "$PYTHON" -m gsbench.cli bench --raster "$rasters" --size "$SIZE" --repeats "$REPEATS" \
     --json "$@"
 }

@@ -87,6 +87,17 @@ def arrows(inside_functions: bool = True) -> dict[str, set[str]]:
     return graph
 
 
+def reached(start: str) -> set[str]:
+    """A module and all modules of gsbench that it imports, directly or through others."""
+    found, waiting = set[str](), [start]
+    while waiting:
+        name = waiting.pop()
+        if name not in found and name in arrows():
+            found.add(name)
+            waiting += arrows()[name]
+    return found
+
+
 def room(module: str) -> str:
     """The folder below ``gsbench`` in which a module stands; a file beside the folders is a room of its own."""
     parts = module.split(".")

@@ -11,7 +11,7 @@ import pytest
 
 from gsbench.app.command import compose_trials
 from gsbench.scene.colmap import write_frames
-from gsbench.scene.prepare import CameraModel
+from gsbench.scene.load import CameraModel
 
 sys.path.append(str(Path(__file__).parents[1] / "scripts"))
 import captures

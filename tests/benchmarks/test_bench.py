@@ -149,7 +149,6 @@ def test_kernels_are_timed_and_put_back_when_a_step_fails() -> None:
         (["--raster", "nosuch", "--no-memory"], "nosuch"),
         (["--ply", "/no/such.ply"], "such.ply"),
         (["--raster", "gsplat", "--no-memory"], "raster=gsplat runs on a CUDA device, and torch finds none"),
-        (["--raster", "gsplat-rasterization", "--no-memory"], "gsplat-rasterization runs on a CUDA device"),
     ],
 )
 def test_bad_input(arguments: list[str], cause: str) -> None:

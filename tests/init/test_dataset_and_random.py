@@ -51,7 +51,7 @@ def test_dataset_takes_over_the_cloud(courtyard: Capture, tmp_path: Path):
 def test_dataset_without_points_or_model(courtyard: Capture, bare_photos: Capture, tmp_path: Path):
     with pytest.raises(InputError, match="has no points: use init=sfm"):
         Dataset().run(courtyard, tmp_path)
-    with pytest.raises(InputError, match="came without a COLMAP model"):
+    with pytest.raises(InputError, match="came without"):
         Dataset().run(bare_photos, tmp_path)
 
 

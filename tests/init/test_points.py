@@ -9,21 +9,17 @@ import numpy as np
 import pycolmap
 import pytest
 from plyfile import PlyData, PlyElement
-from scipy.spatial.transform import Rotation
 
 from gsbench.errors import InputError
 from gsbench.init import MODEL_FOLDER, Points, read_cloud
 from gsbench.init.base import PointCloud
-from gsbench.init.points import GREY, read_points, read_similarity, seen_colors
+from gsbench.init.points import GREY, read_points, seen_colors
 from gsbench.scene.images import read_image
 from gsbench.scene.types import Capture
 
 RNG = np.random.default_rng(0)
 XYZ = RNG.uniform(-2, 2, (40, 3)).astype(np.float32).astype(np.float64)
 RGB = RNG.integers(0, 256, (40, 3))
-MATRIX = np.eye(4)
-MATRIX[:3, :3] = 2.5 * Rotation.from_rotvec([0.3, -1.0, 0.2]).as_matrix()
-MATRIX[:3, 3] = [1.0, -2.0, 3.0]
 
 
 def write(path: Path, properties: list[tuple[str, str]], values: dict[str, np.ndarray], text: bool, order: str) -> Path:
@@ -56,27 +52,18 @@ def test_ply_of_any_order_and_type(tmp_path: Path, text: bool, order: str, names
     np.testing.assert_array_equal(colors, RGB)
 
 
-@pytest.mark.parametrize("suffix", [".npy", ".xyz", ".csv"])
+@pytest.mark.parametrize("suffix", [".xyz", ".csv"])
 @pytest.mark.parametrize("colored", [False, True])
 def test_tables(tmp_path: Path, suffix: str, colored: bool):
     table = np.concatenate([XYZ, RGB], axis=1) if colored else XYZ
     path = tmp_path / f"cloud{suffix}"
-    if suffix == ".npy":
-        np.save(path, table)
-    else:
-        np.savetxt(path, table, fmt="%.17g", delimiter="," if suffix == ".csv" else " ")
+    np.savetxt(path, table, fmt="%.17g", delimiter="," if suffix == ".csv" else " ")
     points, colors = read_points(path)
     np.testing.assert_array_equal(points, XYZ)
     if colored:
         np.testing.assert_array_equal(colors, RGB)
     else:
         assert colors is None
-
-
-def test_similarity_is_pycolmaps(tmp_path: Path):
-    np.savetxt(tmp_path / "matrix.txt", MATRIX)
-    expected = pycolmap.Sim3d(MATRIX[:3]) * XYZ
-    np.testing.assert_allclose(read_similarity(tmp_path / "matrix.txt")(XYZ), expected, atol=1e-9)
 
 
 def test_colours_are_those_of_the_nearest_photograph(courtyard: Capture):
@@ -97,11 +84,9 @@ def test_colours_are_those_of_the_nearest_photograph(courtyard: Capture):
     assert 5 < (found[:, 0] >= 0).sum() < 60
 
 
-def test_a_cloud_is_registered_thinned_and_placed(courtyard: Capture, tmp_path: Path):
-    there = np.linalg.inv(MATRIX)
-    np.save(tmp_path / "scan.npy", XYZ @ there[:3, :3].T + there[:3, 3])
-    np.savetxt(tmp_path / "matrix.txt", MATRIX)
-    options = Points(path=tmp_path / "scan.npy", transform=tmp_path / "matrix.txt", max_points=30, seed=1)
+def test_a_cloud_is_thinned_and_placed(courtyard: Capture, tmp_path: Path):
+    save(tmp_path / "scan.xyz", XYZ)
+    options = Points(path=tmp_path / "scan.xyz", max_points=30, seed=1)
     report = options.run(courtyard, tmp_path / "out")
     cloud = read_cloud(tmp_path / "out" / MODEL_FOLDER)
     assert report.num_points == len(cloud) == 30
@@ -111,18 +96,21 @@ def test_a_cloud_is_registered_thinned_and_placed(courtyard: Capture, tmp_path: 
     seen = seen_colors(cloud.points, courtyard, pycolmap.Reconstruction(courtyard.model))
     np.testing.assert_array_equal(cloud.colors, np.where(seen < 0, GREY, seen))
     first = options.content()
-    np.savetxt(tmp_path / "matrix.txt", 2 * MATRIX)
+    save(tmp_path / "scan.xyz", 2 * XYZ)
     assert options.content() != first
+
+
+def save(path: Path, table: np.ndarray) -> None:
+    np.savetxt(path, table, fmt="%.17g")
 
 
 def bad_ply(path: Path) -> None:
     path.write_bytes(b"ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nend_header\n1\n2\n3\n")
 
 
-def cut_header(path: Path) -> None:
-    """Write a file whose header ends within its dictionary, where numpy raises what Python's tokenizer does."""
-    header = b"{'descr': '<f8', 'shape': ("
-    path.write_bytes(b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header)
+def empty_ply(path: Path) -> None:
+    properties = b"".join(b"property float %c\n" % axis for axis in b"xyz")
+    path.write_bytes(b"ply\nformat ascii 1.0\nelement vertex 0\n" + properties + b"end_header\n")
 
 
 @pytest.mark.parametrize(
@@ -130,13 +118,12 @@ def cut_header(path: Path) -> None:
     [
         ("a.ply", bad_ply, "no property y, z"),
         ("a.ply", lambda path: path.write_bytes(b"no cloud"), "not a readable file of points"),
-        ("a.npy", cut_header, "not a readable file of points"),
-        ("a.npy", lambda path: np.save(path, XYZ[:, :2]), "3 or 6 columns"),
-        ("a.npy", lambda path: np.save(path, XYZ[:0]), "holds no point"),
-        ("a.npy", lambda path: np.save(path, np.where(XYZ > 1.9, np.nan, XYZ)), "not finite numbers"),
+        ("a.xyz", lambda path: save(path, XYZ[:, :2]), "3 or 6 columns"),
+        ("a.ply", empty_ply, "holds no point"),
+        ("a.xyz", lambda path: save(path, np.where(XYZ > 1.9, np.nan, XYZ)), "not finite numbers"),
         ("a.xyz", lambda path: path.write_text("1 2 x\n"), "not a readable file of points"),
         ("a.las", lambda path: path.write_bytes(b"LASF"), "known are .ply"),
-        ("a.npy", lambda path: np.save(path, XYZ + 1e6), "no point is in view of a training camera"),
+        ("a.xyz", lambda path: save(path, XYZ + 1e6), "no point is in view of a training camera"),
     ],
 )
 def test_bad_files_in_one_line(courtyard: Capture, tmp_path: Path, name: str, make, message: str):
@@ -146,27 +133,11 @@ def test_bad_files_in_one_line(courtyard: Capture, tmp_path: Path, name: str, ma
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    ("matrix", "message"),
-    [
-        (np.eye(3), "4 rows of 4 numbers"),
-        (np.diag([1.0, 1, -1, 1]), "mirrors"),
-        (np.diag([1.0, 1, 0, 1]), "flattens"),
-        (np.diag([1.0, 2, 1, 1]), "unevenly"),
-        (np.diag([1.0, 1, 1, 2]), "last 0 0 0 1"),
-    ],
-)
-def test_matrices_that_are_no_similarity(tmp_path: Path, matrix: np.ndarray, message: str):
-    np.savetxt(tmp_path / "matrix.txt", matrix)
-    with pytest.raises(InputError, match=message):
-        read_similarity(tmp_path / "matrix.txt")
-
-
 def test_a_file_that_is_not_there_and_photos_without_cameras(bare_photos: Capture, tmp_path: Path):
     with pytest.raises(InputError, match=r"init\.path=nowhere\.ply is not a file"):
         Points(path="nowhere.ply")
-    np.save(tmp_path / "a.npy", XYZ)
-    assert Points(path=tmp_path / "a.npy").needs_reference(replace(bare_photos))
+    save(tmp_path / "a.xyz", XYZ)
+    assert Points(path=tmp_path / "a.xyz").needs_reference(replace(bare_photos))
 
 
 @pytest.mark.parametrize(("shape", "kind"), [((4, 2), "float64"), ((4,), "float64"), ((4, 3), "float32")])

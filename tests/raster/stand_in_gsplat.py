@@ -87,50 +87,6 @@ def head() -> SimpleNamespace:
     return SimpleNamespace(**here | {"spherical_harmonics": spherical_harmonics})
 
 
-def rasterization(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    colors: Tensor,
-    viewmats: Tensor,
-    Ks: Tensor,  # noqa: N803 - gsplat's name
-    width: int,
-    height: int,
-    near_plane: float = 0.01,
-    eps2d: float = 0.3,
-    sh_degree: int | None = None,
-    packed: bool = True,
-    tile_size: int = 16,
-    backgrounds: Tensor | None = None,
-    absgrad: bool = False,
-) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
-    """The parts in gsplat's own order, for one camera, in its dense mode."""
-    assert (packed, sh_degree is None, viewmats.shape) == (False, False, (1, 4, 4))
-    unit = torch.nn.functional.normalize(quats, dim=-1)
-    radii, means2d, depths, conics, _ = fully_fused_projection(
-        means, None, unit, scales, viewmats, Ks, width, height, eps2d=eps2d, near_plane=near_plane
-    )
-    tiles_x, tiles_y = -(-width // tile_size), -(-height // tile_size)
-    _, crossings, members = isect_tiles(means2d, radii, depths, tile_size, tiles_x, tiles_y)
-    center = -(viewmats[0, :3, :3].T @ viewmats[0, :3, 3])
-    rgb = spherical_harmonics(sh_degree, means - center, colors, (radii > 0).all(-1)[0])
-    image, alpha = rasterize_to_pixels(
-        means2d,
-        conics,
-        (rgb[None] + 0.5).clamp_min(0),
-        opacities[None],
-        width,
-        height,
-        tile_size,
-        isect_offset_encode(crossings, 1, tiles_x, tiles_y),
-        members,
-        backgrounds,
-        absgrad,
-    )
-    return image, alpha, {"radii": radii, "means2d": means2d}
-
-
 def rasterize_to_pixels(
     means2d: Tensor,
     conics: Tensor,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import gc
 import weakref
 from types import ModuleType
@@ -10,7 +9,6 @@ from types import ModuleType
 import pytest
 import torch
 
-from gsbench.bench.peer import RasterizationPeer
 from gsbench.gaussians.model import Gaussians
 from gsbench.raster import CONSTANTS
 from gsbench.raster.contract import Case, departures, render_with_gradients
@@ -55,19 +53,6 @@ def test_the_two_versions_of_gsplat_give_the_same(library: ModuleType) -> None:
     assert (image.image - expected.image).abs().max() < 1e-6
     for name, reference in references.items():
         assert (gradients[name] - reference).abs().max() <= 1e-5 * reference.abs().max(), name
-
-
-def test_gsplats_own_function_shows_the_same_picture(library: ModuleType) -> None:
-    """As the peer of ``gsbench bench``: every argument stands where it belongs."""
-    case = dataclasses.replace(FAINT, principal=(5.0, -4.0))
-    leaves = case.gaussians().map(lambda tensor: tensor.float().requires_grad_())
-    background = torch.tensor([0.1, 0.2, 0.3])
-    output = RasterizationPeer(library).render(leaves, case.camera(), 3, background)
-    expected = ReferenceRasterizer().render(case.gaussians(), case.camera(), 3, background.double())
-    assert (output.image.double() - expected.image).abs().max() < 1e-4
-    assert (output.alpha.double() - expected.alpha).abs().max() < 1e-4
-    output.image.sum().backward()
-    assert all(leaf.grad is not None and leaf.grad.abs().max() > 0 for leaf in leaves.tensors().values())
 
 
 def test_late_and_repeated_backward_without_the_absolute_gradient(library: ModuleType) -> None:

@@ -26,8 +26,8 @@ from gsbench.runs.code import (
     unnamed_modules,
     user_modules,
 )
-from gsbench.system.jit import import_closure
 from gsbench.system.own_modules import allow_modules, allowed_modules
+from tests.test_architecture import modules, reached
 
 SOURCE = '"""A module."""\nX = 0.8  # weight\n\n\ndef loss(a):\n    """The loss."""\n    return X * a\n'
 # Rooms that make no number: what is said, how processes run, where files lie. What `config` and `settings` make of the
@@ -101,10 +101,10 @@ def test_whatever_can_change_a_number_counts(edit: Callable[[str], str]) -> None
 
 @pytest.mark.parametrize("stage", ROOMS)
 def test_the_table_has_all_rooms_that_a_stage_imports(stage: str) -> None:
-    step = PACKAGE / "pipeline" / "steps" / f"{STEPS[stage]}.py"
-    steps = [step, step.with_name("external.py")] if stage == "train" else [step]
+    steps = [STEPS[stage], "external"] if stage == "train" else [STEPS[stage]]
     known = (*ROOMS[stage], *BESIDE[stage], "__init__.py", "pipeline/__init__.py", "pipeline/steps/__init__.py")
-    for file in {path.relative_to(PACKAGE).as_posix() for step in steps for path in import_closure(step)}:
+    names = {name for step in steps for name in reached(f"gsbench.pipeline.steps.{step}")}
+    for file in (modules()[name].relative_to(PACKAGE).as_posix() for name in names):
         if file.partition("/")[0].removesuffix(".py") not in WITHOUT_NUMBERS:
             assert any(file == room or file.startswith(f"{room}/") for room in known), file
 

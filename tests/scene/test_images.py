@@ -10,7 +10,7 @@ from PIL import Image
 
 from gsbench.errors import InputError
 from gsbench.scene.images import image_size, read_image, resize_image, same_up_to_rounding
-from gsbench.scene.sizes import downscaled_size
+from gsbench.scene.options import downscaled_size
 
 from .conftest import smooth_image
 

@@ -14,7 +14,7 @@ from PIL import Image
 
 from gsbench.errors import InputError
 from gsbench.gaussians.ply import check_ply, read_ply
-from gsbench.init.points import read_points, read_similarity
+from gsbench.init.points import read_points
 from gsbench.scene.colmap import read_model
 from gsbench.scene.images import IMAGE_SUFFIXES, exif_orientation, image_size, read_image
 from gsbench.scene.names import check_picture_names
@@ -64,9 +64,7 @@ READERS: list[tuple[str, Callable[[Path], object]]] = [
     (".ply", read_ply),
     (".ply", check_ply),
     (".ply", read_points),
-    (".npy", read_points),
     (".txt", read_points),
-    (".txt", read_similarity),
     (".txt", lambda path: read_photos("x", path.parent, images="images", split=SplitRule(test_list=str(path)))),
 ]
 

@@ -12,9 +12,9 @@ import pytest
 from PIL import Image
 
 from gsbench.errors import InputError
-from gsbench.scene.load import load_scene
+from gsbench.scene.camera import CameraModel
+from gsbench.scene.load import Job, load_scene, prepare_all, undistort
 from gsbench.scene.options import SplitRule
-from gsbench.scene.prepare import CameraModel, Job, prepare_all, undistort
 from gsbench.scene.readers import read_colmap
 
 WIDTH, HEIGHT = 200, 150

@@ -13,7 +13,8 @@ from typing import Any
 import numba
 import pytest
 
-from gsbench.system.jit import PACKAGE, cache_base, cache_folder, import_closure
+from gsbench.system.jit import PACKAGE, SOURCES, cache_base, cache_folder
+from tests.test_architecture import arrows, modules
 
 KERNEL_MODULES = sorted(
     path.relative_to(PACKAGE).as_posix() for path in PACKAGE.rglob("*.py") if "\n@kernel\n" in path.read_text()
@@ -53,56 +54,49 @@ def test_the_kernels_are_where_they_are_looked_for() -> None:
 
 
 @pytest.mark.parametrize("module", KERNEL_MODULES)
-def test_the_closure_has_every_function_that_kernels_reach(module: str) -> None:
+def test_the_table_has_every_function_that_kernels_reach(module: str) -> None:
     loaded = importlib.import_module("gsbench." + module.removesuffix(".py").replace("/", "."))
-    closure = import_closure(PACKAGE / module)
     seen: set[int] = set()
-    reached = [function for value in vars(loaded).values() for function in functions_of(value, seen)]
+    reached = [
+        function
+        for value in vars(loaded).values()
+        if hasattr(value, "py_func")
+        for function in functions_of(value, seen)
+    ]
     assert len(reached) > 3
-    missing = {Path(function.__code__.co_filename).resolve() for function in reached} - closure
+    missing = {Path(function.__code__.co_filename).resolve() for function in reached} - sources(PACKAGE)
     assert not missing
 
 
-@pytest.mark.parametrize("module", KERNEL_MODULES)
-def test_a_change_in_any_source_changes_the_folder(package: Path, module: str) -> None:
-    before = cache_folder(package / module, package)
-    assert before == cache_folder(PACKAGE / module)  # the same sources elsewhere
-    for source in import_closure(package / module, package):
-        content = source.read_bytes()
-        source.write_bytes(content + b"\n# changed\n")
-        assert cache_folder(package / module, package) != before, source
-        source.write_bytes(content)
+def sources(package: Path) -> set[Path]:
+    places = [package / source for source in SOURCES]
+    return {path for place in places for path in (place.rglob("*.py") if place.is_dir() else [place])}
+
+
+@pytest.mark.parametrize("source", SOURCES)
+def test_a_change_in_any_source_changes_the_folder(package: Path, source: str) -> None:
+    before = cache_folder.__wrapped__(package)
+    assert before == cache_folder()  # the same sources elsewhere
+    place = package / source
+    path = place if place.suffix else place / "__init__.py"
+    content = path.read_bytes()
+    path.write_bytes(content + b"\n# changed\n")
+    assert cache_folder.__wrapped__(package) != before, source
+    path.write_bytes(content)
     (package / "cli.py").write_text("changed = True\n")
-    assert cache_folder(package / module, package) == before
+    assert cache_folder.__wrapped__(package) == before
 
 
-def test_a_helper_that_moves_is_followed(package: Path) -> None:
-    (package / "raster" / "vectors").mkdir()
-    (package / "raster" / "cpu" / "simd.py").rename(package / "raster" / "vectors" / "wide.py")
-    composite = package / "raster" / "cpu" / "composite.py"
-    text = composite.read_text().replace("gsbench.raster.cpu.simd", "gsbench.raster.vectors.wide")
-    composite.write_text(text)
-    assert package / "raster" / "vectors" / "wide.py" in import_closure(composite, package)
-
-
-def test_every_way_to_import(tmp_path: Path) -> None:
-    package = tmp_path / "pack"
-    files = {
-        "__init__.py": "",
-        "a.py": "import pack.b\nfrom pack import c\nfrom . import d\nfrom .sub.e import x\nimport os\n",
-        "b.py": "def f():\n    from pack.sub import name\nif TYPE_CHECKING:\n    import pack.stranger\n",
-        "c.py": "from pack.absent import x\n",
-        "d.py": "import pack.a\n",
-        "sub/__init__.py": "from ..late import name\n",
-        "sub/e.py": "x = 1\n",
-        "late.py": "name = 1\n",
-        "stranger.py": "",
-    }
-    for name, text in files.items():
-        (package / name).parent.mkdir(parents=True, exist_ok=True)
-        (package / name).write_text(text)
-    found = {path.relative_to(package).as_posix() for path in import_closure(package / "a.py", package)}
-    assert found == set(files) - {"stranger.py", "__init__.py"}  # no name comes out of the outermost package
+def test_the_table_has_all_that_kernels_import() -> None:
+    """But for what sets the kernels' calls up: memory, threads, cameras as numbers, files and words."""
+    known = {path.relative_to(PACKAGE).as_posix() for path in sources(PACKAGE)}
+    around = {"logs.py", "errors.py", "system/machine.py", "system/resources.py", "scene/camera.py", "scene/colmap.py"}
+    around |= {"eval/images.py", "eval/protocol.py", "__init__.py"}
+    files = {name: path.relative_to(PACKAGE).as_posix() for name, path in modules().items()}
+    for name, targets in arrows().items():
+        if files[name] in known:
+            strange = {files[target] for target in targets if target in files} - known - around
+            assert not strange, f"{name} imports {strange}"
 
 
 def test_the_base_is_the_folder_that_is_set_or_another_that_can_be_written(
@@ -120,10 +114,9 @@ def test_the_base_is_the_folder_that_is_set_or_another_that_can_be_written(
 
 def test_processors_do_not_share_a_folder(monkeypatch: pytest.MonkeyPatch) -> None:
     """Machines of two kinds may have one home folder, and write there at once."""
-    source = PACKAGE / KERNEL_MODULES[0]
-    folders = {cache_folder(source)}
+    folders = {cache_folder.__wrapped__()}
     for name, features in (("bonnell", ""), ("haswell", "+avx2"), ("haswell", "+avx2,+fma")):
         monkeypatch.setattr(numba.config, "CPU_NAME", name)
         monkeypatch.setattr(numba.config, "CPU_FEATURES", features)
-        folders.add(cache_folder(source))
+        folders.add(cache_folder.__wrapped__())
     assert len(folders) == 4

@@ -1,14 +1,13 @@
-"""Training images that are streamed are the same images, whatever is asked for next."""
+"""Training images stay on the device where there is room, and are the same images where there is none."""
 
 from __future__ import annotations
-
-import random
 
 import numpy as np
 import pytest
 import torch
 
 from gsbench.scene.types import View
+from gsbench.train.device import explain_full, free_bytes
 from gsbench.train.views import Targets
 from tests.gaussians.helpers import front_camera
 
@@ -30,20 +29,18 @@ def test_what_fits_is_resident(views: list[View]) -> None:
         targets = Targets(views, CPU, budget)
         assert targets.resident
         assert targets.bytes == size
-        targets.prefetch(3)
         assert targets.get(0).data_ptr() == views[0].image.ctypes.data  # on the CPU nothing is copied
     assert not Targets(views, CPU, size - 1).resident
 
 
-def test_streamed_images_are_whole_however_they_are_asked_for(views: list[View]) -> None:
+def test_images_without_room_are_the_same(views: list[View]) -> None:
     targets = Targets(views, CPU, budget=0)
-    rng = random.Random(5)
-    held: list[tuple[int, torch.Tensor]] = []
-    for _ in range(200):
-        index = rng.randrange(len(views))
-        if rng.random() < 0.7:
-            targets.prefetch(index if rng.random() < 0.8 else rng.randrange(len(views)))
-        held = [*held[-3:], (index, targets.get(index))]
-        for asked, image in held:  # an image stays what it was while others are copied
-            assert image.dtype == torch.uint8
-            assert np.array_equal(image.numpy(), views[asked].image)
+    for index, view in enumerate(views):
+        assert np.array_equal(targets.get(index).numpy(), view.image)
+
+
+def test_the_words_when_memory_is_full() -> None:
+    assert free_bytes(CPU) is None
+    text = str(explain_full(70, 1_234_567, torch.device("cuda:1"), "the last good state is X"))
+    assert "iteration 70: cuda:1 has no memory left at 1,234,567 Gaussians; the last good state is X; lower" in text
+    assert "\n" not in text

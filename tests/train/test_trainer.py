@@ -209,7 +209,7 @@ def test_as_on_a_device_that_is_behind(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Losses that arrive late, streamed images, checkpoints written by a thread: the same bits, stopped or not."""
+    """Losses that arrive late, images without room, checkpoints written by a thread: the same bits, stopped or not."""
 
     def make() -> Densifier:
         return small() if kind == "adc" else MCMC(start=20, stop=110, interval=20)
@@ -220,7 +220,7 @@ def test_as_on_a_device_that_is_behind(
 
     whole = train(tiny_scene, truth, rasterizer, tmp_path / "whole", make())
     monkeypatch.setattr(Readback, "arrived", property(lambda self: False))
-    monkeypatch.setattr(trainer, "room_for_images", lambda *_: 0)
+    monkeypatch.setattr(trainer, "free_bytes", lambda _: 0)
     monkeypatch.setattr(trainer, "CheckpointWriter", lambda folder, background: CheckpointWriter(folder, True))
     broken = tmp_path / "broken"
     broken.mkdir()

@@ -11,7 +11,6 @@ from typing import Any
 
 import torch
 
-from gsbench.bench.peer import PEERS
 from gsbench.bench.scenes import SEED, make_scene
 from gsbench.densify import ADC
 from gsbench.errors import InputError
@@ -46,7 +45,7 @@ class Setting:
 
 
 class Stepper:
-    """A training of ``setting`` with the rasterizer called ``raster``: an executor, an import path, or a peer."""
+    """A training of ``setting`` with the rasterizer called ``raster``: an executor, or an import path."""
 
     def __init__(self, raster: str, setting: Setting) -> None:
         self.threads = setting.threads or torch.get_num_threads()
@@ -56,7 +55,6 @@ class Stepper:
             keep_float32()
         gaussians, scene = make_scene(setting.scene, setting.width, setting.height, setting.count, setting.ply)
         self.count = len(gaussians)
-        self.peer = PEERS.get(raster)
         self.trainer = Trainer(
             scene,
             gaussians.map(lambda tensor: tensor.detach().to(self.device)),
@@ -91,13 +89,8 @@ class Stepper:
             "cpu_ms": 1e3 * (time.process_time() - cpu),
         }
 
-    def steps_per_second(self) -> float | None:
-        """Whole training steps: the next view, render, loss, backward, statistics, Adam, losses read now and then.
-
-        None for a peer, which cannot train.
-        """
-        if self.peer is not None:
-            return None
+    def steps_per_second(self) -> float:
+        """Whole training steps: the next view, render, loss, backward, statistics, Adam, losses read now and then."""
         steps = STEPS_AT_ONCE[self.device.type]
         begin = self._now()
         for _ in range(steps):
@@ -124,19 +117,14 @@ def device_of(raster: str) -> torch.device:
     """The device on which ``raster`` is timed: a GPU if it needs one, or is a user's own class and there is one."""
     if "." in raster:
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    if raster in PEERS:
-        device = torch.device(PEERS[raster].device_type)
-    else:
-        device = torch.device("cpu" if find(raster).runs_on("cpu") else "cuda")
+    device = torch.device("cpu" if find(raster).runs_on("cpu") else "cuda")
     if device.type == "cuda" and not torch.cuda.is_available():
         raise InputError(f"raster={raster} runs on a CUDA device, and torch finds none here")
     return device
 
 
 def make_rasterizer(raster: str, device: torch.device, threads: int) -> Rasterizer:
-    """The executor or peer of that name, or the class at that import path: whoever types it here trusts it."""
-    if raster in PEERS:
-        return PEERS[raster]()
+    """The executor of that name, or the class at that import path: whoever types it here trusts it."""
     if "." in raster:
         return build_rasterizer({"_target_": raster}, [raster.partition(".")[0]], device, threads)
     return build_rasterizer({"name": raster}, [], device, threads)
@@ -203,7 +191,7 @@ def _compare(
             if repeat >= WARM_UP_STEPS:
                 parts[raster].append(sample)
                 frames[raster].append(fps)
-                speeds[raster] += [] if speed is None else [speed]
+                speeds[raster].append(speed)
     rows = []
     for raster, stepper in steppers.items():
         pairs = zip(parts[raster], parts[rasters[0]], strict=True)
@@ -216,13 +204,11 @@ def _compare(
         row |= {key: _median([sample[key] for sample in parts[raster]]) for key in parts[raster][0]}
         row |= {
             "step_ratio": _median([own["step_ms"] / first["step_ms"] for own, first in pairs]),
-            "steps_per_second": _median(speeds[raster]) if speeds[raster] else None,
+            "steps_per_second": _median(speeds[raster]),
             "fps": _median(frames[raster]),
             "threads": stepper.threads,
             "device": stepper.device.type,
         }
-        if raster in PEERS:
-            row["note"] = PEERS[raster].note
         rows.append(row)
     del steppers, stepper  # their memory: the processes below need it
     for row in rows:

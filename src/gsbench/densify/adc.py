@@ -94,9 +94,7 @@ class ADC(Budgeted):
         """Length of the gradient of each projected mean, [N] NDC."""
         gradient = render.screen_gradient_abs if self.gradient == "absolute" else render.screen_points.grad
         if gradient is None:
-            raise RuntimeError(
-                "observe needs the screen gradient: call it after backward, with absolute_gradient if used"
-            )
+            raise RuntimeError("observe needs the screen gradient: call it after backward")
         return gradient.norm(dim=-1)
 
     def rules(self, refinement: Refinement) -> list[Rule]:

@@ -48,9 +48,7 @@ class MCMC(Budgeted):
     scale_weight: NonNegativeFloat = 0.01  # of the mean scale, in the loss
     initial_opacity: OpenFraction = 0.5
     initial_scale: PositiveFloat = 0.1  # of the distance to the neighbours
-    max_copies: Annotated[int, Interval(ge=1, le=BINOMIALS)] = (
-        50  # of one Gaussian, itself included, that share opacity
-    )
+    max_copies: Annotated[int, Interval(ge=1, le=BINOMIALS)] = 50  # of a Gaussian that share opacity, itself included
 
     def prepare(self, gaussians: Gaussians) -> Gaussians:
         return spread_out(gaussians, self.initial_opacity, self.initial_scale)

@@ -92,9 +92,7 @@ class Volumetric(ADC):
     volume_threshold: PositiveFloat = VOLUME_THRESHOLD
     threshold_mode: ThresholdMode = "absolute"
     volume_quantile: OpenFraction = 0.9978  # 99.78 % of the volumes of Mip-NeRF 360 lie below 0.03
-    condition_of: ConditionOf = (
-        "eigenvalues"  # what kappa divides: eigenvalues (eq. 7), scales, or nothing (ADC's shrink)
-    )
+    condition_of: ConditionOf = "eigenvalues"  # what kappa divides: these (eq. 7), scales, or nothing (ADC's shrink)
     max_condition: Annotated[float, Ge(1)] | None = None  # limits kappa, so that children of needles do not vanish
     split_isotropic: bool = True  # False: leave those whose children would be above the threshold again
     volume_children: Annotated[int, Interval(ge=2, le=MOST_CHILDREN)] = 2

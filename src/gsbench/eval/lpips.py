@@ -208,9 +208,8 @@ class Lpips:
         for index, layer in enumerate(self._layers.children()):
             first, second = layer(first), layer(second)  # [1, C, h, w] each
             if index in self.backbone.taps:
-                here = (
-                    None if weights is None else F.adaptive_avg_pool2d(weights, (first.shape[2], first.shape[3]))[0, 0]
-                )  # [h, w]
+                size = first.shape[2], first.shape[3]
+                here = None if weights is None else F.adaptive_avg_pool2d(weights, size)[0, 0]  # [h, w]
                 total = total + _feature_distance(first, second, next(heads), here)
         return total
 

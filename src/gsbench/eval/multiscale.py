@@ -82,9 +82,8 @@ def _iw_ssim(image: Tensor, target: Tensor) -> Tensor:
             inside = (WINDOW_SIZE - BLOCK) // 2  # the block fits in more places than the window
             information = _information(band, target_band, parent)[inside:-inside, inside:-inside]
             mean = (structure[0, 0] * information).sum() / information.sum()
-        value = value * mean.abs() ** (
-            weight / sum(SCALE_WEIGHTS)
-        )  # these sum to 1.0001; the authors normalise them here
+        share = weight / sum(SCALE_WEIGHTS)  # these sum to 1.0001; the authors normalise them here
+        value = value * mean.abs() ** share
     return value
 
 
@@ -120,9 +119,8 @@ def _information(band: Tensor, target_band: Tensor, parent: Tensor | None) -> Te
         blocks = torch.cat([blocks, above[0, 0, 1:-1, 1:-1].reshape(-1, 1)], dim=1)  # [P, 10]
     count, size = blocks.shape
     # On the CPU: not every device has this decomposition, and the matrix is 10x10 at most.
-    variances, axes = (
-        found.to(blocks) for found in torch.linalg.eigh((blocks.T @ blocks / count).cpu())
-    )  # [K], [K, K]
+    found = torch.linalg.eigh((blocks.T @ blocks / count).cpu())
+    variances, axes = (part.to(blocks) for part in found)  # [K], [K, K]
     kept = variances > torch.finfo(variances.dtype).eps * variances.max()
     whitened = blocks @ axes[:, kept] / variances[kept].sqrt()  # [P, K']
     factor = whitened.square().sum(dim=1, keepdim=True) / size  # [P, 1] local variance: s²

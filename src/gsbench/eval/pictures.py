@@ -51,9 +51,7 @@ def match_pictures(photographs: Sequence[str], pictures: Sequence[str], by_order
         found = {photograph: by_key[key] for photograph, key in of_photographs.items()}
         for photograph, candidates in found.items():
             if len(candidates) > 1:
-                raise InputError(
-                    f"{', '.join(sorted(candidates))} all fit the photograph {photograph}: leave one of them"
-                )
+                raise InputError(f"{', '.join(sorted(candidates))} all fit the photograph {photograph}: leave one")
         pairs = {photograph: candidates[0] for photograph, candidates in found.items()}
         return Matching(pairs, rule, tuple(sorted(set(pictures) - set(pairs.values()))))
     raise InputError(_no_match(photographs, pictures, by_order))

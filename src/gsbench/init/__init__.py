@@ -13,9 +13,8 @@ from gsbench.init.base import (
     PoseErrors,
     read_cloud,
 )
-from gsbench.init.dataset import Dataset
 from gsbench.init.dim import Dim, SiftKornia
-from gsbench.init.placed import Carved, Random
+from gsbench.init.placed import Carved, Dataset, Random
 from gsbench.init.points import Ply, Points
 from gsbench.init.sfm import Jittered, Sfm, SfmDense
 from gsbench.logs import Progress

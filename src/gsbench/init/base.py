@@ -140,9 +140,7 @@ class InitReport:
     seconds: Mapping[str, float]
     settings: Mapping[str, Any]
     versions: Mapping[str, str]
-    own_gauge: Gauge | None = (
-        None  # of the model before it was aligned to the reference; None where nothing was aligned
-    )
+    own_gauge: Gauge | None = None  # of the model before its alignment to the reference; None where nothing was aligned
     pose_errors: PoseErrors | None = None  # None without a reference, and where the reference's poses were taken over
     warnings: tuple[str, ...] = ()
     counts: Mapping[str, int] = field(default_factory=dict)  # features, pairs, verified pairs, inlier matches

@@ -18,11 +18,11 @@ from gsbench.errors import InputError
 from gsbench.init.base import Preparation, Timer
 from gsbench.init.colmap.initializer import MIN_DETECTION_SIZE, ColmapInitializer
 from gsbench.init.colmap.pairs import Pairing
-from gsbench.init.colmap.progress_pipe import run_with_progress
 from gsbench.init.networks.features import FeatureSettings
 from gsbench.logs import Progress
 from gsbench.scene.types import Capture
 from gsbench.settings import AnyPath, Fraction
+from gsbench.system.isolate import run_with_progress
 from gsbench.weights import WeightsFile, digests_of_unpinned, find_all_weights
 
 if TYPE_CHECKING:

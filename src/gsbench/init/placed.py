@@ -1,7 +1,8 @@
-"""Points put under reference cameras: the base of such initialisers, and points drawn at random, the weakest start."""
+"""Points under reference cameras: those that came with them, points drawn at random, and the base of such starts."""
 
 from __future__ import annotations
 
+import shutil
 from abc import abstractmethod
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -13,26 +14,22 @@ from numpy.typing import NDArray
 from pydantic import PositiveFloat, PositiveInt
 
 from gsbench.errors import InputError
-from gsbench.init.base import Initializer, InitReport, PointCloud, Seed, Timer
+from gsbench.init.base import WORK_FOLDER, Initializer, InitReport, PointCloud, PointsFrom, Seed, Timer, TrainingPoints
 from gsbench.init.colmap.alignment import Array
-from gsbench.init.colmap.progress_pipe import run_with_progress
 from gsbench.logs import Progress, no_progress
 from gsbench.scene.types import Capture
 from gsbench.settings import check_settings
+from gsbench.system.isolate import run_with_progress
 
 if TYPE_CHECKING:
     import pycolmap
 
 
-class PlacedCloud(Initializer):
-    """Base of `Random` and `Ply`: the reference's cameras, and a cloud that the subclass, a dataclass, makes."""
+class GivenCameras(Initializer):
+    """Base of initialisers, dataclasses, that take the reference's cameras and make the points alone."""
 
     def __post_init__(self) -> None:
         check_settings(self, "init")
-
-    def needs_reference(self, capture: Capture) -> bool:
-        """Return whether `run` needs a ``reference`` because the capture came without cameras."""
-        return capture.model is None
 
     def run(
         self,
@@ -43,33 +40,29 @@ class PlacedCloud(Initializer):
         work_dir: Path | None = None,
     ) -> InitReport:
         """Write model and report; ``work_dir`` is not used. ``InputError`` where there are no cameras."""
-        if reference is None and self.needs_reference(capture):
+        if reference is None and capture.model is None:
             raise InputError(
                 f"init={self.name} needs cameras and scene {capture.name} came without: make them with init=sfm first"
             )
         output_dir.mkdir(parents=True, exist_ok=True)
-        return run_with_progress(_place, (self, capture, output_dir, reference), progress, what=self.name)
+        return run_with_progress(_build, (self, capture, output_dir, reference), progress, what=self.name)
 
     @abstractmethod
-    def cloud(self, capture: Capture, model: pycolmap.Reconstruction) -> PointCloud:
-        """The points, given the reference ``model``; runs in the isolated process."""
+    def fill(self, model: pycolmap.Reconstruction, capture: Capture, work: Path) -> TrainingPoints | None:
+        """Give the reference ``model`` its points, in the isolated process; ``work`` is a folder for that time."""
 
 
-def _place(job: tuple[PlacedCloud, Capture, Path, Path | None], progress: Progress) -> InitReport:
-    import pycolmap
-
+def _build(job: tuple[GivenCameras, Capture, Path, Path | None], progress: Progress) -> InitReport:
     from gsbench.init import report
-    from gsbench.init.colmap import reconstruct
+    from gsbench.init.colmap.reconstruct import load_reference
 
     initializer, capture, output_dir, reference = job
     timer = Timer()
-    model = reconstruct.load_reference(capture, reference)
+    with timer.phase("read"):
+        model = load_reference(capture, reference)
     assert model is not None
     with timer.phase("place"):
-        cloud = initializer.cloud(capture, model)
-        model.delete_all_points2D_and_points3D()
-        for point, color in zip(cloud.points, cloud.colors, strict=True):
-            model.add_point3D(point, pycolmap.Track(), color)
+        training_points = initializer.fill(model, capture, output_dir / WORK_FOLDER)
     settings: dict[str, Any] = asdict(initializer)  # type: ignore[call-overload]
     result = report.make_report(
         initializer.name,
@@ -80,9 +73,58 @@ def _place(job: tuple[PlacedCloud, Capture, Path, Path | None], progress: Progre
         settings=settings,
         seconds=timer.rounded(),
         packages=("pycolmap", "numpy"),
+        training_points=training_points,
     )
     report.write_result(model, result, output_dir)
     return result
+
+
+@dataclass(frozen=True, kw_only=True)
+class Dataset(GivenCameras):
+    """Takes over the capture's model: restricted to its selected images, cameras scaled to the files.
+
+    ``points_from=train`` leaves what two training views see, where it is, in their colours.
+    """
+
+    name: ClassVar[str] = "dataset"
+
+    points_from: PointsFrom = "all"
+
+    def fill(self, model: pycolmap.Reconstruction, capture: Capture, work: Path) -> TrainingPoints | None:
+        from gsbench.init.colmap.database import readable_images
+        from gsbench.init.colmap.reconstruct import keep_training_points
+
+        if model.num_points3D() == 0:
+            raise InputError(f"init=dataset: the model of scene {capture.name} has no points: use init=sfm or random")
+        if self.points_from == "all":
+            return None
+        work.mkdir(parents=True, exist_ok=True)
+        try:
+            images = readable_images(capture.images, capture.train_names, work)
+            return keep_training_points(model, capture.train_names, images)
+        finally:
+            shutil.rmtree(work, ignore_errors=True)
+
+
+class PlacedCloud(GivenCameras):
+    """Base of `Random` and `Ply`: the reference's cameras, and a cloud that the subclass, a dataclass, makes."""
+
+    def needs_reference(self, capture: Capture) -> bool:
+        """Return whether `run` needs a ``reference`` because the capture came without cameras."""
+        return capture.model is None
+
+    def fill(self, model: pycolmap.Reconstruction, capture: Capture, work: Path) -> TrainingPoints | None:
+        import pycolmap
+
+        cloud = self.cloud(capture, model)
+        model.delete_all_points2D_and_points3D()
+        for point, color in zip(cloud.points, cloud.colors, strict=True):
+            model.add_point3D(point, pycolmap.Track(), color)
+        return None
+
+    @abstractmethod
+    def cloud(self, capture: Capture, model: pycolmap.Reconstruction) -> PointCloud:
+        """The points, given the reference ``model``; runs in the isolated process."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +15,7 @@ from pydantic import PositiveInt
 from gsbench.errors import InputError
 from gsbench.files import file_sha256, require_regular
 from gsbench.init.base import GAUSSIANS_FILE, InitReport, PointCloud, Seed
-from gsbench.init.colmap.alignment import Array, Similarity
+from gsbench.init.colmap.alignment import Array
 from gsbench.init.placed import PlacedCloud, in_view
 from gsbench.logs import Progress, no_progress
 from gsbench.parsing import one_line
@@ -28,27 +27,24 @@ if TYPE_CHECKING:
 
 COLOR_NAMES = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
 TEXT_SUFFIXES = (".xyz", ".txt", ".csv", ".pts")
-ROTATION_TOLERANCE = 1e-4  # of a matrix that was written with few digits
 
 
 def read_points(path: Path) -> tuple[Array, NDArray[np.uint8] | None]:
     """Points [P, 3] float64 and their colours [P, 3], None where the file has none; the suffix says its form.
 
     ``.ply``: vertices with x, y, z in any order and type, text or binary; colours as whole numbers or in [0, 1].
-    ``.npy`` and text: columns x, y, z, and perhaps red, green, blue. Raises ``InputError`` for a file that cannot be
-    read, holds no point, or a coordinate or colour that is not a finite number.
+    Text: columns x, y, z, and perhaps red, green, blue. Raises ``InputError`` for a file that cannot be
+    read, holds no point, or a coordinate or colour that is no finite number.
     """
     suffix = path.suffix.lower()
     require_regular(path)
     try:
         if suffix == ".ply":
             points, colors = _read_ply(path)
-        elif suffix == ".npy":
-            points, colors = _columns(np.load(path, allow_pickle=False))
         elif suffix in TEXT_SUFFIXES:
             points, colors = _columns(np.loadtxt(path, delimiter="," if suffix == ".csv" else None, ndmin=2))
         else:
-            raise ValueError(f"known are .ply, .npy, {', '.join(TEXT_SUFFIXES)}")
+            raise ValueError(f"known are .ply, {', '.join(TEXT_SUFFIXES)}")
     except Exception as error:  # readers raise anything on a damaged file, numpy even what Python's tokenizer raises
         raise InputError(f"{path}: not a readable file of points ({one_line(str(error))})") from error
     if len(points) == 0:
@@ -63,28 +59,6 @@ def read_points(path: Path) -> tuple[Array, NDArray[np.uint8] | None]:
     if not np.isfinite(colors.astype(np.float64)).all() or colors.min() < 0:
         raise InputError(f"{path}: has colours that are negative or not finite numbers")
     return points, _eight_bits(colors)
-
-
-def read_similarity(path: Path) -> Similarity:
-    """The similarity in a text file of a 4 x 4 matrix: scale times rotation, translation, last row 0 0 0 1.
-
-    Raises ``InputError`` where it is none: another shape, a shear, a mirror image.
-    """
-    require_regular(path)
-    try:
-        matrix = np.loadtxt(path, ndmin=2)
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: not a readable matrix ({error})") from error
-    if matrix.shape != (4, 4) or not np.isfinite(matrix).all() or not np.array_equal(matrix[3], [0, 0, 0, 1]):
-        raise InputError(f"{path}: must hold 4 rows of 4 numbers, the last 0 0 0 1")
-    determinant = float(np.linalg.det(matrix[:3, :3]))
-    if determinant <= 0:
-        raise InputError(f"{path}: mirrors or flattens (determinant {determinant:.3g}): must be a similarity")
-    scale = determinant ** (1 / 3)
-    rotation = matrix[:3, :3] / scale
-    if np.abs(rotation @ rotation.T - np.eye(3)).max() > ROTATION_TOLERANCE:
-        raise InputError(f"{path}: shears or scales unevenly: must be one scale, a rotation and a translation")
-    return Similarity(scale, rotation, matrix[:3, 3])
 
 
 def _read_ply(path: Path) -> tuple[Array, NDArray[np.generic] | None]:
@@ -120,8 +94,28 @@ GREY = 128  # of points that no training photograph shows, where the file has no
 
 
 @dataclass(frozen=True, kw_only=True)
-class Points(PlacedCloud):
-    """The points of a file under the reference cameras: in their gauge, or moved there by a given similarity.
+class CloudOfFile(PlacedCloud):
+    """Base of initialisers whose points stand in the file ``path``."""
+
+    path: AnyPath
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.file.is_file():
+            raise InputError(f"init.path={self.path} is not a file")
+
+    @property
+    def file(self) -> Path:
+        return Path(self.path).expanduser()
+
+    def content(self) -> str:
+        """sha256 of the file: what the result depends on beside the options."""
+        return file_sha256(self.file)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Points(CloudOfFile):
+    """The points of a file under the reference cameras, in whose gauge they must lie.
 
     ``max_points`` keeps so many at random. Colours that the file lacks come from the nearest training camera's
     photograph that a point falls into.
@@ -129,33 +123,18 @@ class Points(PlacedCloud):
 
     name: ClassVar[str] = "points"
 
-    path: AnyPath
-    transform: AnyPath | None = None
     max_points: PositiveInt | None = 200_000
     seed: Seed = 0
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for key, path in (("path", self.path), ("transform", self.transform)):
-            if path is not None and not Path(path).expanduser().is_file():
-                raise InputError(f"init.{key}={path} is not a file")
-
-    def content(self) -> str:
-        """sha256 over the files: what the result depends on beside the options."""
-        files = [path for path in (self.path, self.transform) if path is not None]
-        return hashlib.sha256("".join(file_sha256(Path(path).expanduser()) for path in files).encode()).hexdigest()
-
     def cloud(self, capture: Capture, model: pycolmap.Reconstruction) -> PointCloud:
-        points, colors = read_points(Path(self.path).expanduser())
-        if self.transform is not None:
-            points = read_similarity(Path(self.transform).expanduser())(points)
+        points, colors = read_points(self.file)
         chosen = np.sort(np.random.default_rng(self.seed).permutation(len(points))[: self.max_points])
         points, colors = points[chosen], None if colors is None else colors[chosen]
         seen = seen_colors(points, capture, model)
         if (seen < 0).all():
             raise InputError(
                 f"init.path={self.path}: no point is in view of a training camera of scene {capture.name}: the cloud "
-                "lies in other coordinates; give init.transform, the similarity to those of the cameras"
+                "lies in other coordinates; bring it into those of the cameras"
             )
         if colors is None:
             colors = np.where(seen < 0, GREY, seen).astype(np.uint8)
@@ -188,7 +167,7 @@ def seen_colors(points: Array, capture: Capture, model: pycolmap.Reconstruction)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Ply(PlacedCloud):
+class Ply(CloudOfFile):
     """The Gaussians of a 3DGS PLY file, under the reference cameras; they must lie in the gauge of those.
 
     The model holds their means and colours as points; the training starts from the Gaussians themselves, kept beside.
@@ -196,25 +175,11 @@ class Ply(PlacedCloud):
 
     name: ClassVar[str] = "ply"
 
-    path: AnyPath
-
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not self.file.is_file():
-            raise InputError(
-                f"init.path={self.path} is not a file: name a PLY of Gaussians, as a trial's point_cloud.ply"
-            )
         from gsbench.gaussians.ply import check_ply
 
         check_ply(self.file)
-
-    @property
-    def file(self) -> Path:
-        return Path(self.path).expanduser()
-
-    def content(self) -> str:
-        """sha256 of the file: what the result depends on beside the options."""
-        return hashlib.sha256(self.file.read_bytes()).hexdigest()
 
     def run(
         self,

@@ -14,9 +14,9 @@ from gsbench.errors import InputError
 from gsbench.init.base import MODEL_FOLDER, InitReport, Timer
 from gsbench.init.colmap.alignment import Array
 from gsbench.init.colmap.initializer import MIN_DETECTION_SIZE, ColmapInitializer
-from gsbench.init.colmap.progress_pipe import run_with_progress
 from gsbench.logs import Progress, no_progress
 from gsbench.scene.types import Capture
+from gsbench.system.isolate import run_with_progress
 
 if TYPE_CHECKING:
     from gsbench.init.colmap.database import DatabaseTask

@@ -18,7 +18,6 @@ from functools import cache
 from pathlib import Path
 
 from gsbench.errors import InputError
-from gsbench.raster import executors
 from gsbench.settings import MISSING, TargetName, check_settings
 from gsbench.system.install import install_command
 from gsbench.words import closest
@@ -77,7 +76,7 @@ class Executor:
         return f"needs {self.package} {wanted} or newer, and {found} is installed: {self.upgrade}"
 
 
-EXECUTORS = (
+EXECUTORS = (  # of those for one type of device, ``auto`` takes the first that is installed
     Executor(
         "reference",
         "gsbench.raster.reference.ReferenceRasterizer",
@@ -112,8 +111,6 @@ EXECUTORS = (
         has_splitting_matrix=False,
     ),
 )
-# Executors that ``auto`` takes: the first that is installed. Other types of devices have the reference alone.
-PREFERRED = {"cpu": ("cpu",), "cuda": ("triton", "gsplat")}
 
 
 def names() -> tuple[str, ...]:
@@ -155,8 +152,7 @@ def resolve(name: str, device_type: str) -> Executor:
 
 
 def _automatic(device_type: str) -> Executor:
-    wanted = [executor for executor in EXECUTORS if executor.name in PREFERRED.get(device_type, ())]
-    wanted.sort(key=lambda executor: PREFERRED[device_type].index(executor.name))
+    wanted = [executor for executor in EXECUTORS if device_type in executor.devices]
     for executor in wanted:
         if executor.obstacle(device_type) is None:
             return executor
@@ -209,8 +205,6 @@ class RasterConfig:
 
     def __post_init__(self) -> None:
         check_settings(self, "raster")
-        if self._target_ is None and self.name not in executors.names():
-            choices = ", ".join(executors.names())
-            raise InputError(
-                f"raster must be one of {choices}, got {self.name!r}{closest(self.name, executors.names())}"
-            )
+        if self._target_ is None and self.name not in names():
+            choices = ", ".join(names())
+            raise InputError(f"raster must be one of {choices}, got {self.name!r}{closest(self.name, names())}")

@@ -8,6 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+PINHOLE_NAMES = ("SIMPLE_PINHOLE", "PINHOLE")
+
 
 @dataclass(frozen=True, eq=False)
 class Camera:
@@ -54,6 +56,26 @@ class Camera:
         return replace(
             self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy
         )
+
+
+@dataclass(frozen=True)
+class CameraModel:
+    """A COLMAP camera as plain values: the model's name, the size in px, and the parameters in COLMAP's order."""
+
+    name: str
+    width: int
+    height: int
+    params: tuple[float, ...]
+
+    @property
+    def distorted(self) -> bool:
+        return self.name not in PINHOLE_NAMES
+
+
+def pinhole_of(camera: CameraModel) -> Camera:
+    """An undistorted COLMAP camera as a `Camera` at the origin."""
+    fx, fy, cx, cy = camera.params if camera.name == "PINHOLE" else (camera.params[0], *camera.params)
+    return Camera(camera.width, camera.height, fx, fy, cx, cy, np.eye(3), np.zeros(3))
 
 
 ANGLE, DISTANCE = "angle_to_nearest", "distance_to_nearest"

@@ -11,11 +11,10 @@ import pycolmap
 from numpy.typing import NDArray
 
 from gsbench.errors import InputError
-from gsbench.scene.camera import Camera
+from gsbench.scene.camera import Camera, CameraModel
 from gsbench.scene.colmap_files import check_model
 from gsbench.scene.images import check_size, image_size
 from gsbench.scene.names import match_names
-from gsbench.scene.prepare import CameraModel
 from gsbench.scene.types import Capture
 
 PINHOLE_MODELS = (pycolmap.CameraModelId.SIMPLE_PINHOLE, pycolmap.CameraModelId.PINHOLE)
@@ -75,9 +74,7 @@ def read_reference(capture: Capture) -> pycolmap.Reconstruction:
     Raises `InputError` if there is no model, or an image and its camera differ in aspect by more than rounding.
     """
     if capture.model is None:
-        raise InputError(
-            f"scene {capture.name}: no COLMAP model came with these photos: use init.poses=own with init=sfm"
-        )
+        raise InputError(f"scene {capture.name}: no COLMAP model came with these photos: use init=sfm init.poses=own")
     model = read_model(capture.model)
     names = match_names(registered_names(model), capture.image_names)
     sizes = {file: image_size(capture.images / file) for file in names.values()}

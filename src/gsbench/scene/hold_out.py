@@ -40,16 +40,14 @@ def arrange(cameras: Sequence[Camera]) -> Arrangement:
     """The order of cameras around the scene, from the first one or from after the widest gap, else along an axis."""
     centers = np.array([camera.center for camera in cameras])  # [V, 3]
     azimuths, fault = _azimuths(cameras, centers)
-    if azimuths is None:
-        places = along_axis(centers)
-        description = f"by planes across the principal axis of the cameras' centres, since {fault}"
-        return Arrangement(_sorted(places), description)
-    order = np.argsort(azimuths, kind="stable")
-    gaps = np.diff(azimuths[order], append=azimuths[order[0]] + 360.0)  # [V] after each camera, degrees
-    widest = int(gaps.argmax())
-    gap = float(gaps[widest])
-    if gap >= SURROUNDED:
-        fault = f"the cameras stand on one side of the scene, with none in {gap:.0f} degrees around its centre"
+    if azimuths is not None:
+        order = np.argsort(azimuths, kind="stable")
+        gaps = np.diff(azimuths[order], append=azimuths[order[0]] + 360.0)  # [V] after each camera, degrees
+        widest = int(gaps.argmax())
+        gap = float(gaps[widest])
+        if gap >= SURROUNDED:
+            fault = f"the cameras stand on one side of the scene, with none in {gap:.0f} degrees around its centre"
+    if fault:
         description = f"by planes across the principal axis of the cameras' centres, since {fault}"
         return Arrangement(_sorted(along_axis(centers)), description)
     if gap > OPEN_RING:

@@ -71,18 +71,14 @@ def split_names(
         raise InputError(f"scene.test_every must be 0 (no test views) or positive, got {test_every}")
     if train is None and test is None:
         chosen = set(names[::test_every]) if test_every else set()
-        training = [name for name in names if name not in chosen]
-    elif train is not None and test is not None:
-        chosen = set(test)
-        if both := sorted(chosen & set(train)):
-            raise InputError(f"the split lists hold {some_of(both)} for training and for testing: name each image once")
-        training = [name for name in names if name in set(train)]
-    elif test is not None:
-        chosen = set(test)
-        training = [name for name in names if name not in chosen]
-    else:
+    elif test is None:
         chosen = set(names) - set(train or ())
-        training = [name for name in names if name not in chosen]
+    else:
+        chosen = set(test)
+        if both := sorted(chosen & set(train or ())):
+            raise InputError(f"the split lists hold {some_of(both)} for training and for testing: name each image once")
+    wanted = set(names if train is None else train)
+    training = [name for name in names if name in wanted and name not in chosen]
     testing = [name for name in names if name in chosen]
     if not training:
         raise InputError(
@@ -90,7 +86,7 @@ def split_names(
         )
     if not testing and test_every:
         raise InputError(
-            f"the split leaves no test view of {len(names)}: correct the lists, or give scene.test_every=0 for none"
+            f"the split leaves no test view of {len(names)}: correct the lists, or give scene.test_every=0"
         )
     return training, testing
 

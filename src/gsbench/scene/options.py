@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Literal
@@ -10,8 +11,41 @@ from annotated_types import Ge, Interval
 from pydantic import NonNegativeInt, PositiveInt
 
 from gsbench.errors import InputError
-from gsbench.scene.sizes import MIN_SIZE, check_final_size
 from gsbench.settings import MISSING, FolderName, PathName, check_settings, is_folder_name
+
+MIN_SIZE = 16  # px: the least side of an image that is worth training on
+
+
+def downscaled_size(width: int, height: int, downscale: int = 1, max_size: int | None = None) -> tuple[int, int]:
+    """The size after dividing by ``downscale`` and then, if need be, shrinking the longest side to ``max_size``.
+
+    Sides are rounded half up, and never below 1; the size never grows.
+
+    Examples:
+        >>> downscaled_size(4946, 3286, downscale=4)
+        (1237, 822)
+        >>> downscaled_size(4946, 3286, max_size=1600)
+        (1600, 1063)
+    """
+    if downscale < 1:
+        raise InputError(f"scene.downscale must be at least 1, got {downscale}")
+    if max_size is not None and max_size < 1:
+        raise InputError(f"scene.max_size must be at least 1 px, got {max_size}")
+    longest = max(width, height)
+    # one fraction, so that the longest side comes out as exactly max_size
+    numerator, denominator = (max_size, longest) if max_size and max_size * downscale < longest else (1, downscale)
+    return tuple(max(1, math.floor(side * numerator / denominator + 0.5)) for side in (width, height))  # type: ignore[return-value]
+
+
+def check_final_size(size: tuple[int, int], downscale: int, max_size: int | None, what: str) -> None:
+    """Raise InputError where ``what``, of ``size`` (width, height) px, would be trained on with a side below 16 px."""
+    width, height = downscaled_size(*size, downscale, max_size)
+    if min(width, height) < MIN_SIZE:
+        cause = f"scene.downscale={downscale}" + ("" if max_size is None else f" with scene.max_size={max_size}")
+        raise InputError(
+            f"{cause} leaves {width}x{height} px of {what} ({size[0]}x{size[1]} px): at least {MIN_SIZE} px are needed"
+        )
+
 
 SplitName = Literal["every_nth", "sector", "matched", "list"]
 TEST_EVERY = 8  # Mip-NeRF 360 and 3DGS hold out every 8th image, from the first
@@ -92,9 +126,7 @@ class SceneConfig:
     resample: Literal["lanczos", "area", "bicubic"] = "lanczos"
     max_images: Annotated[int, Ge(3)] = 200  # evenly spaced over the sorted names
     test_every: Annotated[int, Ge(2)] = TEST_EVERY  # every 8th sorted name is held out
-    split: SplitName = (
-        "every_nth"  # what is held out: every test_every-th image | sector | list; matched: a sweep of both
-    )
+    split: SplitName = "every_nth"  # what is held out: every test_every-th image, a sector, lists; matched: see `check`
     train_list: PathName | None = None  # file of names, one a line; null with split=list: train_list.txt
     test_list: PathName | None = None  # the same; null with split=list: test_list.txt
     sector: NonNegativeInt = 0  # which of them is held out

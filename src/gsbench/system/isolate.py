@@ -31,6 +31,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, ParamSpec, TypeVar
 
 from gsbench.errors import GsbenchError
+from gsbench.logs import Progress
 from gsbench.system.own_modules import allowed_modules
 
 PR_SET_PDEATHSIG, PR_SET_CHILD_SUBREAPER = 1, 36  # linux/prctl.h
@@ -110,6 +111,7 @@ def _control(option: int, value: int) -> None:
 
 P = ParamSpec("P")
 R = TypeVar("R")
+T = TypeVar("T")
 
 _BOOTSTRAP = (
     "import json, sys; path, own = json.loads(sys.argv[1]); sys.path[:] = path; "
@@ -159,6 +161,51 @@ def run_isolated(
         return value
     value.add_note(f"raised in the isolated process of {what}:\n{trace}")
     raise value
+
+
+POLL_SECONDS = 0.25
+
+
+class ProgressFile:
+    """A `Progress` that writes to a file, for a process to tell its parent; small enough writes are atomic."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __call__(self, phase: str, done: int, total: int | None, note: str = "") -> None:
+        with self.path.open("a", encoding="utf-8") as file:
+            file.write(f"{phase}\t{done}\t{'' if total is None else total}\t{note}\n")
+
+
+def run_with_progress(
+    function: Callable[[Any, Progress], T], job: Any, progress: Progress, what: str, log: Path | None = None
+) -> T:
+    """``function(job, progress)`` in a fresh process (see `run_isolated`); its progress is passed on as it comes."""
+    with tempfile.TemporaryDirectory(prefix="gsbench-progress-") as folder:
+        channel = ProgressFile(Path(folder, "progress.txt"))
+        channel.path.touch()
+        ended = threading.Event()
+        listener = threading.Thread(target=_listen, args=(channel.path, progress, ended), daemon=True)
+        listener.start()
+        try:
+            return run_isolated(function, job, channel, what=what, log=log)
+        finally:
+            ended.set()
+            listener.join()
+
+
+def _listen(path: Path, progress: Progress, ended: threading.Event) -> None:
+    rest = ""
+    with path.open(encoding="utf-8") as file:
+        while True:
+            last = ended.wait(POLL_SECONDS)
+            *lines, rest = (rest + file.read()).split("\n")
+            for line in lines:
+                phase, done, total, note = line.split("\t")
+                with suppress(BrokenPipeError):  # a closed terminal must not end the work
+                    progress(phase, int(done), int(total) if total else None, note)
+            if last:
+                return
 
 
 def python_command(module: str, name: str, *arguments: str) -> list[str]:

@@ -9,11 +9,11 @@ import hashlib
 import logging
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, BinaryIO, cast
+from typing import Any
 
 import torch
 
-from gsbench.files import CHUNK, atomic, sync_to_disk
+from gsbench.files import CHUNK, atomic, file_sha256, sync_to_disk
 
 log = logging.getLogger(__name__)
 
@@ -26,9 +26,9 @@ def save_checkpoint(folder: Path, step: int, state: dict[str, Any]) -> None:
     """Write ``state`` (tensors and plain values) as the checkpoint of ``step``, then drop all but the last two."""
     path = folder / f"checkpoint-{step:08d}.pt"
     with atomic(path) as temporary, temporary.open("wb") as stream:
-        writer = _HashingWriter(stream)
-        torch.save(state, cast("BinaryIO", writer))  # it only writes and flushes
-        stream.write(writer.digest.digest())
+        torch.save(state, stream)
+        stream.flush()
+        stream.write(bytes.fromhex(file_sha256(temporary)))
     sync_to_disk(folder)
     for old in sorted(folder.glob(PATTERN))[:-KEPT]:
         old.unlink()
@@ -93,21 +93,6 @@ def load_checkpoint(folder: Path) -> dict[str, Any] | None:
             log.warning("checkpoint %s is damaged (%s) and is passed over", path, reason)
             path.unlink()
     return None
-
-
-class _HashingWriter:
-    """Passes bytes on to ``stream`` and keeps their sha256."""
-
-    def __init__(self, stream: BinaryIO) -> None:
-        self.stream = stream
-        self.digest = hashlib.sha256()
-
-    def write(self, data: bytes) -> int:
-        self.digest.update(data)
-        return self.stream.write(data)
-
-    def flush(self) -> None:
-        self.stream.flush()
 
 
 def _check_digest(path: Path) -> None:

@@ -58,7 +58,7 @@ class PhotometricLoss:
     def __call__(self, image: Tensor, target: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         if image.dim() != 3 or image.shape[-1] != 3 or image.shape != target.shape:
             raise ValueError(
-                f"image {tuple(image.shape)} and target {tuple(target.shape)} must be of one shape [H, W, 3]"
+                f"image {tuple(image.shape)} and target {tuple(target.shape)} must have one shape: [H, W, 3]"
             )
         if image.dtype != torch.float32:
             return torch_photometric_loss(image, target, self.ssim_weight)

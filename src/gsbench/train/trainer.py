@@ -27,7 +27,7 @@ from gsbench.runs.layout import CURVES, EVENTS, HISTOGRAMS
 from gsbench.scene.types import Scene
 from gsbench.system.stopping import deferred, requested
 from gsbench.train.checkpoint import CheckpointWriter, load_checkpoint
-from gsbench.train.device import explain_full, free_bytes, room_for_images
+from gsbench.train.device import explain_full, free_bytes
 from gsbench.train.journal import LossLog, append, drop_after, volume_histogram
 from gsbench.train.loss import PhotometricLoss
 from gsbench.train.options import TrainConfig
@@ -35,6 +35,8 @@ from gsbench.train.resolution import Pictures, Resolution
 from gsbench.train.views import CameraOrder, SceneViews, Targets, generators
 
 log = logging.getLogger(__name__)
+
+SHARE_FOR_IMAGES = 0.5  # of the free memory of a GPU; the model and its renders take the rest
 
 
 @dataclass(frozen=True)
@@ -78,9 +80,8 @@ class Trainer:
         self.step = 0
         self.seconds = 0.0
         self.losses = LossLog()
-        cap = densifier.most_gaussians
-        pixels = max((view.camera.width * view.camera.height for view in scene.train), default=0)
-        room = room_for_images(free_bytes(self.device), len(initial), cap, pixels)
+        free = free_bytes(self.device)
+        room = None if free is None else int(SHARE_FOR_IMAGES * free)
         self.targets = Targets(scene.train, self.device, room)
         views = SceneViews(
             scene.train, self.targets, rasterizer, self.background, self.loss, partial(sh_degree_at, options)
@@ -160,8 +161,6 @@ class Trainer:
         index = self.order.next()
         _, targets = self.pictures.at(self.scale)
         target = targets.get(index)
-        if self.order.following is not None:
-            targets.prefetch(self.order.following)
         try:
             render = self.render(index)
         except ValueError as error:  # the optimiser has driven a parameter out of range
@@ -186,7 +185,7 @@ class Trainer:
         self.densifier.after_step(step, self.gaussians, self.rngs["densify"])
         if len(self.gaussians) == 0:
             raise TrainingError(
-                f"no Gaussian was left after iteration {step}; the pruning thresholds or a decay are too high"
+                f"no Gaussian was left after iteration {step}: pruning thresholds or a decay are too high"
             )
         return event
 

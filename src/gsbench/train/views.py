@@ -45,13 +45,6 @@ class CameraOrder:
             self.remaining = torch.randperm(self.num_views, generator=self.rng).tolist()
         return self.remaining.pop()
 
-    @property
-    def following(self) -> int | None:
-        """The camera that `next` will give, or None where that is not drawn yet."""
-        return self.remaining[-1] if self.remaining else None
-
-
-BUFFERS = 2  # page-locked, between an image and the device: one is filled while the other is copied
 
 log = logging.getLogger(__name__)
 
@@ -60,8 +53,8 @@ class Targets:
     """The images of ``views`` on ``device``, [H, W, 3] uint8 each.
 
     They stay on the device where all of them fit into ``budget`` bytes (None: no limit). Else each is copied there when
-    it is needed: ahead of its use and beside the work of the device, if `prefetch` says in time which comes next. On a
-    CPU they are the arrays of the views themselves. Masks, a third of that where there are any, are always there.
+    it is asked for. On a CPU they are the arrays of the views themselves. Masks, a third of that where there are any,
+    are always there.
     """
 
     def __init__(self, views: Sequence[View], device: torch.device, budget: int | None = None) -> None:
@@ -72,21 +65,13 @@ class Targets:
         self._device = device
         self.bytes = sum(image.numel() for image in self._images)
         self.resident = budget is None or self.bytes <= budget
-        self._stream: _Stream | None = None
-        self._ahead: tuple[int, Tensor] | None = None
         if self.resident:
             self._images = [image.to(device) for image in self._images]
         else:
-            self._stream = _Stream(device, max(image.numel() for image in self._images))
             log.info(
-                "the %d training images (%s) do not fit on %s beside the model: each is copied when it is needed",
+                "the %d training images (%s) leave too little memory on %s: each is copied when it is needed",
                 len(self._images), readable_bytes(self.bytes), device,
             )  # fmt: skip
-
-    def prefetch(self, index: int) -> None:
-        """Begin to copy the image of view ``index``, which `get` will ask for next."""
-        if self._stream is not None:
-            self._ahead = index, self._stream.send(self._images[index])
 
     def mask(self, index: int) -> Tensor | None:
         """The mask of view ``index``, True where a pixel counts, [H, W, 1] on the device; None where all do."""
@@ -94,49 +79,10 @@ class Targets:
 
     def get(self, index: int) -> Tensor:
         """The image of view ``index``, for work that is queued from here on."""
-        if self._stream is None:
-            return self._images[index]
-        if self._ahead is None or self._ahead[0] != index:
-            self.prefetch(index)
-        assert self._ahead is not None
-        image, self._ahead = self._ahead[1], None
-        self._stream.join(image)
-        return image
-
-
-class _Stream:
-    """Copies images to a device through page-locked buffers, on a stream of its own where the device has streams."""
-
-    def __init__(self, device: torch.device, largest: int) -> None:
-        self._device = device
-        self._on_cuda = device.type == "cuda"
-        self._buffers = [torch.empty(largest, dtype=torch.uint8, pin_memory=self._on_cuda) for _ in range(BUFFERS)]
-        self._copied: list[torch.cuda.Event | None] = [None] * BUFFERS
-        self._turn = 0
-        self._stream = torch.cuda.Stream(device) if self._on_cuda else None
-
-    def send(self, image: Tensor) -> Tensor:
-        """``image`` on the device, of which work must not be queued before `join`."""
-        self._turn = (self._turn + 1) % BUFFERS
-        event = self._copied[self._turn]
-        if event is not None:
-            event.synchronize()  # of the copy before the last: long done
-        staged = self._buffers[self._turn][: image.numel()].view(image.shape)
-        staged.copy_(image)
-        if self._stream is None:
-            return staged.to(self._device, copy=True)
-        with torch.cuda.stream(self._stream):
-            sent = staged.to(self._device, non_blocking=True, copy=True)
-            self._copied[self._turn] = torch.cuda.Event()
-            self._copied[self._turn].record(self._stream)  # type: ignore[union-attr]
-        return sent
-
-    def join(self, image: Tensor) -> None:
-        """Let the work that is queued from here on wait for the copies so far; the host does not wait."""
-        if self._stream is not None:
-            current = torch.cuda.current_stream(self._device)
-            current.wait_stream(self._stream)
-            image.record_stream(current)
+        image = self._images[index]
+        if self.resident or self._device.type != "cuda":
+            return image
+        return image.pin_memory().to(self._device, non_blocking=True)  # page-locked, so that the host need not wait
 
 
 class SceneViews:

@@ -10,7 +10,7 @@ from typing import Any
 
 from gsbench.errors import InputError
 from gsbench.raster.executors import AUTO, EXECUTORS
-from gsbench.scene.sizes import MIN_SIZE
+from gsbench.scene.options import MIN_SIZE
 from gsbench.system.own_modules import allow_modules
 from gsbench.verbs.arguments import ArgumentParser, path
 
@@ -43,7 +43,7 @@ def parser() -> ArgumentParser:
     made.add_argument(
         "--raster",
         default="cpu",
-        help=f"names, comma between: {names}, gsplat-rasterization (its own function), or your own, mine.MyRasterizer",
+        help=f"names, comma between: {names}, or your own, mine.MyRasterizer",
     )
     made.add_argument("--size", default="500x375", help="image sizes, comma between")
     made.add_argument("--count", default="100000", help="numbers of Gaussians, comma between")
@@ -100,8 +100,7 @@ def table(rows: list[dict[str, Any]]) -> str:
     cells = [used] + [[_cell(key, row.get(key)) for key in used] for row in rows]
     widths = [max(len(line[k]) for line in cells) for k in range(len(used))]
     lines = ["  ".join(text.rjust(width) for text, width in zip(line, widths, strict=True)) for line in cells]
-    notes = {f"{row['raster']}: {row['note']}" for row in rows if "note" in row}
-    return "\n".join([*lines, *sorted(notes)])
+    return "\n".join(lines)
 
 
 def _cell(key: str, value: Any) -> str:

@@ -166,7 +166,7 @@ def test_ways_are_tried_until_one_places_nine_of_ten(
     create_database(tmp_path / "database.db", guessed_groups(tmp_path / "images", names, "single", "PINHOLE", 30.0))
     monkeypatch.setattr(mapping, "_is_plausible", lambda model: True)
     ways = [(f"way {k}", lambda sizes=sizes: [Model(*size) for size in sizes]) for k, sizes in enumerate(found)]
-    monkeypatch.setattr(mapping, "_ways", lambda *_: iter(ways))
+    monkeypatch.setattr(mapping._Mapper, "ways", lambda mapper: iter(ways))
     result = mapped(tmp_path / "database.db", "auto")
     assert (result.model.num_reg_images(), result.model.num_points3D()) == best
     place = next(k for k, sizes in enumerate(found) if best in sizes)
@@ -185,27 +185,24 @@ def test_the_ways_of_a_mapper(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, m
     """From the defaults to assumed focal lengths, these only where none is known."""
     calls: list[tuple[object, ...]] = []
     monkeypatch.setattr(mapping, "cameras_without_prior", lambda database: not prior)
+    own = mapping._Mapper
+    monkeypatch.setattr(own, "with_focal_lengths", lambda _, factor: calls.append(("assumed", factor)) or [])
     monkeypatch.setattr(
-        mapping, "_with_focal_lengths", lambda database, copy, factor, *_: (database, copy.name, factor)
+        own, "incremental", lambda _, found, angle=None: calls.append(("incremental", found, angle)) or []
     )
-    monkeypatch.setattr(
-        mapping,
-        "_incremental",
-        lambda found, images, output, *rest: calls.append(("incremental", found, rest[-1])) or [],
-    )
-    monkeypatch.setattr(mapping, "_global", lambda database, *_: calls.append(("global", database)) or [])
+    monkeypatch.setattr(own, "at_once", lambda made: calls.append(("global", made.database)) or [])
     database = tmp_path / "a.db"
-    ways = list(mapping._ways(database, tmp_path, tmp_path / "out", Sfm(mapper=mapper), no_progress, 9))
+    ways = list(own(database, tmp_path, tmp_path / "out", Sfm(mapper=mapper), no_progress, 9).ways())
     for _, run in ways:
         run()
-    assumed = [] if prior else [(database, f"assumed-{factor:g}.db", factor) for factor in mapping.FOCAL_FACTORS]
+    assumed = [] if prior else [("assumed", factor) for factor in mapping.FOCAL_FACTORS]
     small = mapping.SMALL_ANGLE_DEG
     expected = {
         "incremental": [("incremental", database, None)],
         "global": [("global", database)],
         "auto": [
             ("incremental", database, None), ("incremental", database, small), ("global", database),
-            *(("incremental", copy, small) for copy in assumed),
+            *assumed,
         ],
     }  # fmt: skip
     assert calls == expected[mapper]
@@ -224,11 +221,11 @@ def test_mapping_tells_its_progress_from_none_to_all(tmp_path: Path, monkeypatch
 
     monkeypatch.setattr(pycolmap, "incremental_mapping", place)
     monkeypatch.setattr(pycolmap, "global_mapping", lambda *_, options: {0: Model(3)})
-    given = tmp_path, tmp_path, tmp_path, Sfm(), lambda *state: told.append(state), 3
-    assert [model.images for model in mapping._incremental(*given, None)] == [2, 2]
+    mapper = mapping._Mapper(tmp_path / "a.db", tmp_path, tmp_path / "out", Sfm(), lambda *at: told.append(at), 3)
+    assert [model.images for model in mapper.incremental(tmp_path / "a.db")] == [2, 2]
     assert told == [("map", done, 3) for done in (0, 1, 2, 3, 3, 3)]
     told.clear()
-    assert [model.images for model in mapping._global(*given)] == [3]
+    assert [model.images for model in mapper.at_once()] == [3]
     assert told == [("map", 0, 3), ("map", 3, 3)]
 
 

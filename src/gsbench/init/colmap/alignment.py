@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 RANSAC_TRIALS = 500
-INLIER_FACTOR = (
-    2.5 * 1.4826
-)  # a median absolute deviation times 1.4826 estimates sigma; 2.5 sigma as in least median of squares
+# 2.5 sigma, as in least median of squares; a median absolute deviation times 1.4826 estimates sigma.
+INLIER_FACTOR = 2.5 * 1.4826
 COLLINEAR_RATIO = 1e-2  # second over first singular value of the centres: below it they are too near to a line
 
 

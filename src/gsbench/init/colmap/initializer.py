@@ -28,10 +28,10 @@ from gsbench.init.base import (
     Timer,
 )
 from gsbench.init.colmap.pairs import Pairing
-from gsbench.init.colmap.progress_pipe import run_with_progress
 from gsbench.logs import Progress, no_progress
 from gsbench.scene.types import Capture
 from gsbench.settings import Fraction, Threads, check_settings
+from gsbench.system.isolate import run_with_progress
 from gsbench.system.resources import available_cores
 from gsbench.words import counted
 

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pycolmap
@@ -51,18 +51,10 @@ class Mapped:
         if len(self.tried) < 2:
             return ()
         others = ", ".join(f"{way} {count}" for way, count in self.tried)
-        return (
-            f"the cameras come from the way {self.way!r}, since COLMAP's defaults placed too few (images: {others})",
-        )
+        return (f"cameras come from the way {self.way!r}, since COLMAP's defaults placed too few (images: {others})",)
 
 
-def map_images(
-    database: Path,
-    images: Path,
-    output: Path,
-    options: ColmapInitializer,
-    progress: Progress,
-) -> Mapped:
+def map_images(database: Path, images: Path, output: Path, options: ColmapInitializer, progress: Progress) -> Mapped:
     """Cameras and points from the matches in ``database``; of several models the one with the most images.
 
     ``auto`` goes from COLMAP's incremental mapper to one that starts from smaller angles, to the global mapper and to
@@ -74,7 +66,7 @@ def map_images(
         total = opened.num_images()
     best: tuple[pycolmap.Reconstruction, int, str] | None = None
     tried: list[tuple[str, int]] = []
-    for way, run in _ways(database, images, output, options, progress, total):
+    for way, run in _Mapper(database, images, output, options, progress, total).ways():
         models = [model for model in run() if _is_plausible(model)]
         largest = max(models, key=_size, default=None)
         tried.append((way, 0 if largest is None else largest.num_reg_images()))
@@ -92,88 +84,75 @@ def map_images(
     return Mapped(*best, tuple(tried))
 
 
-Run = Callable[[], Sequence[pycolmap.Reconstruction]]
+Models = Sequence[pycolmap.Reconstruction]
 
 
-def _ways(
-    database: Path,
-    images: Path,
-    output: Path,
-    options: ColmapInitializer,
-    progress: Progress,
-    total: int,
-) -> Iterator[tuple[str, Run]]:
-    """The ways that ``init.mapper`` allows, in the order of trying, each with what runs it."""
+@dataclass(frozen=True)
+class _Mapper:
+    """COLMAP's mappers on one database of ``total`` images."""
 
-    def incremental(found: Path, angle: float | None = None) -> Sequence[pycolmap.Reconstruction]:
-        return _incremental(found, images, _empty(output), options, progress, total, angle)
+    database: Path
+    images: Path
+    output: Path
+    options: ColmapInitializer
+    progress: Progress
+    total: int
 
-    def with_focal_lengths(factor: float) -> Sequence[pycolmap.Reconstruction]:
-        copy = database.with_name(f"assumed-{factor:g}.db")
-        return incremental(_with_focal_lengths(database, copy, factor, options, progress), SMALL_ANGLE_DEG)
+    def ways(self) -> Iterator[tuple[str, Callable[[], Models]]]:
+        """The ways that ``init.mapper`` allows, in the order of trying, each with what runs it."""
+        mapper = self.options.mapper
+        if mapper in ("auto", "incremental"):
+            yield "incremental", lambda: self.incremental(self.database)
+        if mapper == "auto":
+            yield (
+                f"incremental from {SMALL_ANGLE_DEG:g} degrees",
+                lambda: self.incremental(self.database, SMALL_ANGLE_DEG),
+            )
+        if mapper in ("auto", "global"):
+            yield "global", self.at_once
+        if mapper == "auto" and cameras_without_prior(self.database):
+            for factor in FOCAL_FACTORS:
+                yield f"focal length {factor:g} x the longest side", partial(self.with_focal_lengths, factor)
 
-    if options.mapper in ("auto", "incremental"):
-        yield "incremental", lambda: incremental(database)
-    if options.mapper == "auto":
-        yield f"incremental from {SMALL_ANGLE_DEG:g} degrees", lambda: incremental(database, SMALL_ANGLE_DEG)
-    if options.mapper in ("auto", "global"):
-        yield "global", lambda: _global(database, images, _empty(output), options, progress, total)
-    if options.mapper == "auto" and cameras_without_prior(database):
-        for factor in FOCAL_FACTORS:
-            yield f"focal length {factor:g} x the longest side", partial(with_focal_lengths, factor)
+    def incremental(self, database: Path, initial_angle: float | None = None) -> Models:
+        """Image by image, from a pair that sees points under ``initial_angle`` degrees (None: COLMAP's default)."""
+        registered = 0
 
+        def one_more() -> None:
+            nonlocal registered
+            registered += 1
+            self.progress("map", min(registered, self.total), self.total)
 
-def _with_focal_lengths(
-    database: Path, copy: Path, factor: float, options: ColmapInitializer, progress: Progress
-) -> Path:
-    """A copy of the database whose unknown focal lengths are ``factor`` times the longest side, verified anew."""
-    shutil.copy(database, copy)
-    pairs = assume_focal_lengths(copy, factor)
-    verify_pairs(copy, pairs, verification_options(options), progress)
-    return copy
+        options = pipeline_options(self.options)
+        if initial_angle is not None:
+            options.mapper.init_min_tri_angle = initial_angle
+        run = partial(pycolmap.incremental_mapping, database, next_image_callback=one_more)
+        return self._run(run, options)
 
+    def at_once(self) -> Models:
+        """All images together, by COLMAP's global mapper."""
+        options = pycolmap.GlobalPipelineOptions()
+        options.num_threads = self.options.mapper_threads
+        options.random_seed = self.options.seed
+        options.min_model_size = self.options.min_model_size
+        adjustment = options.mapper.bundle_adjustment
+        adjustment.refine_focal_length = self.options.intrinsics == "estimate"
+        adjustment.refine_extra_params = self.options.intrinsics == "estimate"
+        return self._run(partial(pycolmap.global_mapping, self.database), options)
 
-def _incremental(
-    database: Path,
-    images: Path,
-    output: Path,
-    settings: ColmapInitializer,
-    progress: Progress,
-    total: int,
-    initial_angle: float | None,
-) -> Sequence[pycolmap.Reconstruction]:
-    registered = 0
+    def with_focal_lengths(self, factor: float) -> Models:
+        """Incrementally, with unknown focal lengths taken as ``factor`` times the longest side, and verified anew."""
+        copy = self.database.with_name(f"assumed-{factor:g}.db")
+        shutil.copy(self.database, copy)
+        verify_pairs(copy, assume_focal_lengths(copy, factor), verification_options(self.options), self.progress)
+        return self.incremental(copy, SMALL_ANGLE_DEG)
 
-    def one_more() -> None:
-        nonlocal registered
-        registered += 1
-        progress("map", min(registered, total), total)
-
-    options = pipeline_options(settings)
-    if initial_angle is not None:
-        options.mapper.init_min_tri_angle = initial_angle
-    progress("map", 0, total)
-    pycolmap.set_random_seed(settings.seed)
-    models = pycolmap.incremental_mapping(database, images, output, options=options, next_image_callback=one_more)
-    progress("map", total, total)
-    return list(models.values())
-
-
-def _global(
-    database: Path, images: Path, output: Path, settings: ColmapInitializer, progress: Progress, total: int
-) -> Sequence[pycolmap.Reconstruction]:
-    options = pycolmap.GlobalPipelineOptions()
-    options.num_threads = settings.mapper_threads
-    options.random_seed = settings.seed
-    options.min_model_size = settings.min_model_size
-    adjustment = options.mapper.bundle_adjustment
-    adjustment.refine_focal_length = settings.intrinsics == "estimate"
-    adjustment.refine_extra_params = settings.intrinsics == "estimate"
-    progress("map", 0, total)
-    pycolmap.set_random_seed(settings.seed)
-    models = pycolmap.global_mapping(database, images, output, options=options)
-    progress("map", total, total)
-    return list(models.values())
+    def _run(self, mapping: Callable[..., dict[int, pycolmap.Reconstruction]], options: Any) -> Models:
+        self.progress("map", 0, self.total)
+        pycolmap.set_random_seed(self.options.seed)
+        models = mapping(self.images, _empty(self.output), options=options)
+        self.progress("map", self.total, self.total)
+        return list(models.values())
 
 
 def _empty(folder: Path) -> Path:

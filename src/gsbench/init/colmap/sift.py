@@ -22,9 +22,9 @@ from typing import TYPE_CHECKING
 import pycolmap
 
 from gsbench.init.colmap.database import image_ids, rename_images, write_pairs
-from gsbench.init.colmap.progress_pipe import run_with_progress
 from gsbench.init.colmap.reconstruct import verification_options
 from gsbench.logs import Progress
+from gsbench.system.isolate import run_with_progress
 
 if TYPE_CHECKING:
     from gsbench.init.sfm import Sfm

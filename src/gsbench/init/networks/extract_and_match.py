@@ -20,12 +20,12 @@ from gsbench.init.networks.features import Features, FeatureSettings, FeatureSto
 from gsbench.logs import Progress
 from gsbench.scene.masks import read_mask
 from gsbench.scene.types import Capture
+from gsbench.words import some_of
 
 if TYPE_CHECKING:
     from gsbench.init.colmap.initializer import ColmapInitializer
 
 CACHE_BYTES = 1 << 30  # of descriptors held in memory while pairs are matched
-NAMES_IN_WARNING = 5
 # deep-image-matching's `matching_lowres`, its default way to choose pairs (pairs_generator.py, state of December 2024)
 LOWRES_SIZE = 1000  # px
 LOWRES_KEYPOINTS = 2048
@@ -70,9 +70,7 @@ def extract_and_match(job: NetworkJob, progress: Progress) -> Preparation:
     with timer.phase("extract"):
         empty = _extract_all(job, store, names, device, progress)
     if len(empty) == len(names):
-        raise InputError(
-            f"{options.name}: no keypoint in any image: lower init.keypoint_threshold, or check the photos"
-        )
+        raise InputError(f"{options.name}: no keypoint in any image: lower init.keypoint_threshold or check the photos")
     if options.pairs == "lowres":  # type: ignore[comparison-overlap]  # `Dim` has one way more than SIFT
         with timer.phase("preselect"):
             small = at_low_resolution(job)
@@ -85,7 +83,7 @@ def extract_and_match(job: NetworkJob, progress: Progress) -> Preparation:
         raise InputError(f"{options.name}: no pair of images has a match: the photos need more overlap or texture")
     warnings = []
     if empty:
-        warnings.append(f"no keypoint in {_some(empty)}: no point comes from these images")
+        warnings.append(f"no keypoint in {some_of(empty)}: no point comes from these images")
     weights = [path for path in (job.extractor_weights, job.matcher_weights) if path is not None]
     return Preparation(
         seconds=timer.seconds,
@@ -190,8 +188,3 @@ def _cached_reader(store: FeatureStore, pairs: Sequence[tuple[str, str]]) -> Cal
 
 def _digest(path: Path | None) -> str | None:
     return None if path is None else file_sha256(path)
-
-
-def _some(names: Sequence[str]) -> str:
-    more = len(names) - NAMES_IN_WARNING
-    return ", ".join(names[:NAMES_IN_WARNING]) + (f" and {more} more" if more > 0 else "")

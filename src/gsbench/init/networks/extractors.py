@@ -15,7 +15,7 @@ from PIL import Image
 from gsbench.errors import InputError
 from gsbench.init.networks.features import Features, FeatureSettings
 from gsbench.scene.images import read_image
-from gsbench.scene.sizes import downscaled_size
+from gsbench.scene.options import downscaled_size
 from gsbench.system.install import install_command
 from gsbench.weights import MissingWeights, load_state
 

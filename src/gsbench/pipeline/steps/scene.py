@@ -27,7 +27,7 @@ from gsbench.scene.images import image_size
 from gsbench.scene.load import load_scene
 from gsbench.scene.masks import IMAGES, prepare, prepared_mask, write_mask
 from gsbench.scene.names import png_name
-from gsbench.scene.options import Behind, SceneConfig
+from gsbench.scene.options import Behind, SceneConfig, check_final_size
 from gsbench.scene.readers import (
     SPARSE_FOLDERS,
     existing_folder,
@@ -36,7 +36,6 @@ from gsbench.scene.readers import (
     read_photos,
     read_transforms,
 )
-from gsbench.scene.sizes import check_final_size
 from gsbench.scene.transforms import Transforms
 from gsbench.scene.transforms import read_transforms as read_transforms_files
 from gsbench.scene.types import Capture, Scene

@@ -74,6 +74,7 @@ MAX_VARIANCE = 1e18  # px^2; nor can a standard deviation; squares stay finite
 CONTOUR_MARGIN = 0.01  # px, and relative: rounding of the contour alpha = 1/255 must not lose a pixel
 ZERO, HALF, ONE, TWO, FOUR = (np.float32(value) for value in (0, 0.5, 1, 2, 4))
 
+AHEAD = 16  # records that the backward pass's prefetch runs ahead
 ALL_LANES = np.uint64((1 << LANES) - 1)
 VISIBLE, BAD_VALUE = 0, 1  # places of a shard's flags
 
@@ -241,9 +242,6 @@ def _row_sums(array: Any, place: int) -> Any:
     for k in range(1, LANES):
         total += load(array, place + k * LANES)
     return total
-
-
-AHEAD = 16  # records that the prefetch runs ahead
 
 
 @inlined

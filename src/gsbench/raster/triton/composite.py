@@ -45,6 +45,7 @@ TRANSMITTANCE_MIN = tl.constexpr(CONSTANTS.transmittance_min)
 UNROLL = tl.constexpr(4)  # entries between two looks at whether all pixels have stopped
 UNROLL_BACK = tl.constexpr(2)  # entries of one round of the backward pass
 TO_PRECISION = tl.constexpr(2 * math.log(2.0))  # -curve to entry of the inverse covariance, up to sign
+COVERED, VALUES, DISTANCES = tl.constexpr(0), tl.constexpr(1), tl.constexpr(2)  # of a footprint's row
 
 
 @triton.jit
@@ -361,9 +362,6 @@ def composite_backward(
                 _sums_over_lanes(_lane_sums(h, weight, t, dy, g, record, ABSOLUTE), lane, ABSOLUTE),
                 mask=stores & (position >= begin),
             )
-
-
-COVERED, VALUES, DISTANCES = tl.constexpr(0), tl.constexpr(1), tl.constexpr(2)  # of a row
 
 
 @triton.jit(do_not_specialize=["width", "height", "blocks_x"])

@@ -33,44 +33,6 @@ def launch_grid(kernel: Any, *programs: int) -> Callable[..., None]:
     return run
 
 
-# Bytes that stay from step to step, in the workspaces of `stages` and `lists`.
-BYTES_OF_GAUSSIAN = (
-    64 + 36 + 3 * 4 + 3 * 8
-)  # record; slopes of the colour; depth and key, rows of blocks; their places, the order
-BYTES_OF_UNIT = 3 * 4 + 8  # a row of blocks of a Gaussian: owner, first block, width; end of its pairs
-BYTES_OF_PAIR = 64 + 8 + 2 * 4 + 2 * 2  # row of gradient sums; slot; Gaussian, twice; key, twice
-BYTES_OF_BLOCK = 128 * (4 + 4) + 3 * 4 + 2 * 8  # of 128 pixels transmittance and last entry; list, last slot
-BYTES_OF_BORDER = 128 * 4 * 4  # of 128 pixels transmittance and colour
-PAIRS_OF_BORDER = 256  # between two, where a list is walked backward by several programs
-BYTES_OF_RENDER = 64 + 4 + 4 + 3 * 8  # the record that cannot be seen, the end of the lists, flags, status
-UNITS_AT_FIRST = 2  # rows of blocks that a Gaussian has room for, before they are counted
-
-# While pairs are sorted: the numbers of the slots, and a second copy of these and of the keys.
-BYTES_OF_SORTING = 8 + 8 + 2
-
-
-def workspace_bytes(gaussians: int, units: int, pairs: int, blocks: int) -> int:
-    """The buffers of one render with its backward pass, those for rows of blocks having room for ``units``."""
-    return (
-        BYTES_OF_RENDER
-        + BYTES_OF_GAUSSIAN * gaussians
-        + BYTES_OF_UNIT * units
-        + BYTES_OF_PAIR * pairs
-        + BYTES_OF_BLOCK * blocks
-        + BYTES_OF_BORDER * (max(pairs - 1, 0) // PAIRS_OF_BORDER)
-    )
-
-
-def render_bytes(gaussians: int, units: int, pairs: int, blocks: int) -> int:
-    """Bytes that renders hold at once, with their backward passes, beside their results and gradients.
-
-    ``pairs`` (Gaussian, block) stand in ``units`` rows of blocks. A buffer that has to grow becomes at least twice as
-    large as it was, so that after some growth it may be up to twice what is counted here.
-    """
-    room = UNITS_AT_FIRST * gaussians
-    return workspace_bytes(gaussians, room if units <= room else 2 * units, pairs, blocks) + BYTES_OF_SORTING * pairs
-
-
 class Workspace:
     """Named one-dimensional tensors that grow by doubling. ``take`` gives a view with what was left there."""
 

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from gsbench.gaussians.model import Gaussians
 from gsbench.raster.staged import Readback, raise_for_values
-from gsbench.raster.triton.launch import UNITS_AT_FIRST, Workspace, launch, launch_grid
+from gsbench.raster.triton.launch import Workspace, launch, launch_grid
 from gsbench.raster.triton.layout import (
     BLOCK_HEIGHT,
     BLOCK_WIDTH,
@@ -138,6 +138,7 @@ def write_pairs(unit_owners, unit_blocks, unit_widths, pair_ends, units, keys, o
 
 
 MAX_INT16, MAX_INT32 = 2**15 - 1, 2**31 - 1
+UNITS_AT_FIRST = 2  # rows of blocks that a Gaussian has room for, before they are counted
 
 
 class Projected(NamedTuple):
