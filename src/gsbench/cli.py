@@ -3,8 +3,6 @@
 Nothing here loads torch, so that ``--help`` and the verbs that only read files answer at once.
 """
 
-from __future__ import annotations
-
 import sys
 
 INTERRUPTED = 130  # 128 + SIGINT, as shells count

@@ -1,7 +1,5 @@
 """Downloads over HTTP: tries that follow a failure, and what to say when there is none left."""
 
-from __future__ import annotations
-
 import hashlib
 import logging
 import time

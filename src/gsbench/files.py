@@ -1,7 +1,5 @@
 """Files that are whole or absent, and what to say when the disk is full or cannot be written to."""
 
-from __future__ import annotations
-
 import errno
 import hashlib
 import json

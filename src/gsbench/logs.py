@@ -1,7 +1,5 @@
 """Destinations of gsbench's log lines: stderr for people, and a trial's own file."""
 
-from __future__ import annotations
-
 import logging
 import os
 import sys

@@ -5,8 +5,6 @@ nobody up, and no link is followed: a user's own file is read by its `resolved` 
 at most `MOST_DEPTH` levels, whose numbers are finite.
 """
 
-from __future__ import annotations
-
 import os
 import stat
 from collections.abc import Iterator

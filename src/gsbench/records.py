@@ -4,8 +4,6 @@ A file is written through the same type that reads it. Numbers are finite and of
 ``true`` for 1); keys that a type does not know may stand beside its own.
 """
 
-from __future__ import annotations
-
 import logging
 import reprlib
 from collections.abc import Iterator

@@ -5,8 +5,6 @@ A field's rule stands at the field: its type, bounds (`annotated_types`, or pyda
 default is not. Rules between fields belong into the ``__post_init__`` of their class.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import inspect
 import re

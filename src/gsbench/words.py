@@ -1,7 +1,5 @@
 """Numbers as people say them, the nearest right word for a wrong one, and what can be a path."""
 
-from __future__ import annotations
-
 import difflib
 import re
 from collections.abc import Iterable, Sequence

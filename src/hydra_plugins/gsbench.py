@@ -3,8 +3,6 @@
 Hydra imports this file at every start, of any Hydra app in the same environment, so it imports Hydra alone.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from inspect import signature
 from typing import Any

@@ -5,8 +5,6 @@ of ``conf/densify``, without composing: what an arm's authors wrote, and where g
 comments of its file: lines above the settings, ``theirs: VALUE`` beside one, and facts under fixed keys at the end.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import re

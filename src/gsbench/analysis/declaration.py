@@ -1,7 +1,5 @@
 """The declaration that a sweep's verdict is about: what had been measured before it, and what was added later."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -4,8 +4,6 @@ Ingredients are read from the trials' recorded configurations and code: each set
 sense together share a name, and a class of densifiers brings those in which it departs from ADC.
 """
 
-from __future__ import annotations
-
 import itertools
 import time
 from collections import defaultdict

@@ -1,7 +1,5 @@
 """Origin of one number of a table."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -3,8 +3,6 @@
 It is made from the trials' records, never written by hand, so nothing can be left out of it that was recorded.
 """
 
-from __future__ import annotations
-
 import statistics
 from collections.abc import Callable, Sequence
 from typing import Any

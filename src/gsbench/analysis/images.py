@@ -1,7 +1,5 @@
 """The pictures of a trial's test views: the error in their textured parts, and the views in which two arms differ."""
 
-from __future__ import annotations
-
 import base64
 import io
 from collections.abc import Sequence

@@ -4,8 +4,6 @@ Reports, tables, checks of claims, sweeps that stop when decided, planning, abla
 `gsbench.analysis.pairing.pair`.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Notes below a table and beside a verdict: who trained, what was declared, in what else arms differ."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """Printed numbers of papers as data, the paper's Tables 1 and 2 from one's own trials, and how far both lie apart."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence

@@ -6,8 +6,6 @@ variance (Searle, Casella and McCulloch 1992, *Variance components*, section 3.6
 statement about scenes like these needs more scenes. Power is that of the two-sided 5 % tests of `analysis.statistics`.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

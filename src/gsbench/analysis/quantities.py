@@ -4,8 +4,6 @@ Tables show counts and times in a unit that suits the trials; a question asks ab
 their ratios mean something.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Container, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import partial

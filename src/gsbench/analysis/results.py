@@ -4,8 +4,6 @@ A trial lies in ``<runs>/<experiment>/<scene>/<init>-<densify>/<hash8>-seed<k>/`
 says that it is complete. Nothing here needs torch, so that tables over thousands of trials come at once.
 """
 
-from __future__ import annotations
-
 import math
 import os
 import re

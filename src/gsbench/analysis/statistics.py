@@ -10,8 +10,6 @@ assumes nothing about the shape of the effects; no test of their mean could stan
 others.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass

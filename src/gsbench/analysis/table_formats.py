@@ -1,7 +1,5 @@
 """A table as plain data, and its forms: Markdown, CSV, LaTeX (booktabs) and HTML."""
 
-from __future__ import annotations
-
 import itertools
 import re
 from collections.abc import Callable

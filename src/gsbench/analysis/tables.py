@@ -1,7 +1,5 @@
 """Tables of an experiment in any layout: mean and deviation over trials, best in bold, what is missing marked."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType

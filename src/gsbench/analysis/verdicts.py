@@ -10,8 +10,6 @@ seen. A metric that was declared when results were there, or to which seeds or a
 its own: then all are one family.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 

@@ -4,8 +4,6 @@ Before Hydra runs, one look at the whole configuration refuses what cannot be (`
 ``hydra.main`` runs the task, or makes a sweep of it by gsbench's sweeper.
 """
 
-from __future__ import annotations
-
 import logging
 import os
 import sys

@@ -17,8 +17,6 @@ A word of the command line whose setting some of the grids list is meant for the
 list; any other word is meant for all.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from itertools import product
 from typing import Any

@@ -1,7 +1,5 @@
 """Rasterizers side by side: single steps in parts, and whole steps and frames as trainings and viewers make them."""
 
-from __future__ import annotations
-
 import itertools
 import statistics
 import time

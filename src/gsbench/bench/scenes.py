@@ -1,7 +1,5 @@
 """Scenes to be timed: synthetic Gaussians, equal for one count on every machine, or a trained model; and its camera."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

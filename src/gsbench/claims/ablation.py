@@ -5,8 +5,6 @@ on as the densifier is configured; its ``off`` settings take that part out. Runs
 there (the scales of children where nothing is split) are one and the same, and trained once.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Mapping, Sequence
 from typing import Any

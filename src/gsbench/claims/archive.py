@@ -14,8 +14,6 @@ It holds, without any pixels but where pictures are asked for:
 Paths of the machine are left out: of folders the last name is kept. The same results make the same archive, bit by bit.
 """
 
-from __future__ import annotations
-
 import csv
 import hashlib
 import io

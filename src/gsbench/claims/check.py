@@ -4,8 +4,6 @@ The trials are ordinary ones of one experiment, found again by their folders, so
 it stopped and ends with the same verdicts. From published archives the same verdicts are made without any training.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

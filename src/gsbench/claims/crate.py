@@ -1,7 +1,5 @@
 """Description of an archive of results in the terms of RO-Crate 1.2 (w3id.org/ro/crate/1.2)."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Mapping, Sequence
 from typing import Any

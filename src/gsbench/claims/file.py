@@ -20,8 +20,6 @@
 Settings, scenes, arms, budgets and splits are settings as on the command line. docs/claims.md has every key.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Iterable, Mapping

@@ -5,8 +5,6 @@ passes, is worse, or is not decided after the seeds that were allowed. It passes
 difference is too small to matter, or where it is at least shown not to be worse by the least that matters.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace

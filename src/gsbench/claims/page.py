@@ -1,7 +1,5 @@
 """The page at the end of a check: claim by claim the verdict and all that it rests on."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import get_args

@@ -6,8 +6,6 @@ studies' own standard errors would take as known what two or three seeds estimat
 7 to 10 % of intervals then miss the mean. A mean only where protocols agree.
 """
 
-from __future__ import annotations
-
 import math
 import tempfile
 from collections.abc import Mapping, Sequence

@@ -3,8 +3,6 @@
 Archives are strangers' files: their words come into the pages as text alone, and into no name of a file.
 """
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import re

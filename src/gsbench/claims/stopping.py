@@ -3,8 +3,6 @@
 In such a sweep every two arms are a question about ``eval.primary``.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """The words of a command line, before Hydra composes anything: each is understood, or refused with a reason."""
 
-from __future__ import annotations
-
 import re
 import shlex
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Configurations as Hydra composes them, looked at as a whole, and made ready for trials: for one, or for a sweep's."""
 
-from __future__ import annotations
-
 import copy
 import os
 import re

@@ -1,7 +1,5 @@
 """Hydra's two entrances, composing a configuration and running an app; and its errors in one line."""
 
-from __future__ import annotations
-
 import os
 import re
 import sys

@@ -5,8 +5,6 @@ What a key may be stands at its field (see `gsbench.settings`), rules between th
 ``__post_init__``. Hydra gets the names and the defaults alone, so that one mechanism checks every value.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import re
 from collections.abc import Mapping

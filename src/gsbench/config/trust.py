@@ -7,8 +7,6 @@ programs (``bash``) and environment variables (``PATH``). `docs/security.md` say
 it; `check_permissions` at the resolved values of each trial, before its parts are made. Loads no Hydra by itself.
 """
 
-from __future__ import annotations
-
 import importlib
 import os
 import re

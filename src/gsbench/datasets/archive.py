@@ -4,8 +4,6 @@ Of an archive on a server only the directory and the wanted members come, each b
 scene appears in the data folder when all that was missing of it is here.
 """
 
-from __future__ import annotations
-
 import lzma
 import shutil
 import struct

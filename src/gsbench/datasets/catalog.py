@@ -1,7 +1,5 @@
 """The data file of public data sets (``catalog.yaml``): where scenes lie, and which files of them are wanted."""
 
-from __future__ import annotations
-
 import os
 import re
 from collections import defaultdict

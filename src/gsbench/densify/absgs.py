@@ -1,7 +1,5 @@
 """AbsGS: clones by the signed gradient, splits by the sum of its absolute values, and opacities held below one."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar

@@ -1,7 +1,5 @@
 """Adaptive density control, as the 2023 implementation of 3DGS does it, with the family's departures as options."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Limits on the number of Gaussians: the arithmetic of all caps, and the base of densifiers that have one."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Improved-GS: halves along the longest axis, of candidates that are drawn by the edges that they cover."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass

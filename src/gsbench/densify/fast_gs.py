@@ -1,7 +1,5 @@
 """FastGS: growth and pruning by how many badly rendered pixels a Gaussian covers, over several views."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 

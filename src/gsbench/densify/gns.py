@@ -1,7 +1,5 @@
 """GNS: grow beyond the budget, then press on all opacities until only the budget's Gaussians hold out."""
 
-from __future__ import annotations
-
 import logging
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal

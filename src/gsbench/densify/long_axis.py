@@ -1,7 +1,5 @@
 """The long-axis split of Improved-GS: every candidate of ADC becomes two halves along its longest axis."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,8 +1,6 @@
 """3DGS as Markov chain Monte Carlo (Kheradmand et al., arXiv 2404.09591): relocation and noise instead of
 heuristics."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass

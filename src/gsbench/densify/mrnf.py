@@ -1,7 +1,5 @@
 """MRNF, the default strategy of LichtFeld-Studio: few long-axis splits, drawn by error and edges, and steady decay."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

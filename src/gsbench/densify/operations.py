@@ -1,7 +1,5 @@
 """Children of Gaussians: pure functions that every densifier shares."""
 
-from __future__ import annotations
-
 import math
 
 import torch

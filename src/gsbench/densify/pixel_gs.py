@@ -1,7 +1,5 @@
 """Pixel-GS: ADC whose mean gradient weighs each view by the pixels that a Gaussian covers in it."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar

@@ -1,7 +1,5 @@
 """ADC whose gradient threshold is what lets the count grow at a given rate."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Annotated
 

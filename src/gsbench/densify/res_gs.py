@@ -1,7 +1,5 @@
 """ResGS: a Gaussian that grows stays, fainter, and gets a smaller child; thresholds follow a level."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field

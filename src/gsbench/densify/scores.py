@@ -1,7 +1,5 @@
 """Scores by which Gaussians are drawn for growth: sums over the pixels of training views, and the draw."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Protocol
 

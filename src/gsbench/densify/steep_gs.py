@@ -1,7 +1,5 @@
 """SteepGS: Gaussians at a saddle of the loss are split along the direction in which a split lowers it most."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass

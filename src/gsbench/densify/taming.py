@@ -1,7 +1,5 @@
 """Taming 3DGS: a budget that is spent on Gaussians drawn by a score of many terms."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 

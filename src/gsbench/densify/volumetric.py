@@ -4,8 +4,6 @@ Every question that the paper leaves open is an option; the defaults are its equ
 split, which the rule extends, where they do not. Volumes and condition numbers are computed in log space.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass

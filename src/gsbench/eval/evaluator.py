@@ -1,7 +1,5 @@
 """The evaluator: applies the metrics of a protocol, and those of the user's own, to pairs of images."""
 
-from __future__ import annotations
-
 import importlib
 import math
 import traceback

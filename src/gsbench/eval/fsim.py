@@ -1,7 +1,5 @@
 """FSIM with colour (FSIMc): where two images have features, how far these and their contrast agree."""
 
-from __future__ import annotations
-
 import math
 
 import torch

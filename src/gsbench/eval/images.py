@@ -1,7 +1,5 @@
 """Helpers that metrics and the loss share: values, masks and shapes of images, and luminance."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

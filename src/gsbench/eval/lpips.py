@@ -4,8 +4,6 @@ The feature stacks of VGG16, AlexNet and SqueezeNet 1.1 are written here as plai
 its published ImageNet weights load into them; the learned linear heads are those of LPIPS v0.1.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path

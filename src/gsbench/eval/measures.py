@@ -1,7 +1,5 @@
 """gsbench's own metrics as the evaluator calls them, each under the conventions of a protocol."""
 
-from __future__ import annotations
-
 import importlib.util
 import math
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Contract of a metric: a class that measures one image against another. docs/metric.md has an example."""
 
-from __future__ import annotations
-
 from typing import Protocol, runtime_checkable
 
 from torch import Tensor

@@ -4,8 +4,6 @@ Images are torch tensors in [0, 1], either one image [H, W, 3] (the value is a 0
 [B, 3, H, W] (the values are [B]). SSIM and LPIPS have modules of their own.
 """
 
-from __future__ import annotations
-
 import torch
 import torch.nn.functional as F
 from torch import Tensor

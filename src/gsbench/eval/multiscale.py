@@ -3,8 +3,6 @@
 Both take images [H, W, 3] in [0, 1] of at least 161 px a side, so that the window fits into the smallest scale.
 """
 
-from __future__ import annotations
-
 import math
 
 import torch

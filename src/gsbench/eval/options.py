@@ -1,7 +1,5 @@
 """The settings of an evaluation: protocol, metrics, and the one that a verdict is declared to be about."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """Pictures that some program rendered: matching them with photographs by name, without guesses, and measuring them."""
 
-from __future__ import annotations
-
 import re
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence

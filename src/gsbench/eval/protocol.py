@@ -4,8 +4,6 @@ Two protocols never share a table cell: an identifier such as ``paper-1`` goes i
 convention below needs a new version.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

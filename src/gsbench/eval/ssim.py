@@ -4,8 +4,6 @@ Wang, Bovik, Sheikh and Simoncelli 2004, "Image quality assessment: from error v
 11x11 Gaussian window of sigma 1.5, constants for a data range of 1, variances of the window as a population.
 """
 
-from __future__ import annotations
-
 from typing import get_args
 
 import torch

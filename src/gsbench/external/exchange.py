@@ -1,7 +1,5 @@
 """Folders of another program: what it is given (training views, test cameras alone), and what it leaves, checked."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Sequence
 from pathlib import Path

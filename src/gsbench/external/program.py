@@ -1,7 +1,5 @@
 """Another program, run to its end or to a limit of time, of which nothing is left running."""
 
-from __future__ import annotations
-
 import subprocess
 import time
 from collections.abc import Mapping, Sequence

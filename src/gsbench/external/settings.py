@@ -4,8 +4,6 @@ It is chosen in the group ``densify``, because an arm of a table is an initialis
 ``{name}`` stands for what is known when it runs. Loads no torch.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import shlex

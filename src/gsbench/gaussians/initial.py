@@ -1,7 +1,5 @@
 """First Gaussians of a training, made of a point cloud as 3DGS does it."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from numpy.typing import NDArray

@@ -1,7 +1,5 @@
 """Values that papers and their code give, which several parts of gsbench take as defaults. Loads no torch."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

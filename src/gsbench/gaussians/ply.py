@@ -1,7 +1,5 @@
 """The standard 3DGS point-cloud file, which viewers and other trainers read."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Contract of an initialiser: it takes a capture, and gives a COLMAP model and a report."""
 
-from __future__ import annotations
-
 import json
 import time
 from abc import ABC, abstractmethod

@@ -1,7 +1,5 @@
 """A batch of trials: skip what is done, check the rest before any work, run it; how each ended."""
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import logging

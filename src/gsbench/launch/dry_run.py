@@ -3,8 +3,6 @@
 All finished trials are read once, so that ten thousand planned ones can be held against ten thousand. Loads no torch.
 """
 
-from __future__ import annotations
-
 import json
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence

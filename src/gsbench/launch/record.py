@@ -4,8 +4,6 @@
 it, so that what is missing can be named; ``declared.jsonl`` is `gsbench.runs.declaration`'s.
 """
 
-from __future__ import annotations
-
 import logging
 import os
 import shutil

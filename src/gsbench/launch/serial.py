@@ -1,7 +1,5 @@
 """One trial after the other, in this process; and how a trial ended, as plain values that travel between processes."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The parts of a trial: what its configuration describes, as objects, with errors that name the key."""
 
-from __future__ import annotations
-
 import dataclasses
 import inspect
 import logging

@@ -1,7 +1,5 @@
 """Content of a finished trial's ``results.json``, from the results of its steps."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Mapping
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """One trial: its steps in order, from its parts; and its way from configuration to ``results.json``."""
 
-from __future__ import annotations
-
 import logging
 import time
 import traceback

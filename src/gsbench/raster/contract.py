@@ -5,8 +5,6 @@ gsbench's own executors are tested with the same scenes. For a rasterizer of you
     assert departures(MyRasterizer()) == []
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -3,8 +3,6 @@
 Loads no torch. A rasterizer of your own needs no entry: ``raster._target_=mine.MyRasterizer`` (docs/rasterizer.md).
 """
 
-from __future__ import annotations
-
 import importlib.metadata
 import importlib.util
 import logging

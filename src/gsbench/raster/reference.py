@@ -4,8 +4,6 @@ Faster executors are tested against this one in float64. Formulas: EWA splatting
 (Kerbl et al. 2023); the constants stand in ``raster.base.RasterConstants``.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import partial
 

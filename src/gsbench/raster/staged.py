@@ -1,8 +1,6 @@
 """Parts that executors share: checks of their inputs, values read back without a wait, and for compiled ones a bridge
 between their stages and autograd."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from functools import partial
 from typing import Any, ClassVar, Generic, NamedTuple, TypeVar

@@ -4,8 +4,6 @@ Such a trial has metrics and pictures and nothing else: no model, no times, and 
 what is unknown as missing, and say which arms were evaluated from renders.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The work of ``gsbench evaluate``: renders of any program measured, and imported beside the arms of an experiment."""
 
-from __future__ import annotations
-
 import argparse
 import json
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """The photographs that renders are held against: those of a trial, of a scene as a trial would see it, or a folder."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -5,8 +5,6 @@ In a checkout that differs, the key of a stage has the digests of the rooms that
 hashed whole: those that ``allow_targets`` names, since nothing else of the user's can be imported.
 """
 
-from __future__ import annotations
-
 import ast
 import hashlib
 import importlib.util

@@ -6,8 +6,6 @@ it was run. `gsbench.analysis.judgement` judges by declarations, and `gsbench.an
 before and after them.
 """
 
-from __future__ import annotations
-
 import calendar
 import json
 import logging

@@ -1,7 +1,5 @@
 """The experiments of a runs folder, by its folders alone; ``tuning.json`` in that of a search, which tunes an arm."""
 
-from __future__ import annotations
-
 import logging
 import os
 from collections.abc import Iterator

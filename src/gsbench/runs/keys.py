@@ -3,8 +3,6 @@
 A step is a stage with its inputs; it knows its key without running. Loads neither Hydra nor torch.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Callable, Mapping

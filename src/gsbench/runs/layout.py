@@ -3,8 +3,6 @@
 A trial lies in ``<runs>/<experiment>/<scene>/<init>-<densify>/<hash8>-seed<k>/``.
 """
 
-from __future__ import annotations
-
 # in the runs folder, beside the experiments
 STORE = "store"  # results of stages by content
 ARTIFACTS, DATABASE = "mlartifacts", "mlflow.db"  # MLflow's mirror

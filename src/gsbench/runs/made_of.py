@@ -3,8 +3,6 @@
 A sweep that is given again recognises what is done by this, without reading photographs. Loads no torch.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping

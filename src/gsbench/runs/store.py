@@ -5,8 +5,6 @@ where it is built, and what a killed build leaves; ``.<key>.lock`` lets one proc
 (it is empty).
 """
 
-from __future__ import annotations
-
 import logging
 import os
 import shutil

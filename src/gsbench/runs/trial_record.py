@@ -2,8 +2,6 @@
 files (``training.json``, ``metrics.json``), and of the JSON lines of a training. Writers fill these, readers get them.
 """
 
-from __future__ import annotations
-
 import logging
 import reprlib
 from collections.abc import Callable, Mapping

@@ -1,7 +1,5 @@
 """COLMAP models: reading them safely, fitting them to the files at hand, and taking plain cameras out of them."""
 
-from __future__ import annotations
-
 import zlib  # noqa: F401  must be loaded before pycolmap, whose own zlib otherwise crashes Pillow's PNG code
 from collections.abc import Iterable, Mapping
 from pathlib import Path

@@ -5,8 +5,6 @@ their azimuth around its up and centre; where they do not, their places along th
 that planes across it cut them into parts.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 

@@ -3,8 +3,6 @@
 Every image becomes uint8 RGB. EXIF orientation is ignored, as COLMAP ignores it: a camera belongs to stored pixels.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Literal
 

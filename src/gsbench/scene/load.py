@@ -8,8 +8,6 @@ largest pinhole image without blank pixels, at the focal length of the original.
 passes through JPEG again.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import logging

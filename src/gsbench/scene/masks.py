@@ -5,8 +5,6 @@ regions"), and nerfstudio trains only where a mask is not 0 (its page "Data conv
 is replaced before anything looks at a photograph, so that not one bit of it can have a part in a result.
 """
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path

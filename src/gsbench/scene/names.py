@@ -1,7 +1,5 @@
 """Names of images: the files that they mean, and the choice of images to keep and to hold out."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from pathlib import Path, PurePosixPath

@@ -1,7 +1,5 @@
 """The settings of a scene: where its photographs lie, how many are read, how large, and which are held out."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, fields
 from pathlib import Path

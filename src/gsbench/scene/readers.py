@@ -1,7 +1,5 @@
 """Readers: a folder on disk becomes a `Capture`."""
 
-from __future__ import annotations
-
 import hashlib
 import logging
 import os

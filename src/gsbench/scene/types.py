@@ -1,7 +1,5 @@
 """Types of a scene: photographs on disk before initialisation, views with cameras after it."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property

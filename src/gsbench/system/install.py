@@ -1,7 +1,5 @@
 """Installation of gsbench: where it lies, the command that adds what is missing, and its code as git knows it."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -11,8 +11,6 @@ session of its own: then neither its parent nor its process group leads to it. L
 among its descendants (PR_SET_CHILD_SUBREAPER), so that none can get away from it.
 """
 
-from __future__ import annotations
-
 import ctypes
 import json
 import os

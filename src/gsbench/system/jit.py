@@ -1,7 +1,5 @@
 """Compilation of kernels by numba: options, the cache on disk, and the word to the user while something compiles."""
 
-from __future__ import annotations
-
 import functools
 import hashlib
 import logging

@@ -1,7 +1,5 @@
 """Locks between processes: one works, the others wait and say for what."""
 
-from __future__ import annotations
-
 import json
 import logging
 import os

@@ -3,8 +3,6 @@
 The current folder as such is no place of Python's here: a capture may hold a ``plyfile.py``.
 """
 
-from __future__ import annotations
-
 import os
 import sys
 from collections.abc import Mapping, Sequence

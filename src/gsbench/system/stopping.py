@@ -4,8 +4,6 @@ Signals belong to the process, and so does the state in this module. SIGINT is C
 from Slurm when a job is preempted or cancelled; SIGUSR2 comes from submitit shortly before a job's time is up.
 """
 
-from __future__ import annotations
-
 import signal
 import threading
 from collections.abc import Iterator, Sequence

@@ -4,8 +4,6 @@
 its trials have ended. The files are the truth: how far a trial has come and how it ended is read there.
 """
 
-from __future__ import annotations
-
 import os
 import signal
 import sys

@@ -1,7 +1,5 @@
 """A trial as event files of TensorBoard, in ``tensorboard/`` of the runs folder."""
 
-from __future__ import annotations
-
 import shutil
 import time
 from collections.abc import Sequence

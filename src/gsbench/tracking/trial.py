@@ -1,7 +1,5 @@
 """A trial in a tracker's terms: what its files say, how far that was sent, and the contract of a tracker."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path

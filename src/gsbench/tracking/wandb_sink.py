@@ -1,7 +1,5 @@
 """A trial as a run of Weights & Biases: its server is ``tracking.uri``, or what WANDB_BASE_URL and WANDB_MODE say."""
 
-from __future__ import annotations
-
 import os
 import uuid
 from collections.abc import Sequence

@@ -3,8 +3,6 @@
 A checkpoint is what ``torch.save`` writes, which ``torch.load`` reads, and after it the sha256 of that.
 """
 
-from __future__ import annotations
-
 import hashlib
 import logging
 from concurrent.futures import Future, ThreadPoolExecutor

@@ -1,7 +1,5 @@
 """The device of a training: which it is, what it rounds, how much memory is free, and what to say when it is full."""
 
-from __future__ import annotations
-
 import torch
 
 from gsbench.errors import InputError, TrainingError

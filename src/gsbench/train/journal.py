@@ -1,7 +1,5 @@
 """The journal of a training: its losses, read without making the device wait, and records as JSON lines."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections import deque

@@ -4,8 +4,6 @@ quickest executor for a device.
 SSIM is that of `gsbench.eval.ssim`, padded with zeros, the mean of the full map, as in the reference code of 3DGS.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 

@@ -5,8 +5,6 @@ covers 16 numbers of any channel. Rows are filtered horizontally once into a rin
 there. The statistics of the target are computed again at each step, so that no memory is needed for each view.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

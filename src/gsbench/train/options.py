@@ -1,7 +1,5 @@
 """The settings of a training: iterations, learning rates, the window of the densifiers, checkpoints."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Literal
 

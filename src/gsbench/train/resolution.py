@@ -1,7 +1,5 @@
 """Training on small pictures first, and on no more Gaussians than they can show (DashGaussian, arXiv 2503.18402)."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """The training loop: the schedule of 3DGS, any rasterizer, any densifier."""
 
-from __future__ import annotations
-
 import logging
 import time
 from collections.abc import Callable, Collection, Iterator

@@ -1,7 +1,5 @@
 """The training views: their random order, their images on the device, and what densifiers see of them."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """``gsbench ablate``: which part of a densifier carries its gain."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

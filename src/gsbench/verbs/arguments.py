@@ -1,7 +1,5 @@
 """Parsing of a verb's words by argparse, with gsbench's errors of one line."""
 
-from __future__ import annotations
-
 import argparse
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """``gsbench bench``: time rasterizers and the training step, side by side."""
 
-from __future__ import annotations
-
 import argparse
 import json
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """``gsbench bisect GOOD BAD``: which commit of a trainer made its results worse?"""
 
-from __future__ import annotations
-
 import argparse
 import os
 import sys

@@ -1,7 +1,5 @@
 """``gsbench check``: a paper's claims in, verdicts out."""
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """``gsbench doctor``: what this machine has, what is missing, and how to mend it."""
 
-from __future__ import annotations
-
 import shutil
 import sys
 import tempfile

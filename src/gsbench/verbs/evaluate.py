@@ -1,7 +1,5 @@
 """``gsbench evaluate``: measure renders of any program, and enter them beside the arms of an experiment."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """``gsbench explain``: how a table's number came about."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

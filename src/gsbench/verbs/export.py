@@ -1,7 +1,5 @@
 """``gsbench export``: a trained model, an initial cloud, or an experiment's results, for others."""
 
-from __future__ import annotations
-
 import logging
 import shutil
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """``gsbench fetch``: public scenes into the data folder."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Mapping, Sequence
 from contextlib import suppress

@@ -1,7 +1,5 @@
 """``gsbench gate``: is this version of a trainer worse than the one that an archive is of?"""
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path

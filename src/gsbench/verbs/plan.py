@@ -1,7 +1,5 @@
 """``gsbench plan``: from trials that are there, how many scenes and seeds resolve a difference."""
 
-from __future__ import annotations
-
 import argparse
 import math
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """``gsbench pool``: one answer from the results of many."""
 
-from __future__ import annotations
-
 import sys
 from collections import Counter
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Questions about the configuration, which Hydra answers: ``--cfg job``, ``--info``, tab completion."""
 
-from __future__ import annotations
-
 import os
 import re
 from contextlib import suppress

@@ -1,7 +1,5 @@
 """``gsbench report``: one HTML file with the evidence of an experiment."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Sequence
 from pathlib import Path

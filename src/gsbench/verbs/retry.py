@@ -1,7 +1,5 @@
 """``gsbench retry``: run what failed, was stopped or is missing of an experiment, with its own settings."""
 
-from __future__ import annotations
-
 import logging
 import os
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """``gsbench site``: a static site from archives of results."""
 
-from __future__ import annotations
-
 import sys
 import tempfile
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """``gsbench status``: what an experiment has done, runs, failed and misses."""
 
-from __future__ import annotations
-
 import json
 import time
 from collections.abc import Sequence

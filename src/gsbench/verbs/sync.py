@@ -1,7 +1,5 @@
 """``gsbench sync``: mirror to the tracker what it missed, once."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """``gsbench tables``: read an experiment's result files, print or write its tables."""
 
-from __future__ import annotations
-
 import argparse
 import re
 import sys

@@ -1,7 +1,5 @@
 """``gsbench ui``: the MLflow dashboard on this machine, lean."""
 
-from __future__ import annotations
-
 import os
 import shlex
 import subprocess

@@ -1,7 +1,5 @@
 """``gsbench view``: look at one trained model in the browser, or at two side by side."""
 
-from __future__ import annotations
-
 import importlib.util
 import threading
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Pictures of trials from any camera: the render, and with it the initial cloud or what made the large Gaussians."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

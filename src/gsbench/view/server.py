@@ -4,8 +4,6 @@ One trial fills the page; two stand side by side under one camera. Everything on
 seen is what was evaluated, in any browser.
 """
 
-from __future__ import annotations
-
 import logging
 import math
 import threading

@@ -1,7 +1,5 @@
 """Trials as the viewer needs them, read from their folders and from the initial models in the store."""
 
-from __future__ import annotations
-
 import zipfile
 import zlib
 from dataclasses import dataclass, replace

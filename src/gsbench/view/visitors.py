@@ -4,8 +4,6 @@ A browser lets any web page connect to this machine. Of a page it tells the serv
 what the server was called (``Host``), which a name of the page's own that leads here gives away (DNS rebinding).
 """
 
-from __future__ import annotations
-
 import http
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Putting the report together: one HTML file that needs no network, no script to be read, and no other file."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

@@ -3,8 +3,6 @@
 Here values find their places; ``charts.html.j2`` writes the elements.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Sequence

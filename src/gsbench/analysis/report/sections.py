@@ -1,7 +1,5 @@
 """Sections of the report, each made from result files only."""
 
-from __future__ import annotations
-
 import logging
 import math
 from collections.abc import Sequence

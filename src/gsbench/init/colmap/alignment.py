@@ -1,7 +1,5 @@
 """The similarity between two sets of camera poses, and the errors that remain after it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """COLMAP's database: cameras first, then images with keypoints and matches from whatever extractor."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager

@@ -5,8 +5,6 @@ features first and leaves out pairs in which few of them agree. Here the agreeme
 best are kept: what a pair of distant views adds to a track, its nearer views mostly hold already.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Literal
 

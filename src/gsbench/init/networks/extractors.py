@@ -1,7 +1,5 @@
 """The networks: extractors of local features and matchers, chosen by name and built with their weights."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path

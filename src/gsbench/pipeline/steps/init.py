@@ -1,7 +1,5 @@
 """Cameras and the first cloud: a COLMAP model and its report, shared by all trials with the same options."""
 
-from __future__ import annotations
-
 from concurrent.futures import ThreadPoolExecutor
 from importlib.metadata import version
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Inputs of a step's key: options of components, the held-out views, the code of gsbench and the user's."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A picture of a trained model: its voluminous Gaussians drawn over a view."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

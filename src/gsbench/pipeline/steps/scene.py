@@ -1,7 +1,5 @@
 """The photographs of a trial: as they come, as views of their final size, and the test views as they are kept."""
 
-from __future__ import annotations
-
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import cache, cached_property

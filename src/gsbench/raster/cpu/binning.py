@@ -5,8 +5,6 @@ of every tile comes out sorted. A tile that the contour alpha = 1/255 does not r
 seen.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

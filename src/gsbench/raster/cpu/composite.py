@@ -4,8 +4,6 @@ A tile is 16 blocks of 4x4 pixels; a block's state is one vector per quantity. A
 touch; the forward pass leaves it in ``masks`` for the backward pass.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

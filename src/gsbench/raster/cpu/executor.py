@@ -1,7 +1,5 @@
 """The compiled CPU rasterizer: its stages in order, forward and backward, shared out among threads."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

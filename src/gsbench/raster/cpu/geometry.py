@@ -5,8 +5,6 @@ harmonics of 16 Gaussians is a 16x16 matrix: first a row for each function, whic
 each Gaussian, to be multiplied with its coefficients.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

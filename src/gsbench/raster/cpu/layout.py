@@ -1,7 +1,5 @@
 """Layout of what the kernels pass to each other: the camera as numbers, the places in a record and a gradient row."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

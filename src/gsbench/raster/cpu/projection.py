@@ -4,8 +4,6 @@ Of a shard, the Gaussians ``begin`` to ``end``, the visible ones become the reco
 order of their index.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -4,8 +4,6 @@ The kernels hold a quantity of 16 Gaussians in a vector; records, gradient rows 
 side by side in memory. Here one becomes the other.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

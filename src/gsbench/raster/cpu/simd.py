@@ -9,8 +9,6 @@ host has: one AVX-512 register, two of AVX2, four of SSE or NEON; the lanes' res
 Indices count array elements, are not checked and must not be negative. Arrays are contiguous.
 """
 
-from __future__ import annotations
-
 import math
 import operator
 from collections.abc import Callable, Iterator, Sequence

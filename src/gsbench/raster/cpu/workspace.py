@@ -1,7 +1,5 @@
 """Memory that is used again: fresh arrays of this size cost more in page faults than the kernels that fill them."""
 
-from __future__ import annotations
-
 import threading
 import weakref
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Ray casting for the courtyard, compiled with numba; scalar and without any shared state."""
 
-from __future__ import annotations
-
 from math import exp, floor, inf, sqrt
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Objects of the procedural courtyard: solid primitives with materials, in metres, z up, the lawn at z = 0."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from itertools import pairwise
 from math import cos, pi, radians, sin

@@ -4,8 +4,6 @@ A well, crates, a bench and pots on a large lawn of faint texture, a gravel path
 for structure from motion beside the low-texture ground on which 3DGS grows oversized Gaussians. One seed, one result.
 """
 
-from __future__ import annotations
-
 from concurrent.futures import ThreadPoolExecutor
 from math import cos, pi, radians, sin, tan
 from pathlib import Path

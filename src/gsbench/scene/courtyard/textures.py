@@ -4,8 +4,6 @@ Every pattern is a sum of noise octaves that fade out as their cells approach th
 so a picture from afar shows no aliasing. All functions are scalar, pure and deterministic. Colours are linear RGB.
 """
 
-from __future__ import annotations
-
 from math import floor, sqrt
 
 from gsbench.scene.courtyard.layout import CLAY, GLASS, LEAVES, LOG, METAL, PAINT, PLASTER, STONE, TILES, WATER, WOOD
