@@ -3,11 +3,20 @@
     python scripts/mutants.py                               # 160 faults over all rooms below, two at a time
     python scripts/mutants.py --rooms densify eval --count 40 --seed 3
 
-A fault is a flipped comparison, another sign, a whole number that is one off, a dropped statement, or two swapped
-arguments. Texts, messages and annotations get none. A fault is caught when a test of ``make test`` fails or hangs. The
-table and the faults that survived are printed as Markdown; a survivor either shows a gap in the tests or changes
-nothing. The tests of a fault are those of its room, then those elsewhere that import its module. Triton's kernels are
-left out: their tests belong to ``make test-all``.
+A fault is one of these:
+
+- comparison: it becomes its opposite, ``<`` becomes ``>=`` and ``==`` becomes ``!=``;
+- border: a comparison with a whole number takes in its border or leaves it out, ``> 0`` becomes ``>= 0``. Other borders
+  stay as they are: between continuous values they change nothing that can be seen;
+- sign: ``+`` becomes ``-``, ``*`` becomes ``/``, ``and`` becomes ``or``, and the other way round;
+- off by one: a whole number is one larger;
+- dropped: a statement is left out;
+- swapped: the first two arguments of a call change places.
+
+Texts, messages and annotations get none. A fault is caught when a test of ``make test`` fails or hangs. The table and
+the faults that survived are printed as Markdown; a survivor either shows a gap in the tests or changes nothing. The
+tests of a fault are those of its room, then those elsewhere that import its module. Triton's kernels are left out:
+their tests belong to ``make test-all``.
 """
 
 from __future__ import annotations
@@ -37,8 +46,12 @@ LEFT_OUT = "triton"  # in a path
 SYMMETRIC = {"maximum", "minimum", "min", "max", "add"}  # swapped arguments change nothing
 SPEED_ONLY = {"prefetch"}  # calls that change no result
 SECONDS = 1800  # for the tests of one room; a fault that makes them hang is caught
-FLIPPED: dict[type[ast.AST], type[ast.AST]] = {
-    **{ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq},
+Replacements = dict[type[ast.AST], type[ast.AST]]
+OPPOSITE: Replacements = {
+    **{ast.Lt: ast.GtE, ast.GtE: ast.Lt, ast.Gt: ast.LtE, ast.LtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq},
+}
+BORDER: Replacements = {ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt}
+OTHER_SIGN: Replacements = {
     **{ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult, ast.And: ast.Or, ast.Or: ast.And},
 }
 
@@ -66,28 +79,37 @@ def describe(fault: Fault) -> str:
     return f"`{fault.file}:{fault.line}` {fault.kind}: `{before}` → `{after}`"
 
 
-def changed_node(node: ast.AST) -> tuple[str, ast.AST] | None:
-    """The kind of fault that fits the node, and the node with it; None where none does."""
+def is_whole_number(node: ast.AST) -> bool:
+    return isinstance(node, ast.Constant) and type(node.value) is int
+
+
+def changed_nodes(node: ast.AST) -> Iterator[tuple[str, ast.AST]]:
+    """The faults that fit the node: the kind of each, and the node with it."""
     new = copy.deepcopy(node)
-    if isinstance(new, ast.Compare) and type(new.ops[0]) in FLIPPED:
-        new.ops[0] = FLIPPED[type(new.ops[0])]()  # type: ignore[call-overload]
-        return "comparison", new
-    if isinstance(new, ast.BinOp | ast.BoolOp) and type(new.op) in FLIPPED:
+    if isinstance(new, ast.Compare):
+        first = type(new.ops[0])
+        for kind, replacements in (("comparison", OPPOSITE), ("border", BORDER)):
+            if kind == "border" and not any(map(is_whole_number, (new.left, new.comparators[0]))):
+                continue
+            if first in replacements:
+                changed = copy.deepcopy(new)
+                changed.ops[0] = replacements[first]()  # type: ignore[call-overload]
+                yield kind, changed
+    elif isinstance(new, ast.BinOp | ast.BoolOp) and type(new.op) in OTHER_SIGN:
         if isinstance(new, ast.BinOp) and any(isinstance(side, ast.JoinedStr) for side in (new.left, new.right)):
-            return None
-        new.op = FLIPPED[type(new.op)]()  # type: ignore[assignment]
-        return "sign", new
-    if isinstance(new, ast.Constant) and type(new.value) is int:
-        new.value += 1
-        return "off by one", new
-    if isinstance(new, ast.AugAssign) or (isinstance(new, ast.Expr) and isinstance(new.value, ast.Call)):
-        return "dropped", ast.Pass()
-    if isinstance(new, ast.Call) and len(new.args) > 1 and all(isinstance(arg, ast.Name) for arg in new.args[:2]):
+            return
+        new.op = OTHER_SIGN[type(new.op)]()  # type: ignore[assignment]
+        yield "sign", new
+    elif is_whole_number(new):
+        new.value += 1  # type: ignore[attr-defined]
+        yield "off by one", new
+    elif isinstance(new, ast.AugAssign) or (isinstance(new, ast.Expr) and isinstance(new.value, ast.Call)):
+        yield "dropped", ast.Pass()
+    elif isinstance(new, ast.Call) and len(new.args) > 1 and all(isinstance(arg, ast.Name) for arg in new.args[:2]):
         if ast.unparse(new.func).rpartition(".")[2] in SYMMETRIC or new.args[0].id == new.args[1].id:
-            return None
+            return
         new.args[:2] = new.args[1::-1]
-        return "swapped", new
-    return None
+        yield "swapped", new
 
 
 def is_silent(node: ast.AST) -> bool:
@@ -120,19 +142,17 @@ def faults_of(path: Path) -> list[Fault]:
     for line in text.encode().splitlines(keepends=True):  # columns of the syntax tree count bytes
         lines.append(lines[-1] + len(line))
     found = []
-    for node in visited(ast.parse(text)):
-        change = changed_node(node)
-        if change is None:
-            continue
+    planted = ((node, *change) for node in visited(ast.parse(text)) for change in changed_nodes(node))
+    for node, kind, changed in planted:
         start, end = (
             lines[row - 1] + column
             for row, column in ((node.lineno, node.col_offset), (node.end_lineno, node.end_col_offset))
         )  # type: ignore[attr-defined]
-        before, after = text.encode()[start:end].decode(), ast.unparse(change[1])
-        if isinstance(change[1], ast.BinOp | ast.BoolOp | ast.Compare):
+        before, after = text.encode()[start:end].decode(), ast.unparse(changed)
+        if isinstance(changed, ast.BinOp | ast.BoolOp | ast.Compare):
             after = f"({after})"
         file = path.relative_to(ROOT).as_posix()
-        found.append(Fault(file, node.lineno, change[0], start, end, before, after))  # type: ignore[attr-defined]
+        found.append(Fault(file, node.lineno, kind, start, end, before, after))  # type: ignore[attr-defined]
     return found
 
 

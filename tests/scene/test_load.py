@@ -13,6 +13,7 @@ from PIL import Image
 
 from gsbench.errors import InputError
 from gsbench.scene.camera import CameraModel
+from gsbench.scene.colmap import read_model
 from gsbench.scene.load import Job, load_scene, prepare_all, undistort
 from gsbench.scene.options import SplitRule
 from gsbench.scene.readers import read_colmap
@@ -115,6 +116,15 @@ def test_downscaled_and_distorted_views_come_back_from_the_cache(make_scene, tmp
     load_scene(capture, capture.model, tmp_path / "cache", made_by={"scene/images.py": "edited"}, **options)
     assert done == [("views", 6, 6)] * 3  # what other code has prepared is not taken
     assert len(list((tmp_path / "cache").iterdir())) == 3
+    model = read_model(capture.model)
+    model.points3D[1].xyz += 1.0
+    model.write_binary(capture.model)
+    load_scene(capture, capture.model, tmp_path / "cache", **options)
+    assert len(done) == 3  # no pixel depends on points
+    model.cameras[1].params = [71.0, 40, 30, 0.05]
+    model.write_binary(capture.model)
+    load_scene(capture, capture.model, tmp_path / "cache", **options)
+    assert len(done) == 4  # but on the cameras
 
 
 def test_centred_moves_the_principal_point_only(make_scene, tmp_path: Path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,6 +13,7 @@ import pytest
 from PIL import Image
 
 from gsbench.errors import InputError
+from gsbench.pipeline.steps import scene as scene_steps
 from gsbench.pipeline.steps.scene import CaptureSource, Views, ground_truth_step, masked, masked_step
 from gsbench.runs.keys import INIT, Step
 from gsbench.runs.store import Store
@@ -53,8 +55,10 @@ def test_only_a_courtyard_and_cameras_in_a_file_are_made(photographs: Path) -> N
 
 
 def test_pixels_are_replaced_where_a_mask_or_a_colour_behind_them_asks_for_it(
-    photographs: Path, tmp_path: Path
+    photographs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    told: list[tuple[int, int]] = []
+    monkeypatch.setattr(scene_steps, "progress", lambda title: nullcontext(lambda _, *counts: told.append(counts)))
     bare, masks = read_photos("own", str(photographs)), read_photos("own", str(photographs), masks="masks")
     assert masked_step(bare, "black") is None  # as they are read anyway
     steps = [masked_step(capture, behind) for capture, behind in ((bare, "white"), (masks, "white"), (masks, "black"))]
@@ -62,6 +66,7 @@ def test_pixels_are_replaced_where_a_mask_or_a_colour_behind_them_asks_for_it(
     for name, step in zip(("white", "both", "masks"), steps, strict=True):
         assert step is not None
         step.build(tmp_path / name)
+    assert told == [(done, 4) for done in (1, 2, 3, 4)] * 3  # of four photographs, the last is told as all
     read = {
         name: np.asarray(Image.open(tmp_path / name / "images" / "b.png").convert("RGB")) for name in ("white", "both")
     }
