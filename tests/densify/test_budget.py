@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from gsbench.densify import ADC, MCMC, Budgeted, DensifyContext, Refinement, Volumetric
-from gsbench.densify.budget import settle
+from gsbench.densify.budget import find_factor
 from gsbench.errors import InputError
 from gsbench.gaussians.paper_values import LearningRates
 from gsbench.gaussians.trainable import TrainableGaussians
@@ -74,10 +74,10 @@ def test_settling_is_as_good_as_trying_every_factor(seed: int) -> None:
         return int((scores > factor).sum())
 
     best = min(abs(count(f) - target) for f in scores)
-    found = settle(count, target, 1e-3, 1e3)
+    found = find_factor(count, target, 1e-3, 1e3)
     assert abs(count(found) - target) == best == 0
-    assert settle(count, 0, 1e-3, 1e-2) == pytest.approx(1e-2)  # never so few: the strictest
-    assert settle(count, 300, 1e-3, 1e3) == 1e-3  # never so many: the least strict
+    assert find_factor(count, 0, 1e-3, 1e-2) == pytest.approx(1e-2)  # never so few: the strictest
+    assert find_factor(count, 300, 1e-3, 1e3) == 1e-3  # never so many: the least strict
 
 
 COMBINATIONS = [

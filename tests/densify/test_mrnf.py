@@ -112,7 +112,7 @@ def test_what_leaves_the_scene_by_size_goes() -> None:
     trainable.values.log_scales.data[3, 1] = np.log(101 * half_size)
     trainable.values.log_scales.data[4, 2] = np.log(0.9e-10)
     trainable.values.log_scales.data[5] = np.log(99 * half_size)
-    assert densifier.lost(trainable.values).nonzero().squeeze(-1).tolist() == [3, 4]
+    assert densifier.to_prune(trainable.values).nonzero().squeeze(-1).tolist() == [3, 4]
 
 
 def test_the_bounds_hold_the_central_four_fifths() -> None:

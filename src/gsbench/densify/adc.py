@@ -1,4 +1,4 @@
-"""Adaptive density control, as the 2023 implementation of 3DGS does it, with the family's departures as options."""
+"""Adaptive density control (ADC) as in the 2023 code of 3DGS; later variants of it are options."""
 
 import math
 from collections.abc import Mapping
@@ -17,30 +17,30 @@ from gsbench.events import Cause
 from gsbench.raster.base import RenderOutput
 from gsbench.settings import OpenFraction, Switch
 
-MOST_CHILDREN = 64  # of one split; more is a slip in the settings, and fills the memory in one round
+MAX_CHILDREN = 64  # of one split: more is a mistake in the settings, and would fill the memory in one round
 OPACITY_RESET = Switch(
     {"opacity_reset_interval": NEVER}, "opacity resets, and the pruning by size that follows the first"
 )
-LOCKED_ROUNDS = 5  # after an opacity reset the governor does not raise the cull; our choice
+LOCKED_ROUNDS = 5  # rounds after an opacity reset in which the governor does not raise ``cull``; our choice
 
 
 class Grown(NamedTuple):
-    """Outcomes of a Gaussian in a round, before pruning."""
+    """What each of N Gaussians becomes by the growth of a round, before pruning."""
 
-    number: Tensor  # [N]
-    log_scales: Tensor  # [N, 3]
-    opacity_logits: Tensor  # [N]
+    number: Tensor  # [N] of Gaussians in its place, itself included
+    log_scales: Tensor  # [N, 3] of each of them
+    opacity_logits: Tensor  # [N] of each of them
 
 
 @dataclass
 class ADC(Budgeted):
-    """Clone what is small, split what is large, prune what is faint or huge (Kerbl et al. 2023, section 5).
+    """Clone small Gaussians, split large ones, and prune faint and huge ones (Kerbl et al. 2023, section 5).
 
-    Sizes are fractions of the scene extent; ``gradient_threshold`` is in NDC units, averaged over the iterations in
-    which a Gaussian was visible.
+    A Gaussian grows if its gradient in NDC units, averaged over the iterations in which it was visible, reaches
+    ``gradient_threshold``. Sizes are fractions of the scene extent.
 
     Examples:
-        An idea of your own overrides one rule. This one prunes nothing, and needs no other change:
+        To try an idea, override one rule. This class never prunes:
 
         >>> @dataclass
         ... class NeverPrune(ADC):
@@ -67,12 +67,12 @@ class ADC(Budgeted):
     gradient_threshold: PositiveFloat = 2e-4
     threshold_inclusive: bool = True  # >= as 3DGS; False: > as gsplat
     split_size: PositiveFloat = 0.01  # largest scale above it: split, else clone ("percent_dense")
-    split_children: Annotated[int, Interval(ge=2, le=MOST_CHILDREN)] = 2
+    split_children: Annotated[int, Interval(ge=2, le=MAX_CHILDREN)] = 2
     split_shrink: Annotated[float, Ge(1)] = 1.6  # children's scales are divided by it (0.8 x 2)
     revised_opacity: bool = False  # children of clones and splits share their parent's opacity (arXiv 2404.06109)
     prune_opacity: Annotated[float, Interval(ge=0, lt=1)] = 0.005
     prune_size: PositiveFloat = 0.1  # after the first opacity reset
-    prune_screen_radius: PositiveFloat | None = None  # px; 3DGS means 20 but zeroes the radii first, so it never acts
+    prune_screen_radius: PositiveFloat | None = None  # px; 3DGS has 20, but zeroes the radii first, so it never acts
     opacity_reset_interval: PositiveInt = 3000
     opacity_reset_value: OpenFraction = 0.01
 
@@ -89,49 +89,51 @@ class ADC(Budgeted):
         statistics["max_radii"] = torch.maximum(statistics["max_radii"], render.radii)
 
     def screen_gradient(self, render: RenderOutput) -> Tensor:
-        """Length of the gradient of each projected mean, [N] NDC."""
+        """Length of the gradient by each projected mean, [N] NDC."""
         gradient = render.screen_gradient_abs if self.gradient == "absolute" else render.screen_points.grad
         if gradient is None:
             raise RuntimeError("observe needs the screen gradient: call it after backward")
         return gradient.norm(dim=-1)
 
     def rules(self, refinement: Refinement) -> list[Rule]:
-        """A round in the order of the baseline, and its opacity reset."""
+        """A round in the order of 3DGS, then the opacity reset."""
         step = refinement.step
         rules: list[Rule] = []
         if self.due(step) and self.frozen(refinement):
-            rules.append(self.stand_still)
+            rules.append(self.skip_round)
         elif self.due(step):
             rules += [*self.governing(), self.grow_by_gradient, self.prune, self.reset_statistics]
+        # As in 3DGS: with a white background, opacities are also reset once at the start of the window.
         periodic = step % self.opacity_reset_interval == 0
         if step < self.stop and (periodic or (self.context.white_background and step == self.start)):
             rules.append(self.reset_opacity)
         return rules
 
     def mean_gradient(self) -> Tensor:
-        """[N] NDC, over the iterations in which a Gaussian was visible; 0 where it never was."""
+        """Mean gradient [N] NDC over the iterations in which a Gaussian was visible; 0 if it never was."""
         return self.statistics["gradient_sum"] / self.statistics["visible_count"].clamp_min(1)
 
     def candidates(self, refinement: Refinement) -> tuple[Tensor, Tensor]:
-        """Two masks [N]: those whose mean gradient reaches the threshold, and those to split rather than clone."""
+        """Two masks [N]: Gaussians whose mean gradient reaches the threshold; Gaussians to split rather than clone."""
         log_scales = refinement.gaussians.values.log_scales
         large = log_scales.amax(-1) > math.log(self.split_size * self.context.extent)
         return self.reaches(self.mean_gradient(), self.gradient_threshold), large
 
     def reaches(self, mean: Tensor, threshold: float) -> Tensor:
-        """Mask [N] of those whose ``mean`` [N] reaches a threshold of growth."""
+        """Mask [N] of the Gaussians whose ``mean`` gradient [N] reaches a growth ``threshold`` times
+        ``strictness``."""
         limit = threshold * self.strictness
         return mean >= limit if self.threshold_inclusive else mean > limit
 
     def choose(self, refinement: Refinement, candidates: Tensor, gain: int) -> tuple[Tensor, int]:
-        """Choose the ``candidates`` [N] of the largest mean gradients that the budget admits, and count the refused.
+        """Choose the ``candidates`` [N] with the largest mean gradients, as many as the cap admits.
 
-        Each adds ``gain`` Gaussians.
+        Each candidate adds ``gain`` Gaussians. Returns a mask [N] and the number of refused candidates.
         """
         return admit(candidates, self.mean_gradient(), gain, self.allowance(refinement))
 
     def grown(self, refinement: Refinement) -> Grown:
-        """The outcome of growth for each Gaussian."""
+        """What each Gaussian would become if the cap admitted all candidates."""
         values = refinement.gaussians.values
         over, large = self.candidates(refinement)
         logits = torch.where(over, revised_logits(values.opacity_logits), values.opacity_logits)
@@ -143,18 +145,19 @@ class ADC(Budgeted):
 
     def forecast(self, refinement: Refinement) -> int:
         grown = self.grown(refinement)
-        gone = self.faint(grown.opacity_logits) | self.huge(refinement.step, grown.log_scales)
-        return int(grown.number[~gone].sum())
+        pruned = self.faint(grown.opacity_logits) | self.huge(refinement.step, grown.log_scales)
+        return int(grown.number[~pruned].sum())
 
     def grow_by_gradient(self, refinement: Refinement) -> None:
-        """Clone the small and split the large of those whose mean gradient reaches the threshold."""
+        """Of the Gaussians whose mean gradient reaches the threshold, clone the small and split the large."""
         gaussians, event = refinement.gaussians, refinement.event
         over, large = self.candidates(refinement)
         selected, blocked = self.choose(refinement, over, max(1, self.split_children - 1))
         event.blocked_by_cap += blocked
         event.cloned += self.clone(refinement, selected & ~large, revised_opacity=self.revised_opacity)
-        new = selected.new_zeros(len(gaussians) - len(selected))
-        to_split = torch.cat([selected & large, new])  # clones never split
+        # Cloning appended Gaussians: extend the mask to them. A clone is not split in its first round, as in 3DGS.
+        not_split = selected.new_zeros(len(gaussians) - len(selected))
+        to_split = torch.cat([selected & large, not_split])
         event.split_gradient += self.split(
             refinement,
             to_split,
@@ -165,11 +168,11 @@ class ADC(Budgeted):
         )
 
     def faint(self, opacity_logits: Tensor) -> Tensor:
-        """Mask [N] of those to prune by opacity."""
+        """Mask [N] of the Gaussians to prune by opacity."""
         return opacity_logits.sigmoid() < self.prune_opacity * self.cull
 
     def huge(self, step: int, log_scales: Tensor) -> Tensor:
-        """Mask [N] of those to prune by size, after the first opacity reset."""
+        """Mask [N] of the Gaussians to prune by size: none until the first opacity reset has passed."""
         if step <= self.opacity_reset_interval:
             return log_scales.new_zeros(len(log_scales), dtype=torch.bool)
         huge = log_scales.amax(-1) > math.log(self.prune_size * self.context.extent)
@@ -178,23 +181,23 @@ class ADC(Budgeted):
         return huge
 
     def may_cull(self, step: int) -> bool:
-        """Return whether pruning is due: not in the first rounds after an opacity reset."""
+        """Return False in the first rounds after an opacity reset: then nearly all opacities are low."""
         since_reset = step % self.opacity_reset_interval
         return step <= self.opacity_reset_interval or not 0 < since_reset <= LOCKED_ROUNDS * self.interval
 
     def prune(self, refinement: Refinement) -> None:
-        """Remove the faint, and after the first opacity reset the huge."""
+        """Remove faint Gaussians and, after the first opacity reset, huge ones."""
         values = refinement.gaussians.values
         faint, huge = self.faint(values.opacity_logits), self.huge(refinement.step, values.log_scales)
         self.remove(refinement, faint, huge)
 
     def reset_opacity(self, refinement: Refinement) -> None:
-        """Make everything faint, so that what is not needed stays so and is pruned."""
+        """Lower all opacities: those of needed Gaussians rise again, the others are pruned."""
         self.limit_opacity(refinement, self.opacity_reset_value)
         refinement.event.opacity_reset = True
 
     def limit_opacity(self, refinement: Refinement, ceiling: float) -> None:
-        """Lower all opacities above ``ceiling`` to it; the moments of all opacities become zero, as in 3DGS."""
+        """Lower all opacities above ``ceiling`` to it. The moments of all opacities become zero, as in 3DGS."""
         limit = math.log(ceiling / (1 - ceiling))
         logits = refinement.gaussians.values.opacity_logits.detach().clamp_max(limit)
         refinement.gaussians.overwrite("opacity_logits", logits)

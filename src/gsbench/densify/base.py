@@ -1,5 +1,5 @@
-"""The contract of a densifier: hyper-parameters, a state that can be saved, the origin of every Gaussian, and a record
-of what each refinement did."""
+"""The contract of a densifier: its hyper-parameters, its saved state, the lineage of every Gaussian, and a record of
+each refinement."""
 
 from __future__ import annotations
 
@@ -20,9 +20,10 @@ from gsbench.settings import Switch, check_settings
 
 
 class Lineage:
-    """An identity, a parent and a cause for every Gaussian that ever existed in a training; always on the CPU.
+    """Identity, parent and cause of every Gaussian that ever existed in a training; always on the CPU.
 
-    ``ids`` [N] names the Gaussians that live now; ``parents``, ``causes`` and ``steps`` [T] hold the history of all T.
+    ``ids`` [N] are the identities of the present Gaussians. ``parents``, ``causes`` and ``steps`` [T] are the history
+    of all T Gaussians, indexed by identity; the parent of an initial Gaussian is -1.
     """
 
     def __init__(self, num_gaussians: int) -> None:
@@ -34,24 +35,28 @@ class Lineage:
         self._total = num_gaussians
 
     def edit(self, keep: Tensor | None, parents: Tensor | None, cause: Cause, step: int) -> None:
-        """Keep the living at the mask ``keep`` [N], then append children of ``parents`` [A] (indices before that)."""
+        """Keep the Gaussians at the mask ``keep`` [N], then append a child of each of ``parents`` [A].
+
+        ``parents`` are indices from before the edit.
+        """
         living = self.ids if keep is None else self.ids[keep.cpu()]
         if parents is not None and len(parents):
-            a = len(parents)
+            added = len(parents)
             self._parents.append(self.ids[parents.cpu()])
-            self._causes.append(torch.full((a,), int(cause), dtype=torch.uint8))
-            self._steps.append(torch.full((a,), step, dtype=torch.int32))
-            living = torch.cat([living, torch.arange(self._total, self._total + a)])
-            self._total += a
+            self._causes.append(torch.full((added,), int(cause), dtype=torch.uint8))
+            self._steps.append(torch.full((added,), step, dtype=torch.int32))
+            living = torch.cat([living, torch.arange(self._total, self._total + added)])
+            self._total += added
         self.ids = living
 
     def causes_of_living(self) -> dict[str, int]:
-        """Count the living Gaussians of each cause."""
+        """Count the present Gaussians by cause."""
         counts = torch.bincount(torch.cat(self._causes)[self.ids].long(), minlength=len(Cause))
         return {cause.key: int(counts[cause]) for cause in Cause}
 
     def state_dict(self) -> dict[str, Tensor]:
-        """``ids``, ``parents``, ``causes`` and ``steps`` as tensors; also what ``lineage.npz`` of a trial holds."""
+        """Return ``ids``, ``parents``, ``causes`` and ``steps`` as tensors; ``lineage.npz`` of a trial holds the
+        same."""
         return {
             "ids": self.ids.clone(),
             "parents": torch.cat(self._parents),
@@ -76,18 +81,18 @@ NEVER = 10**9  # an iteration, or an interval, beyond any training
 
 @dataclass(frozen=True)
 class DensifyContext:
-    """Facts of a training that its densifier is given."""
+    """What a densifier knows of its training."""
 
-    extent: float  # world units: 3DGS's cameras_extent
+    extent: float  # size of the scene in world units: 3DGS's cameras_extent
     white_background: bool = False
     device: torch.device = CPU  # of the Gaussians
     views: TrainingViews | None = None
-    # A count that the training wants a round to stay below, for the most that there may ever be (None: not said).
+    # Given a refinement and the cap (None: no cap), returns the count that the training allows after this round.
     limit: Callable[[Refinement, int | None], int] | None = None
 
     @property
     def training_views(self) -> TrainingViews:
-        """``views``, which a trainer gives."""
+        """``views``, or RuntimeError if there are none; the trainer always gives them."""
         if self.views is None:
             raise RuntimeError("this densifier looks at training views: give them as DensifyContext.views")
         return self.views
@@ -95,7 +100,7 @@ class DensifyContext:
 
 @dataclass
 class Refinement:
-    """One refinement under way: what its rules read, change and count."""
+    """One refinement in progress: what its rules read and change, and the event that counts their edits."""
 
     step: int
     gaussians: TrainableGaussians
@@ -107,26 +112,29 @@ Rule = Callable[[Refinement], None]
 
 
 class Statistic(NamedTuple):
-    """A statistic of more than one number for each Gaussian: ``Statistic(torch.float32, (3, 3))`` is [N, 3, 3]."""
+    """A statistic with several numbers per Gaussian: ``Statistic(torch.float32, (3, 3))`` is [N, 3, 3]."""
 
     dtype: torch.dtype
     shape: tuple[int, ...] = ()
 
 
 class Densifier:
-    """Base of all densifiers, and the one that never changes the Gaussians (``densify=none``).
+    """Base of all densifiers. By itself it never changes the Gaussians.
 
-    A subclass is a dataclass of hyper-parameters, whose annotations say what is allowed. In every iteration the trainer
-    calls ``regularizer`` before the backward pass, ``observe`` after it, then ``refine``, then the optimiser step, then
-    ``after_step``. A subclass says what happens by ``rules``, and what it gathers by ``STATISTICS``, besides those of
-    its own base; and which of its parts can be taken out by ``SWITCHES``, for ``gsbench ablate``.
+    A subclass is a dataclass of hyper-parameters; their annotations say which values are allowed. In every iteration
+    the trainer calls ``regularizer`` before the backward pass, ``observe`` after it, then ``refine``, then the
+    optimiser step, then ``after_step``. A subclass defines:
 
-    State: ``context``; ``lineage``; and ``statistics``, one tensor [N] for each name in ``STATISTICS``, or [N, …] for a
-    `Statistic` with a shape, zero at the start. They follow every ``edit`` (the new have zero), are saved, and are on
-    the device of the Gaussians.
+    - ``rules``: what a refinement does;
+    - ``STATISTICS``: what it gathers, in addition to the statistics of its base class;
+    - ``SWITCHES``: its parts that ``gsbench ablate`` can turn off.
+
+    The state is ``context``, ``lineage`` and ``statistics``. ``statistics`` has one tensor [N] for each name in
+    ``STATISTICS`` ([N, …] for a `Statistic` with a shape), zero at the start, on the device of the Gaussians. Every
+    ``edit`` updates them (new Gaussians get zero), and checkpoints save them.
 
     Examples:
-        A rule that clones, every ``interval`` iterations, what is nearly opaque:
+        A densifier that clones the nearly opaque Gaussians every ``interval`` iterations:
 
         >>> @dataclass
         ... class CloneOpaque(Densifier):
@@ -155,53 +163,54 @@ class Densifier:
     STATISTICS: ClassVar[Mapping[str, torch.dtype | Statistic]] = {}
     SWITCHES: ClassVar[Mapping[str, Switch]] = {}
     needs_absolute_gradient: bool = False
-    needs_footprint: bool = False  # ``RenderOutput.footprint``, which not every rasterizer gives
-    needs_splitting_matrix: bool = False  # ``RenderOutput.splitting_probe``, likewise
+    needs_footprint: bool = False  # ``RenderOutput.footprint``, which gsplat does not give
+    needs_splitting_matrix: bool = False  # ``RenderOutput.splitting_probe``, which gsplat does not give
 
     context: DensifyContext
     lineage: Lineage
     statistics: dict[str, Tensor]
-    strictness: float = 1.0  # factor on the thresholds of growth, moved by a governor (`Budgeted`)
-    cull: float = 1.0  # factor on the opacity below which Gaussians are pruned
+    strictness: float = 1.0  # factor on the growth thresholds, set by ``cap=governor`` (`Budgeted`)
+    cull: float = 1.0  # factor on the opacity below which Gaussians are pruned, set by ``cap=governor``
 
     def __init_subclass__(cls, **keywords: Any) -> None:
         super().__init_subclass__(**keywords)
-        own = [vars(parent).get("STATISTICS", {}) for parent in reversed(cls.__mro__)]
-        cls.STATISTICS = {name: dtype for table in own for name, dtype in table.items()}
+        # A subclass names only its own statistics: merge them with those of its bases.
+        tables = [vars(base).get("STATISTICS", {}) for base in reversed(cls.__mro__)]
+        cls.STATISTICS = {name: dtype for table in tables for name, dtype in table.items()}
 
     def __post_init__(self) -> None:
-        """Check the hyper-parameters against their annotations; a subclass adds the rules between them."""
+        """Check each hyper-parameter against its annotation. A subclass adds checks that involve several of them."""
         check_settings(self, "densify")
 
     @property
     def most_gaussians(self) -> int | None:
-        """The limit on the number of Gaussians, ``max_gaussians`` where a class has that; None: no limit."""
+        """The largest count during training: ``max_gaussians`` if the class has it; None: no limit."""
         return getattr(self, "max_gaussians", None)
 
     def prepare(self, gaussians: Gaussians) -> Gaussians:
-        """The Gaussians that the training starts with, from those of the initial cloud."""
+        """Return the Gaussians to start with, given those of the initial cloud."""
         return gaussians
 
     def begin(self, gaussians: Gaussians, context: DensifyContext) -> None:
-        """Start a training of ``gaussians``: forget all earlier state."""
+        """Start a training of ``gaussians``; forget all earlier state."""
         self.context = context
         self.lineage = Lineage(len(gaussians))
         self.statistics = self._zeros(len(gaussians), gaussians.means.device)
 
     def regularizer(self, gaussians: Gaussians) -> Tensor | None:
-        """A term added to the loss, or None."""
+        """Return a term to add to the loss, or None."""
         return None
 
     def observe(self, step: int, render: RenderOutput) -> None:
         """Gather statistics of iteration ``step`` (1, 2, …) after its backward pass."""
 
     def rules(self, refinement: Refinement) -> list[Rule]:
-        """The rules that are due at ``refinement.step``, in the order in which they are applied; usually none."""
+        """Return the rules that are due at ``refinement.step``, in order; an empty list if no rule is due."""
         return []
 
     @torch.no_grad()
     def refine(self, step: int, gaussians: TrainableGaussians, rng: torch.Generator) -> RefineEvent | None:
-        """Change the Gaussians by the rules that are due, and say what was done; None where nothing was due."""
+        """Apply the rules that are due. Return the record of what they did, or None if no rule was due."""
         refinement = Refinement(step, gaussians, rng, RefineEvent(step=step, before=len(gaussians)))
         rules = self.rules(refinement)
         if not rules:
@@ -212,7 +221,7 @@ class Densifier:
         return refinement.event
 
     def after_step(self, step: int, gaussians: TrainableGaussians, rng: torch.Generator) -> None:
-        """React to the optimiser step of iteration ``step``, which has just been made."""
+        """Act after the optimiser step of iteration ``step``, for example by adding noise to the means."""
 
     def edit(
         self,
@@ -222,8 +231,11 @@ class Densifier:
         parents: Tensor | None = None,
         cause: Cause = Cause.INITIAL,
     ) -> None:
-        """Keep the Gaussians at the mask ``keep`` [N] (None: all), then append new ones: with their optimiser state,
-        lineage and statistics. ``parents`` [A] are the indices, before the edit, of those appended."""
+        """Keep the Gaussians at the mask ``keep`` [N] (None: all), then append the Gaussians ``append`` [A].
+
+        Optimiser state, lineage and statistics are edited alike. ``parents`` [A] are the indices, from before the edit,
+        of the parents of ``append``.
+        """
         refinement.gaussians.edit(keep, append)
         self.lineage.edit(keep, parents, cause, refinement.step)
         added = self._zeros(0 if append is None else len(append), refinement.gaussians.device)
@@ -234,9 +246,9 @@ class Densifier:
     def clone(
         self, refinement: Refinement, selected: Tensor, cause: Cause = Cause.CLONE, revised_opacity: bool = False
     ) -> int:
-        """Append a copy of each Gaussian at the mask ``selected`` [N]; returns how many.
+        """Append a copy of each Gaussian at the mask ``selected`` [N]; return the number of copies.
 
-        With ``revised_opacity`` each pair is as opaque as the one was (arXiv 2404.06109).
+        With ``revised_opacity``, a Gaussian and its copy together are as opaque as it was before (arXiv 2404.06109).
         """
         gaussians = refinement.gaussians
         parents = selected.nonzero().squeeze(-1)  # [C]
@@ -259,11 +271,15 @@ class Densifier:
         keep_parent: bool = False,
         sampled: bool = True,
     ) -> int:
-        """Replace the Gaussians at the mask ``selected`` [N] by children with scales ``child_log_scales`` [S, 3];
-        returns how many more there are than before."""
+        """Replace each Gaussian at the mask ``selected`` [N] by ``children`` new ones; return by how many the count
+        grew.
+
+        ``child_log_scales`` [S, 3] has one row per selected Gaussian. With ``keep_parent``, parents stay beside their
+        children. The means of children are drawn from the density of their parent (``sampled``), or equal its mean.
+        """
         parents = selected.nonzero().squeeze(-1)  # [S]
-        chosen = refinement.gaussians.values.detach().select(parents)
-        new = split(chosen, children, child_log_scales, refinement.rng, sampled)
+        parent_values = refinement.gaussians.values.detach().select(parents)
+        new = split(parent_values, children, child_log_scales, refinement.rng, sampled)
         if revised_opacity:
             new.opacity_logits = revised_logits(new.opacity_logits)
         keep = None if keep_parent else ~selected
@@ -271,20 +287,24 @@ class Densifier:
         return len(new) - (0 if keep_parent else len(parents))
 
     def remove(self, refinement: Refinement, faint: Tensor, others: Tensor | None = None) -> None:
-        """Remove the Gaussians at the mask ``faint`` [N], counted as pruned by opacity, and at ``others`` [N], counted
-        as pruned by size; those in both count as faint."""
-        gone = faint if others is None else faint | others
+        """Remove the Gaussians at the masks ``faint`` [N] and ``others`` [N].
+
+        ``faint`` counts as pruned by opacity, ``others`` as pruned by size; a Gaussian in both counts as ``faint``.
+        """
+        pruned = faint if others is None else faint | others
         refinement.event.pruned_opacity += int(faint.sum())
-        refinement.event.pruned_size += int((gone & ~faint).sum())
-        self.edit(refinement, keep=~gone)
+        refinement.event.pruned_size += int((pruned & ~faint).sum())
+        self.edit(refinement, keep=~pruned)
 
     def reset_statistics(self, refinement: Refinement) -> None:
-        """The rule that ends a round: gather anew."""
+        """Set all statistics to zero: the rule that ends a round."""
         self.statistics = self._zeros(len(refinement.gaussians), refinement.gaussians.device)
 
     def state_dict(self) -> dict[str, Any]:
-        """The state as tensors and plain values; with the same hyper-parameters, ``load_state_dict`` goes on from
-        it."""
+        """Return the state as tensors and plain values.
+
+        A densifier with the same hyper-parameters continues from it after ``load_state_dict``.
+        """
         return {
             "lineage": self.lineage.state_dict(),
             "statistics": {name: statistic.clone() for name, statistic in self.statistics.items()},
@@ -297,8 +317,11 @@ class Densifier:
         self.statistics = {name: saved[name].to(context.device, copy=True) for name in self.STATISTICS}
 
     def _zeros(self, count: int, device: torch.device) -> dict[str, Tensor]:
-        kinds = {name: Statistic(k) if isinstance(k, torch.dtype) else k for name, k in self.STATISTICS.items()}
-        return {name: torch.zeros(count, *k.shape, dtype=k.dtype, device=device) for name, k in kinds.items()}
+        zeros = {}
+        for name, kind in self.STATISTICS.items():
+            dtype, shape = (kind, ()) if isinstance(kind, torch.dtype) else kind
+            zeros[name] = torch.zeros(count, *shape, dtype=dtype, device=device)
+        return zeros
 
 
 class NoDensifier(Densifier):

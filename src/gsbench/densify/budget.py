@@ -1,4 +1,4 @@
-"""Limits on the number of Gaussians: the arithmetic of all caps, and the base of densifiers that have one."""
+"""Caps on the number of Gaussians: their arithmetic, and the base class of densifiers that have one."""
 
 import math
 from collections.abc import Callable
@@ -14,11 +14,11 @@ from gsbench.errors import InputError
 from gsbench.gaussians.model import Gaussians
 
 CapKind = Literal["soft", "freeze", "hard", "curve", "governor"]
-SETTLE_STEPS = 40  # halvings of a range of the logarithm: far below the distance of neighbouring float32 scores
+BISECTION_STEPS = 40  # of log(factor): the last interval is far below the spacing of float32 scores
 
 
 def check_room(most: int, num_initial: int) -> None:
-    """Raise InputError where the initial cloud has more Gaussians than an arm may ever have."""
+    """Raise InputError if the initial cloud has more than ``most`` Gaussians, the largest count allowed."""
     if most < num_initial:
         raise InputError(
             f"densify.max_gaussians must be at least the size of the initial cloud ({num_initial}), got {most}"
@@ -26,10 +26,11 @@ def check_room(most: int, num_initial: int) -> None:
 
 
 def limit_at(step: int, start: int, stop: int, initial: int, max_gaussians: int | None, cap: CapKind) -> int | None:
-    """The cap that holds at iteration ``step``.
+    """The limit on the count at iteration ``step``; None: no limit.
 
-    ``curve`` rises from the ``initial`` count at ``start`` to ``max_gaussians`` at ``stop`` along n0 + (n - n0) (2x -
-    x^2), so that arms grow alike and the last refinements are small (the idea of Taming 3DGS, arXiv 2406.15643).
+    It is ``max_gaussians``, except under ``curve``. That limit rises from n0 = ``initial`` at ``start`` to n =
+    ``max_gaussians`` at ``stop`` along n0 + (n - n0) (2x - x^2), with x the progress of the window. So all arms grow
+    alike and the last refinements are small (the idea of Taming 3DGS, arXiv 2406.15643).
     """
     if max_gaussians is None or cap != "curve":
         return max_gaussians
@@ -38,11 +39,11 @@ def limit_at(step: int, start: int, stop: int, initial: int, max_gaussians: int 
 
 
 def allowance(num_gaussians: int, max_gaussians: int | None, cap: CapKind) -> int | None:
-    """The number of Gaussians that a growth step may add; None for no limit.
+    """The number of Gaussians that a growth step may add; None: no limit.
 
-    ``soft``: no limit up to ``max_gaussians``, nothing beyond it, so one step may overshoot (the paper's cap, whose
-    counts end at 3.41 to 3.57 M for 3.4 M). ``hard`` and ``curve``: never beyond it. ``freeze`` and ``governor`` set no
-    limit within a round.
+    ``soft``: no limit while the count is at most ``max_gaussians``, nothing above it. So one step may overshoot, as the
+    paper's cap does (its counts end at 3.41 to 3.57 M for a cap of 3.4 M). ``hard`` and ``curve``: never above it.
+    ``freeze`` and ``governor``: no limit within a round.
     """
     if max_gaussians is None or cap in ("freeze", "governor"):
         return None
@@ -52,9 +53,9 @@ def allowance(num_gaussians: int, max_gaussians: int | None, cap: CapKind) -> in
 
 
 def admit(candidates: Tensor, score: Tensor, gain: int, allowed: int | None) -> tuple[Tensor, int]:
-    """The candidates that the allowance admits, best ``score`` first (ties by index), and how many it refused.
+    """Choose the candidates that the allowance admits, best ``score`` first (ties by index); count those refused.
 
-    ``candidates`` is a mask [N], ``score`` [N]; each candidate adds ``gain`` Gaussians.
+    ``candidates`` is a mask [N], ``score`` is [N]; each candidate adds ``gain`` Gaussians.
     """
     count = int(candidates.sum())
     if allowed is None or count * gain <= allowed:
@@ -67,46 +68,51 @@ def admit(candidates: Tensor, score: Tensor, gain: int, allowed: int | None) -> 
     return admitted, count - places
 
 
-def settle(count: Callable[[float], int], target: int, low: float, high: float) -> float:
-    """The factor in [``low``, ``high``] at which ``count``, which falls with it, is nearest to ``target`` from below;
-    ``high`` where it never falls so far."""
+def find_factor(count: Callable[[float], int], target: int, low: float, high: float) -> float:
+    """Find the factor in [``low``, ``high``] for which ``count`` is nearest to ``target`` without exceeding it.
+
+    ``count`` must fall as the factor rises. Returns ``high`` if ``count`` exceeds ``target`` everywhere.
+    """
     if count(low) <= target:
         return low
-    a, b = math.log(low), math.log(high)
-    for _ in range(SETTLE_STEPS):
-        middle = (a + b) / 2
+    log_low, log_high = math.log(low), math.log(high)
+    for _ in range(BISECTION_STEPS):
+        middle = (log_low + log_high) / 2
         reached = count(math.exp(middle))
         if reached == target:
             return math.exp(middle)
-        a, b = (middle, b) if reached > target else (a, middle)
-    return min(high, math.exp(b))
+        if reached > target:
+            log_low = middle
+        else:
+            log_high = middle
+    return min(high, math.exp(log_high))
 
 
-PAPER_CAP = 3_400_000  # the paper's, for the baseline and its own rule alike
-STRICTNESS_LIMITS = (1e-3, 1e3)  # of the factor on the thresholds of growth
+PAPER_CAP = 3_400_000  # arXiv 2508.05187 has it for the baseline and for its own rule
+STRICTNESS_LIMITS = (1e-3, 1e3)  # of the factor on the growth thresholds
 CULL_LIMITS = (1.0, 10.0)  # of the factor on the opacity below which Gaussians are pruned
-DEADBAND = 0.01  # so far above its target a count is not culled (the paper of the governor: "e.g., 1%")
+DEADBAND = 0.01  # a count up to 1 % above its target does not raise ``cull`` (arXiv 2605.16158: "e.g., 1%")
 
 
 @dataclass
 class Budgeted(Densifier):
-    """Base of densifiers that have rounds of growth and pruning, and a limit on their Gaussians.
+    """Base of densifiers that have rounds of growth and pruning, and a cap on the number of Gaussians.
 
-    ``cap`` says how ``max_gaussians`` is kept:
+    ``cap`` says how ``max_gaussians`` is enforced:
 
-    - ``soft``: nothing grows in a round that starts beyond it, pruning goes on;
-    - ``freeze``: such a round neither grows nor prunes;
-    - ``hard``: the candidates of the highest score are taken up to it, never more;
+    - ``soft``: a round that starts above it only prunes;
+    - ``freeze``: a round that starts above it neither grows nor prunes;
+    - ``hard``: the candidates with the highest scores are taken up to it, never more;
     - ``curve``: as ``hard``, with a limit that rises to it over the window;
-    - ``governor``: the thresholds are moved so that the count follows that curve and ends at it (`govern`).
+    - ``governor``: thresholds are adjusted so that the count follows that curve and ends at it (`govern`).
 
-    With ``soft`` and ``hard`` the training may have a limit of its own for each round (``train.resolution_schedule``).
+    Under ``soft`` and ``hard``, the training may set a limit for each round too (``train.resolution_schedule``).
 
-    A subclass asks `allowance` for the first four. For ``freeze`` and ``governor`` it says, by ``forecast``, what count
-    a round would lead to, and multiplies its own thresholds by ``strictness`` and its opacity cull by ``cull``.
+    A subclass calls `allowance` before it adds Gaussians. To support ``freeze`` and ``governor``, it also overrides
+    `forecast`, and multiplies its growth thresholds by ``strictness`` and its opacity for pruning by ``cull``.
 
     Examples:
-        Clones what is opaque, under any cap:
+        A densifier that clones opaque Gaussians, under any cap:
 
         >>> @dataclass
         ... class CloneOpaque(Budgeted):
@@ -128,7 +134,7 @@ class Budgeted(Densifier):
         True
     """
 
-    start: NonNegativeInt = 500  # a round where start < step < stop and step % interval == 0
+    start: NonNegativeInt = 500  # a round is due if start < step < stop and step % interval == 0
     stop: int = 15_000
     interval: PositiveInt = 100
     max_gaussians: PositiveInt | None = PAPER_CAP  # None: no limit, as 3DGS
@@ -153,7 +159,7 @@ class Budgeted(Densifier):
         return self.start < step < self.stop and step % self.interval == 0
 
     def allowance(self, refinement: Refinement) -> int | None:
-        """The number of Gaussians that may be added now; None for no limit."""
+        """The number of Gaussians that may be added now; None: no limit."""
         initial = self.lineage.initial_count
         limit = limit_at(refinement.step, self.start, self.stop, initial, self.max_gaussians, self.cap)
         count = len(refinement.gaussians)
@@ -164,61 +170,66 @@ class Budgeted(Densifier):
         return max(0, most - count) if allowed is None else max(0, min(allowed, most - count))
 
     def forecast(self, refinement: Refinement) -> int:
-        """The number of Gaussians that there would be after a round with the present ``strictness`` and ``cull``."""
+        """The count after a round with the present ``strictness`` and ``cull``, if no cap limited growth."""
         raise NotImplementedError
 
     def frozen(self, refinement: Refinement) -> bool:
-        """Return whether this round is left out because the count is beyond the limit (``cap=freeze``)."""
+        """Return whether ``cap=freeze`` skips this round because the count is above the limit."""
         over = self.max_gaussians is not None and len(refinement.gaussians) > self.max_gaussians
         return self.cap == "freeze" and over
 
     def governing(self) -> list[Rule]:
-        """The rules that a round starts with: `govern`, where that is the cap."""
+        """The rules to put first in a round: `govern` under ``cap=governor``, else none."""
         return [self.govern] if self.cap == "governor" else []
 
-    def stand_still(self, refinement: Refinement) -> None:
-        """The only rule of a frozen round: say how many Gaussians it would have added."""
+    def skip_round(self, refinement: Refinement) -> None:
+        """The only rule of a frozen round: record how many Gaussians it would have added."""
+        # With infinite strictness nothing grows: the difference is growth alone, without the effect of pruning.
         refinement.event.blocked_by_cap += self._forecast_at(refinement) - self._forecast_at(refinement, math.inf)
 
     def govern(self, refinement: Refinement) -> None:
-        """The first rule of a governed round: set ``strictness`` and ``cull`` so that it ends at the curve's count.
+        """The first rule of a governed round: set ``strictness`` and ``cull`` so that the round ends at the target.
 
-        From Bisht and Kolb, "Smart Target Point Control for Gaussian Splatting Methods" (arXiv 2605.16158): the target
-        n0 + (n - n0) (2x - x^2) (their eq. 3 to 5); only the thresholds of growth and the opacity cull move; below the
-        target the cull is at its own value, above it growth is at its strictest and the cull rises; a deadband; no
-        raised cull for some time after an opacity reset (eq. 13).
+        From Bisht and Kolb, "Smart Target Point Control for Gaussian Splatting Methods" (arXiv 2605.16158):
 
-        Ours: the curve ends at the last round, x = 1; one factor for all thresholds of growth; and it is not stepped
-        towards the quota by a bounded update (eq. 8 to 12, whose gains are not stated) but is the one at which
-        ``forecast`` meets the target, found by bisection, so that a window of ten rounds is followed as well as one of
-        144.
+        - the target is n0 + (n - n0) (2x - x^2) (their eq. 3 to 5);
+        - only the growth thresholds and the opacity for pruning are adjusted;
+        - ``cull`` is 1, unless the count is above the target even with the strictest growth; a deadband applies;
+        - ``cull`` is not raised for some time after an opacity reset (eq. 13).
+
+        Ours:
+
+        - the curve ends at the last round, x = 1;
+        - one factor multiplies all growth thresholds;
+        - that factor is not updated in bounded steps (eq. 8 to 12, whose gains are not stated). Bisection finds the
+          factor for which ``forecast`` meets the target, so short windows work too (10 rounds instead of 144).
         """
         event = refinement.event
         target = self.target(refinement)
-        free = self._forecast_at(refinement)
-        self.strictness = settle(lambda s: self._forecast_at(refinement, s), target, *STRICTNESS_LIMITS)
+        ungoverned = self._forecast_at(refinement)
+        self.strictness = find_factor(lambda s: self._forecast_at(refinement, s), target, *STRICTNESS_LIMITS)
         reached = self._forecast_at(refinement, self.strictness)
         if reached > (1 + DEADBAND) * target and self.may_cull(refinement.step):
-            self.cull = settle(lambda c: self._forecast_at(refinement, self.strictness, c), target, *CULL_LIMITS)
+            self.cull = find_factor(lambda c: self._forecast_at(refinement, self.strictness, c), target, *CULL_LIMITS)
         event.target, event.strictness, event.cull = target, self.strictness, self.cull
-        event.blocked_by_cap += max(0, free - reached)
+        event.blocked_by_cap += max(0, ungoverned - reached)
 
     def target(self, refinement: Refinement) -> int:
-        """The count that a governed round is to end at; that of the last round is ``max_gaussians``.
+        """The count at which a governed round should end; ``max_gaussians`` in the last round.
 
-        A round closes the share of what is missing that the curve closes at its place, ((1 - x0)^2 - (1 - x)^2) / (1 -
-        x0)^2 for progress x0 before and x after it: on the curve that is the curve, and an arm that fell behind catches
-        up little by little.
+        With progress x0 before the round and x after it, the curve closes the share 1 - ((1 - x) / (1 - x0))^2 of its
+        distance to ``max_gaussians``. The target closes the same share of the actual distance. So a count on the curve
+        stays on it, and a count below it catches up gradually.
         """
         assert self.max_gaussians is not None  # __post_init__ asks for it
         last = (self.stop - 1) // self.interval
-        left, ahead = last - refinement.step // self.interval, last - self.start / self.interval  # rounds
-        before = min(left + 1, ahead)
+        left_after = last - refinement.step // self.interval  # rounds, proportional to 1 - x
+        left_before = min(left_after + 1, last - self.start / self.interval)
         count = len(refinement.gaussians)
-        return count + round((self.max_gaussians - count) * (1 - (left / before) ** 2))
+        return count + round((self.max_gaussians - count) * (1 - (left_after / left_before) ** 2))
 
     def may_cull(self, step: int) -> bool:
-        """Return whether opacities mean something now; not soon after they were reset."""
+        """Return whether the governor may raise ``cull`` now; False soon after opacities were reset."""
         return True
 
     def _forecast_at(self, refinement: Refinement, strictness: float = 1.0, cull: float = 1.0) -> int:

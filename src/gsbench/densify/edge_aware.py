@@ -1,4 +1,4 @@
-"""Improved-GS: halves along the longest axis, of candidates that are drawn by the edges that they cover."""
+"""Improved-GS: candidates are drawn by the edges that they cover, and split along their longest axis."""
 
 import math
 from collections.abc import Mapping
@@ -18,26 +18,28 @@ from gsbench.gaussians.model import Gaussians
 from gsbench.raster.base import RenderOutput
 from gsbench.settings import Fraction, OpenFraction, Switch
 
-# The authors' code has iterations, rounds being 100 apart and opacity resets 3,000; here these are rounds and resets.
-CLOSING_ROUNDS = 5  # before the end of the window cap=root has reached its budget, and the score is the gradient
-CLOSING_FACTOR = 1.5  # the threshold is divided by it in the closing rounds, while there is room
-EARLY_PRUNE = 3  # rounds from the start of training: a first pruning of the faint
-RECOVERY = 3  # rounds after an opacity reset: what has recovered least is pruned
-ALL_VIEWS = 4  # rounds after an opacity reset: all views give scores
-RESETS = 3  # so many resets count for the two above, the last one not
+# The authors' code has iterations: a round every 100, an opacity reset every 3,000. These are rounds and resets.
+CLOSING_ROUNDS = 5  # the last rounds of the window: cap=root has reached its budget, and the score is the gradient
+CLOSING_FACTOR = 1.5  # divides the threshold in the closing rounds, while there is room below the cap
+EARLY_PRUNE = 3  # rounds after the start of training: faint Gaussians are pruned for the first time
+RECOVERY = 3  # rounds after an opacity reset: Gaussians that have recovered least are pruned
+ALL_VIEWS = 4  # rounds after an opacity reset: scores use all views
+RESETS = 3  # RECOVERY and ALL_VIEWS apply until this opacity reset
 
 
 @dataclass
 class EdgeAware(LongAxis):
-    """The long-axis split of candidates drawn by the edge-aware score of Deng et al. (arXiv 2508.12313).
+    """The long-axis split, of candidates drawn by the edge-aware score of Deng et al. (arXiv 2508.12313).
 
-    Of ``score_views`` training views, drawn in each round, the score of a Gaussian is the mean of sum over pixels of
-    (edge strength of the photograph) alpha T, each view's over its mean; in the closing rounds, the mean gradient. Who
-    is over the gradient threshold and has a score is drawn without replacement in proportion to it, as many as the
-    budget admits. ``cap=root`` is their growth control: ``max_gaussians`` sqrt(x), x the progress of the window up to
-    the closing rounds. Pruned are the faint (nobody for size, none in the last round), once early those below
-    ``early_prune_opacity``, and three rounds after an opacity reset the faintest ``recovery_share``. Gradients are
-    gathered within the window only.
+    Each round draws ``score_views`` training views. The score of a Gaussian in a view is the sum over pixels of (edge
+    strength of the photograph) alpha T, divided by the mean of this sum over the Gaussians; the scores of all views are
+    averaged. In the closing rounds the score is the mean gradient. Gaussians above the gradient threshold with a
+    positive score are drawn without replacement in proportion to it, as many as the cap admits.
+
+    ``cap=root`` is the authors' growth control: a limit of ``max_gaussians`` sqrt(x), where x is the progress of the
+    window up to the closing rounds. Faint Gaussians are pruned in each round but the last, huge ones never. Gaussians
+    below ``early_prune_opacity`` are pruned once early, and the ``recovery_share`` with the lowest opacities three
+    rounds after an opacity reset. Gradients are gathered only within the window.
     """
 
     SWITCHES: ClassVar[Mapping[str, Switch]] = {
@@ -61,7 +63,7 @@ class EdgeAware(LongAxis):
             super().observe(step, render)
 
     def rules(self, refinement: Refinement) -> list[Rule]:
-        """The rules of ADC, and the prunings around them."""
+        """The rules of ADC and the additional prunings."""
         step, rules = refinement.step, super().rules(refinement)
         if self.prune in rules and step >= self.stop - self.interval:
             rules.remove(self.prune)
@@ -72,9 +74,10 @@ class EdgeAware(LongAxis):
         return rules
 
     def rounds_after_reset(self, step: int) -> float:
-        """The number of rounds since opacities were reset (or training began), while that counts; else infinity."""
-        counts = step < RESETS * self.opacity_reset_interval
-        return step % self.opacity_reset_interval / self.interval if counts else math.inf
+        """Rounds since the last opacity reset (or the start of training); infinity from the last counted reset on."""
+        if step >= RESETS * self.opacity_reset_interval:
+            return math.inf
+        return step % self.opacity_reset_interval / self.interval
 
     def closing(self, step: int) -> bool:
         """Return whether ``step`` is in the closing rounds."""
@@ -99,7 +102,7 @@ class EdgeAware(LongAxis):
 
     def choose(self, refinement: Refinement, candidates: Tensor, gain: int) -> tuple[Tensor, int]:
         count, allowed = int(candidates.sum()), self.allowance(refinement)
-        assert allowed is not None  # no cap of this class is without a limit
+        assert allowed is not None  # every cap of this class has a limit
         if count == 0 or allowed == 0:
             return torch.zeros_like(candidates), count
         scores = self.scores(refinement.gaussians.values, refinement.step, refinement.rng)
@@ -107,7 +110,7 @@ class EdgeAware(LongAxis):
         return chosen, count - int(chosen.sum())
 
     def scores(self, gaussians: Gaussians, step: int, rng: torch.Generator) -> Tensor:
-        """The scores by which candidates are drawn, [N]."""
+        """Scores [N] by which candidates are drawn."""
         if self.closing(step):
             return self.mean_gradient()
         views = self.context.training_views
@@ -115,15 +118,15 @@ class EdgeAware(LongAxis):
         return edge_scores(views, draw_views(views, count, rng), gaussians, step, by_mean)
 
     def huge(self, step: int, log_scales: Tensor) -> Tensor:
-        """A mask [N] without any Gaussian: these authors do not prune by size."""
+        """An empty mask [N]: the authors do not prune by size."""
         return torch.zeros_like(log_scales[:, 0], dtype=torch.bool)
 
     def prune_early(self, refinement: Refinement) -> None:
-        """Remove what has become faint before the first round."""
+        """Remove Gaussians that became faint before the first round."""
         self.prune_below(refinement, self.early_prune_opacity)
 
     def prune_unrecovered(self, refinement: Refinement) -> None:
-        """Remove the faintest ``recovery_share``: what did not become opaque again after the reset."""
+        """Remove the ``recovery_share`` with the lowest opacities, which did not recover from the opacity reset."""
         opacities = refinement.gaussians.values.opacities.detach()
         if len(opacities):
             self.prune_below(refinement, quantile(opacities.sort().values, self.recovery_share))

@@ -1,4 +1,4 @@
-"""FastGS: growth and pruning by how many badly rendered pixels a Gaussian covers, over several views."""
+"""FastGS: growth and pruning by the number of badly rendered pixels that a Gaussian covers in several views."""
 
 from dataclasses import dataclass
 from typing import ClassVar, Literal
@@ -13,28 +13,28 @@ from gsbench.densify.scores import draw, draw_views, error_map, to_unit_range
 from gsbench.gaussians.model import Gaussians
 from gsbench.settings import Fraction, OpenFraction
 
-LEAST_WEIGHT = 1e-6  # keeps the weight finite by which the faint are drawn (the authors' code)
+MIN_DIVISOR = 1e-6  # keeps the weights finite by which Gaussians are drawn for pruning (from the authors' code)
 
 
 @dataclass
 class FastGS(AbsGS):
-    """The candidates of AbsGS, of which only those grow that several views find badly rendered; Ren et al. (arXiv
-    2511.04283).
+    """AbsGS whose candidates grow only if they cover badly rendered pixels (Ren et al., arXiv 2511.04283).
 
-    In each round ``score_views`` training views are drawn. In each, a pixel is bad where its L1 error, shifted and
-    scaled to [0, 1], is above ``error_threshold``; a Gaussian's count is the number of bad pixels that it is blended
-    into. Candidates grow whose mean count over the views, rounded down, is above ``least_count``. The pruning score is
-    the sum over views of the loss of the view times the count, shifted and scaled to [0, 1]. Of those to prune, half as
-    many as there are are drawn from all, in proportion to 1 / (1 - score), and only they go. Then opacities are lowered
-    to the ceiling. After the window, every ``final_interval`` iterations, all below ``final_opacity`` or above
-    ``final_score`` go.
+    Each round draws ``score_views`` training views. A pixel is bad if its L1 error, shifted and scaled to [0, 1] in
+    its view, is above ``error_threshold``. A Gaussian's count is the number of bad pixels that it is blended into. A
+    candidate grows if its mean count over the views, rounded down, is above ``least_count``.
+
+    The pruning score is the sum over views of the view's loss times the count, shifted and scaled to [0, 1]. If n
+    Gaussians are faint or huge, n / 2 are drawn from all Gaussians in proportion to 1 / (1 - score); faint and huge
+    Gaussians are pruned only if drawn. Then opacities are lowered to the ceiling. After the window, every
+    ``final_interval`` iterations, Gaussians below ``final_opacity`` or above ``final_score`` are pruned.
     """
 
     STATISTICS: ClassVar[dict[str, torch.dtype]] = {"count": torch.float32, "score": torch.float32}  # within a round
     needs_footprint = True
 
     split_threshold: PositiveFloat = 1.2e-3
-    cap: Literal["soft", "hard", "curve"] = "soft"  # others ask where a round leads before it has scores
+    cap: Literal["soft", "hard", "curve"] = "soft"  # freeze and governor need a forecast before there are scores
     score_views: PositiveInt = 10
     error_threshold: Fraction = 0.1
     least_count: NonNegativeFloat = 5.0
@@ -43,7 +43,7 @@ class FastGS(AbsGS):
     final_score: Fraction = 0.9
 
     def rules(self, refinement: Refinement) -> list[Rule]:
-        """The rules of ADC between the score and the ceiling; after the window, the final prunings."""
+        """The rules of ADC, with scores before growth and the ceiling after pruning; then the final prunings."""
         step = refinement.step
         rules = [rule for rule in super().rules(refinement) if rule != self.lower_opacity]
         if self.grow_by_gradient in rules:
@@ -54,7 +54,7 @@ class FastGS(AbsGS):
         return rules
 
     def score(self, refinement: Refinement) -> None:
-        """The rule that counts the bad pixels of every Gaussian."""
+        """Compute the count and the pruning score of every Gaussian."""
         values, views = refinement.gaussians.values, self.context.training_views
         chosen = draw_views(views, self.score_views, refinement.rng)
         total, weighted = torch.zeros_like(values.opacity_logits), torch.zeros_like(values.opacity_logits)
@@ -66,7 +66,7 @@ class FastGS(AbsGS):
         self.statistics["score"] = to_unit_range(weighted).float()
 
     def bad_pixels(self, index: int, gaussians: Gaussians, step: int) -> tuple[Tensor, Tensor]:
-        """Count the bad pixels of a view that each Gaussian is blended into, [N]; also returns the loss of the view."""
+        """The number [N] of bad pixels of a view that each Gaussian is blended into, and the loss of the view."""
         views = self.context.training_views
         render = views.render(index, gaussians, step)
         bad = error_map(render.image, views.image(index)) > self.error_threshold
@@ -77,15 +77,16 @@ class FastGS(AbsGS):
         return over & (self.statistics["count"] > self.least_count), large
 
     def prune(self, refinement: Refinement) -> None:
-        """Remove some of the faint and, after the first opacity reset, of the huge: more likely those that err."""
+        """Remove some of the faint and huge Gaussians, more likely those with high scores."""
         values, score = refinement.gaussians.values, self.statistics["score"]
         faint, huge = self.faint(values.opacity_logits), self.huge(refinement.step, values.log_scales)
-        removed = refinement.event.split_gradient // (self.split_children - 1)  # parents; those that remain stand first
-        known = torch.arange(len(score), device=score.device) < refinement.event.before - removed  # the new: no score
-        drawn = draw(known, 1 / (LEAST_WEIGHT + 1 - score), int((faint | huge).sum()) // 2, refinement.rng)
+        # Only Gaussians from before the round have a score. They come first; split parents are gone from among them.
+        split_parents = refinement.event.split_gradient // (self.split_children - 1)
+        scored = torch.arange(len(score), device=score.device) < refinement.event.before - split_parents
+        drawn = draw(scored, 1 / (MIN_DIVISOR + 1 - score), int((faint | huge).sum()) // 2, refinement.rng)
         self.remove(refinement, faint & drawn, huge & drawn)
 
     def prune_finally(self, refinement: Refinement) -> None:
-        """Remove the rather faint and those that err most."""
+        """Remove Gaussians below ``final_opacity`` or above ``final_score``."""
         faint = refinement.gaussians.values.opacities < self.final_opacity  # [N]
         self.remove(refinement, faint, self.statistics["score"] > self.final_score)

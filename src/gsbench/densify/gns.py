@@ -1,4 +1,4 @@
-"""GNS: grow beyond the budget, then press on all opacities until only the budget's Gaussians hold out."""
+"""GNS: growth beyond the budget, then a loss on all opacities until only as many Gaussians as budgeted remain."""
 
 import logging
 from dataclasses import dataclass
@@ -18,30 +18,33 @@ from gsbench.settings import OpenFraction
 
 log = logging.getLogger(__name__)
 
-# Of the authors' code, in the iterations of its schedule: pressure from 15,000 to 23,000, every 50 of them.
-SOFT_SHARE = 1 / 8  # of the time under pressure: the opaque are spared, and nobody is pruned
-FIRST_AIM = 0.8  # of the opacity of the least of those that may stay, when the pressure begins
-LOWEST_LOGIT = 20.0  # below zero: where the pressure drives all opacities
-SPARED = 0.05  # least divisor: an opacity of .95 and more is pressed twenty times as hard as one near 0
-HARD_FACTOR = 3.0  # of the pressure that spares nobody
-BAND, WEAKER, STRONGER = 0.1, 0.8, 1.2  # the weight follows where the opacity is so far from its aim
-CLOSE = 1.05  # times the budget: the rest is drawn
-RATE_FACTOR = 4.0  # on the opacities' learning rate, until `SOFT_SHARE` after the budget is met
+# From the authors' code, whose pressure acts every 50 iterations from iteration 15,000 to 23,000.
+SOFT_SHARE = 1 / 8  # first part of the pressure: its term depends on opacity, and no Gaussian is pruned
+FIRST_AIM = 0.8  # of the opacity of the last Gaussian within the budget, when the pressure begins
+LOWEST_LOGIT = 20.0  # the pressure drives all opacity logits towards minus this
+MIN_TRANSPARENCY = 0.05  # smallest divisor in the first part: an opacity of .95 weighs 20 times as much as one near 0
+HARD_FACTOR = 3.0  # on the pressure after the first part
+BAND, WEAKER, STRONGER = 0.1, 0.8, 1.2  # the weight is changed if the opacity is more than BAND from its aim
+CLOSE = 1.05  # times the budget: below this, the excess is removed at once, by a random draw
+RATE_FACTOR = 4.0  # on the learning rate of opacities, until `SOFT_SHARE` after the budget is met
 
 
 @dataclass
 class GNS(EdgeAware):
-    """Improved-GS up to ``overgrowth`` times the budget, then natural selection; Deng et al. (arXiv 2511.16980).
+    """Improved-GS up to ``overgrowth`` times the budget, then natural selection (Deng et al., arXiv 2511.16980).
 
-    From the end of the window, for ``pressure_length`` of the window's length, every half interval a term in the loss
-    presses on all opacity logits l: w (mean of (l + 20) / max(.05, 1 - o))^2 for the first eighth of that time, then
-    3 w (mean l + 20)^2. Rendering pushes back for those that it needs. The weight w, at first ``pressure``, follows an
-    aim for the opacity of the last Gaussian within the budget, which falls from .8 of what it was to 0 in seven eighths
-    of that time. Those below ``selected_opacity`` go. Within 5 % of the budget, or at the end of the time, exactly
-    ``max_gaussians`` stay, drawn by opacity. The opacities' learning rate is four times as high meanwhile.
+    The pressure lasts ``pressure_length`` of the window's length, from the end of the window. Every half interval, a
+    term in the loss lowers all opacity logits l (opacity o): w (mean of (l + 20) / max(.05, 1 - o))^2 in the first
+    eighth of that time, then 3 w (mean l + 20)^2. The photometric loss counteracts it for Gaussians that the pictures
+    need. After the first eighth, Gaussians below ``selected_opacity`` are pruned.
 
-    ``max_gaussians`` is the count at the end; in between there are up to ``overgrowth`` times as many. Where the
-    training ends before the pressure does, there are more at the end, too.
+    The weight w starts at ``pressure``. It is adjusted so that the opacity of the last Gaussian within the budget
+    follows an aim, which falls from .8 of its initial value to 0 in seven eighths of the time. When the count is within
+    5 % of the budget, or the time ends, exactly ``max_gaussians`` are kept, drawn by opacity. Meanwhile the learning
+    rate of opacities is four times as high.
+
+    ``max_gaussians`` is the final count; before, there are up to ``overgrowth`` times as many. If the training ends
+    before the pressure does, the final count is higher, too.
     """
 
     cap: Literal["root"] = "root"
@@ -53,10 +56,10 @@ class GNS(EdgeAware):
 
     def begin(self, gaussians: Gaussians, context: DensifyContext) -> None:
         super().begin(gaussians, context)
-        self.step = 0  # the last one observed
+        self.step = 0  # last observed iteration
         self.weight = self.pressure
-        self.aim: float | None = None  # where the aimed opacity started; None before the pressure
-        self.met_at: int | None = None  # the iteration at which the budget was met
+        self.aim: float | None = None  # initial value of the aimed opacity; None before the pressure
+        self.met_at: int | None = None  # iteration at which the budget was met
 
     @property
     def most_gaussians(self) -> int:
@@ -64,6 +67,7 @@ class GNS(EdgeAware):
 
     @property
     def pressure_interval(self) -> int:
+        """Iterations between two terms in the loss."""
         return max(1, self.interval // 2)
 
     @property
@@ -73,11 +77,11 @@ class GNS(EdgeAware):
         return rounds * self.interval
 
     def pressing(self, step: int) -> bool:
-        """Return whether selection is under way at ``step``."""
+        """Return whether the pressure acts at ``step``."""
         return self.met_at is None and self.stop <= step <= self.stop + self.pressure_time
 
-    def soft(self, step: int) -> bool:
-        """Return whether the pressure of ``step`` spares the opaque."""
+    def in_first_part(self, step: int) -> bool:
+        """Return whether ``step`` is in the first part of the pressure."""
         return step < self.stop + SOFT_SHARE * self.pressure_time
 
     def observe(self, step: int, render: RenderOutput) -> None:
@@ -88,14 +92,14 @@ class GNS(EdgeAware):
         step = self.step + 1
         if not self.pressing(step) or (step - 1) % self.pressure_interval:
             return None
-        self.follow(step, gaussians.opacities.detach())
+        self.adjust_weight(step, gaussians.opacities.detach())
         logits = gaussians.opacity_logits + LOWEST_LOGIT
-        if self.soft(step):
-            return self.weight * (logits / (1 - gaussians.opacities).clamp_min(SPARED)).mean().square()
+        if self.in_first_part(step):
+            return self.weight * (logits / (1 - gaussians.opacities).clamp_min(MIN_TRANSPARENCY)).mean().square()
         return HARD_FACTOR * self.weight * logits.mean().square()
 
-    def follow(self, step: int, opacities: Tensor) -> None:
-        """Strengthen or weaken the pressure by the opacity of the last Gaussian within the budget."""
+    def adjust_weight(self, step: int, opacities: Tensor) -> None:
+        """Adjust the weight of the pressure by the opacity of the last Gaussian within the budget."""
         last = opacities.sort(descending=True).values[min(self.max_gaussians, len(opacities)) - 1].item()
         if self.aim is None:
             self.aim = FIRST_AIM * last
@@ -108,7 +112,7 @@ class GNS(EdgeAware):
                 self.weight *= STRONGER
 
     def rules(self, refinement: Refinement) -> list[Rule]:
-        """The rules of Improved-GS in the window, then the selection."""
+        """The rules of Improved-GS within the window, then those of the selection."""
         step, count = refinement.step, len(refinement.gaussians)
         if self.met_at is not None and step == self.met_at + round(SOFT_SHARE * self.pressure_time):
             return [self.restore_rate]
@@ -119,15 +123,15 @@ class GNS(EdgeAware):
         ended = step == self.stop + self.pressure_time
         if ended or count < CLOSE * self.max_gaussians:
             return [self.meet_budget]
-        selecting = step % self.pressure_interval == 0 and not self.soft(step)
-        return [self.select] if selecting else []
+        pruning = step % self.pressure_interval == 0 and not self.in_first_part(step)
+        return [self.prune_transparent] if pruning else []
 
-    def select(self, refinement: Refinement) -> None:
-        """Remove those that the pressure has made transparent."""
+    def prune_transparent(self, refinement: Refinement) -> None:
+        """Remove the Gaussians that the pressure has made transparent."""
         self.prune_below(refinement, self.selected_opacity)
 
     def meet_budget(self, refinement: Refinement) -> None:
-        """Keep as many as the budget has, drawn by opacity, and end the selection."""
+        """Keep ``max_gaussians`` Gaussians, drawn by opacity, and end the pressure."""
         opacities = refinement.gaussians.values.opacities.detach()
         kept = draw(torch.ones_like(opacities, dtype=torch.bool), opacities, self.max_gaussians, refinement.rng)
         if len(opacities) > CLOSE * self.max_gaussians:
@@ -142,18 +146,18 @@ class GNS(EdgeAware):
         self.met_at = refinement.step
 
     def raise_rate(self, refinement: Refinement) -> None:
-        """Let opacities move faster, under pressure and for a while after it."""
+        """Raise the learning rate of opacities for the pressure and for a while after it."""
         refinement.gaussians.set_rate("opacity_logits", RATE_FACTOR * refinement.gaussians.rates.opacity)
 
     def restore_rate(self, refinement: Refinement) -> None:
-        """Set the usual learning rate of opacities again."""
+        """Restore the learning rate of opacities."""
         refinement.gaussians.set_rate("opacity_logits", refinement.gaussians.rates.opacity)
 
     def state_dict(self) -> dict[str, Any]:
-        own = {"step": self.step, "weight": self.weight, "aim": self.aim, "met_at": self.met_at}
-        return super().state_dict() | {"selection": own}
+        selection = {"step": self.step, "weight": self.weight, "aim": self.aim, "met_at": self.met_at}
+        return super().state_dict() | {"selection": selection}
 
     def load_state_dict(self, state: dict[str, Any], context: DensifyContext) -> None:
         super().load_state_dict(state, context)
-        own = state["selection"]
-        self.step, self.weight, self.aim, self.met_at = (own[key] for key in ("step", "weight", "aim", "met_at"))
+        saved = state["selection"]
+        self.step, self.weight, self.aim, self.met_at = (saved[key] for key in ("step", "weight", "aim", "met_at"))

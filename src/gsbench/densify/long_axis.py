@@ -16,17 +16,17 @@ from gsbench.events import Cause
 from gsbench.gaussians.model import Gaussians
 from gsbench.settings import OpenFraction, Switch
 
-REACH = 3.0  # standard deviations: where a Gaussian is taken to end
+REACH = 3.0  # standard deviations at which a Gaussian is taken to end
 
 
 @dataclass
 class LongAxis(ADC):
-    """ADC whose candidates are all split, none cloned, in the way of Deng et al. (arXiv 2508.12313).
+    """ADC that splits all candidates along their longest axis and clones none (Deng et al., arXiv 2508.12313).
 
-    With d = ``split_distance`` and the longest semi-axis s: two children at 3 d s on either side of the parent along
-    that axis, which becomes (1 - d) s; the other axes are multiplied by sqrt(1 - d^2), the opacity by
-    ``opacity_factor``; the parent goes. Nothing is drawn at random. The options ``split_size``, ``split_children``,
-    ``split_shrink`` and ``revised_opacity`` of ADC have no meaning here.
+    With d = ``split_distance`` and s the longest semi-axis, two children replace the parent. They lie at 3 d s on
+    either side of it along that axis. Their longest semi-axis is (1 - d) s, their other axes are the parent's times
+    sqrt(1 - d^2), and their opacity is the parent's times ``opacity_factor``. The split is not random. The options
+    ``split_size``, ``split_children``, ``split_shrink`` and ``revised_opacity`` of ADC have no effect.
     """
 
     SWITCHES: ClassVar[Mapping[str, Switch]] = {
@@ -49,27 +49,27 @@ class LongAxis(ADC):
         )
 
     def grow_by_gradient(self, refinement: Refinement) -> None:
-        """Split those whose mean gradient reaches the threshold."""
+        """Split the Gaussians whose mean gradient reaches the threshold."""
         over, _ = self.candidates(refinement)
         selected, blocked = self.choose(refinement, over, 1)
         parents = selected.nonzero().squeeze(-1)  # [S]
-        chosen = refinement.gaussians.values.detach().select(parents)
-        children = halves(chosen, REACH * self.split_distance, *self._factors, self.opacity_factor)
+        parent_values = refinement.gaussians.values.detach().select(parents)
+        children = halves(parent_values, REACH * self.split_distance, *self._factors, self.opacity_factor)
         self.edit(refinement, ~selected, children, parents.repeat(2), Cause.SPLIT_GRADIENT)
         refinement.event.split_gradient += len(parents)
         refinement.event.blocked_by_cap += blocked
 
     @property
     def _factors(self) -> tuple[float, float]:
-        """On the longest axis, and on the others."""
+        """Factors on the scale of the longest axis and on those of the other two."""
         return 1 - self.split_distance, math.sqrt(1 - self.split_distance**2)
 
 
 def halves(parents: Gaussians, offset: float, longest: float, across: float, opacity: float) -> Gaussians:
-    """Two children of each of ``parents`` [S], first all on the one side, then all on the other, [2 S].
+    """Two children of each of ``parents`` [S], [2 S]: first all children on one side, then all on the other.
 
-    They stand ``offset`` standard deviations away along the longest axis, which is multiplied by ``longest``, the
-    others by ``across``, the opacity by ``opacity``.
+    They lie ``offset`` standard deviations from the parent along its longest axis. ``longest`` multiplies the scale of
+    that axis, ``across`` the other scales, and ``opacity`` the opacity.
     """
     axis = parents.log_scales.argmax(-1)  # [S]
     directions = parents.rotations[torch.arange(len(axis), device=axis.device), :, axis]  # [S, 3]
@@ -82,8 +82,9 @@ def halves(parents: Gaussians, offset: float, longest: float, across: float, opa
 
 
 def shrunk(log_scales: Tensor, longest: float, across: float) -> Tensor:
-    """``log_scales`` [N, 3] with a factor on the longest axis and one on the others."""
+    """``log_scales`` [N, 3] with the scale of the longest axis times ``longest`` and the others times ``across``."""
     index = log_scales.argmax(-1, keepdim=True)
     is_longest = torch.zeros_like(log_scales, dtype=torch.bool).scatter(-1, index, True)
-    factors = log_scales.new_tensor([math.log(across), math.log(longest)])  # two plain numbers would become float32
+    # torch.where with two Python numbers would compute in float32; a tensor keeps float64.
+    factors = log_scales.new_tensor([math.log(across), math.log(longest)])
     return log_scales + factors[is_longest.long()]

@@ -1,4 +1,4 @@
-"""MRNF, the default strategy of LichtFeld-Studio: few long-axis splits, drawn by error and edges, and steady decay."""
+"""MRNF, the default strategy of LichtFeld-Studio: a few long-axis splits, drawn by error and edges, and decay."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -22,27 +22,33 @@ from gsbench.gaussians.trainable import TrainableGaussians
 from gsbench.raster.base import RenderOutput
 from gsbench.settings import Fraction, OpenFraction, Switch
 
-# Numbers of LichtFeld-Studio's code (src/training/strategies/mrnf.cpp, kernels/mrnf_kernels.cu).
-EDGE_WEIGHT = 0.25  # of the edge score, over its median, beside 1
-REACH = 100.0  # times the scene's half size: farther and larger Gaussians go
-LEAST_SCALE = 1e-10  # world units
-BOUNDS = (0.1, 0.9)  # quantiles of the means on each axis, between which the scene lies
-NOISE_POWER = 150.0  # of 1 - opacity
-SPLIT_OFFSET, SPLIT_LONGEST, SPLIT_ACROSS, SPLIT_OPACITY = 0.5, 0.5, 0.85, 0.6  # in standard deviations; factors
-LEAST_DECAYED = 1e-12  # of opacities and scales
+# Constants from LichtFeld-Studio's code (src/training/strategies/mrnf.cpp, kernels/mrnf_kernels.cu).
+EDGE_WEIGHT = 0.25  # weights of draws are multiplied by 1 + this times (edge score / its median)
+REACH = 100.0  # times half the scene's size: Gaussians that are farther or larger are pruned
+MIN_SCALE = 1e-10  # world units; smaller Gaussians are pruned
+BOUNDS = (0.1, 0.9)  # quantiles of the means on each axis that bound the scene
+NOISE_POWER = 150.0  # noise is proportional to (1 - opacity) to this power
+SPLIT_OFFSET = 0.5  # standard deviations
+SPLIT_LONGEST, SPLIT_ACROSS, SPLIT_OPACITY = 0.5, 0.85, 0.6  # factors on the children's scales and opacity
+MIN_DECAYED = 1e-12  # of opacities and scales after decay
 
 
 @dataclass
 class MRNF(Budgeted):
-    """Rounds that replace what was pruned and add a small share, by long-axis splits; opacities and scales decay.
+    """Each round replaces pruned Gaussians and adds a small share by long-axis splits; opacities and scales decay.
 
-    The refine weight of a Gaussian is the largest, over ``score_views`` training views drawn in each round, of sum over
-    pixels of e alpha T, with e = max(0, 1 - SSIM) over its mean in the view. Candidates are those above
-    ``growth_threshold`` that were seen; ``growth_share`` of their number is how many Gaussians are split in the round:
-    first as many as were pruned, drawn by opacity, then, up to iteration ``grow_until``, the rest, drawn by refine
-    weight; both times by the edges that they cover, too. Pruned are those below ``prune_opacity``, and what has left
-    the scene by size or place. After each round every opacity falls by ``opacity_decay`` and every scale by the share
-    ``scale_decay``, less and less until ``decay_until``. After each step, means of faint Gaussians get noise.
+    The refine weight of a Gaussian is the largest sum over pixels of e alpha T in ``score_views`` training views, drawn
+    in each round, where e = max(0, 1 - SSIM) divided by its mean in the view. Candidates are the Gaussians seen since
+    the last round whose weight is above ``growth_threshold``. A round prunes Gaussians below ``prune_opacity`` and
+    those too small, too large or too far away. Then it splits:
+
+    1. as many Gaussians as it pruned, drawn by opacity;
+    2. until iteration ``grow_until``, further candidates, drawn by refine weight, so that the two splits together are
+       the ``growth_share`` of all candidates.
+
+    Both draws also favour Gaussians that cover edges. After each round every opacity decreases by ``opacity_decay`` and
+    every scale by the share ``scale_decay``; both amounts fall to 0 at iteration ``decay_until``. After each step, the
+    means of faint Gaussians get noise.
     """
 
     STATISTICS: ClassVar[dict[str, torch.dtype]] = {"seen": torch.bool}  # since the last round
@@ -82,30 +88,31 @@ class MRNF(Budgeted):
         return [self.refill_and_grow, self.decay, self.reset_statistics]
 
     def refill_and_grow(self, refinement: Refinement) -> None:
-        """Prune, split as many to fill the gaps, then split a share of the candidates."""
+        """Prune, split as many Gaussians to replace the pruned ones, then split a share of the candidates."""
         step, rng, event = refinement.step, refinement.rng, refinement.event
         values, seen = refinement.gaussians.values, self.statistics["seen"]
-        gone = self.lost(values)  # [N]
+        pruned = self.to_prune(values)  # [N]
+        num_pruned = int(pruned.sum())
         views = draw_views(self.context.training_views, self.score_views, rng)
         weights = self.refine_weights(views, values, step)
         edges = edge_scores(self.context.training_views, views, values, step, by_median)
-        guidance = 1 + EDGE_WEIGHT * by_median(edges)  # [N]
-        above = (weights > self.growth_threshold) & seen
-        wanted = int(self.growth_share * int(above.sum()) + 0.5)
+        edge_factor = 1 + EDGE_WEIGHT * by_median(edges)  # [N]
+        candidates = (weights > self.growth_threshold) & seen
+        wanted = int(self.growth_share * int(candidates.sum()) + 0.5)
 
-        room = (self.allowance(refinement) or 0) + int(gone.sum())
-        replacements = values.opacities.detach() * guidance
-        refilled = draw(seen & ~gone & (replacements > 0), replacements, min(int(gone.sum()), room), rng)
-        left = max(0, wanted - int(refilled.sum())) if step < self.grow_until else 0
-        able = above & ~gone & ~refilled
-        grown = draw(able, weights * guidance, min(left, room - int(refilled.sum())), rng)
-        event.blocked_by_cap += max(0, min(left, int(able.sum())) - int(grown.sum()))
-        event.pruned_opacity += int(gone.sum())
-        event.split_gradient += int((refilled | grown).sum())
-        self.split_along(refinement, refilled | grown, ~gone)
+        room = (self.allowance(refinement) or 0) + num_pruned
+        opacity_scores = values.opacities.detach() * edge_factor
+        replacing = draw(seen & ~pruned & (opacity_scores > 0), opacity_scores, min(num_pruned, room), rng)
+        remaining = max(0, wanted - int(replacing.sum())) if step < self.grow_until else 0
+        eligible = candidates & ~pruned & ~replacing
+        growing = draw(eligible, weights * edge_factor, min(remaining, room - int(replacing.sum())), rng)
+        event.blocked_by_cap += max(0, min(remaining, int(eligible.sum())) - int(growing.sum()))
+        event.pruned_opacity += num_pruned
+        event.split_gradient += int((replacing | growing).sum())
+        self.split_along(refinement, replacing | growing, ~pruned)
 
     def refine_weights(self, views: Sequence[int], gaussians: Gaussians, step: int) -> Tensor:
-        """The refine weight, [N]."""
+        """The refine weights [N] over the training views at the indices ``views``."""
         training, largest = self.context.training_views, torch.zeros_like(gaussians.opacity_logits)
         for index in views:
             error = training.dissimilarity(index, training.render(index, gaussians, step).image.detach())  # [H, W]
@@ -114,29 +121,32 @@ class MRNF(Budgeted):
             largest = torch.maximum(largest, sums[:, 0])
         return largest
 
-    def lost(self, gaussians: Gaussians) -> Tensor:
-        """Mask [N] of those to prune: transparent, without size, or out of the scene by size or place."""
+    def to_prune(self, gaussians: Gaussians) -> Tensor:
+        """Mask [N] of the Gaussians to prune: transparent, too small, too large, or too far away."""
         center, half, _ = bounds(gaussians.means.detach())
         limit = REACH * half
         scales = gaussians.log_scales
         far = (gaussians.means - center).abs().amax(-1) > limit
-        sizes = (scales.amin(-1) < math.log(LEAST_SCALE)) | (scales.amax(-1).exp() > limit)
+        sizes = (scales.amin(-1) < math.log(MIN_SCALE)) | (scales.amax(-1).exp() > limit)
         return (gaussians.opacities < self.prune_opacity) | sizes | far
 
     def split_along(self, refinement: Refinement, selected: Tensor, kept: Tensor) -> None:
-        """Replace the ``selected`` [N] by two halves along their longest axis; of all others keep ``kept`` [N]."""
+        """Split the Gaussians at the mask ``selected`` [N] along their longest axis; of the others, keep those at
+        ``kept`` [N]."""
         parents = selected.nonzero().squeeze(-1)  # [S]
-        chosen = refinement.gaussians.values.detach().select(parents)
-        children = halves(chosen, SPLIT_OFFSET, SPLIT_LONGEST, SPLIT_ACROSS, SPLIT_OPACITY)
+        parent_values = refinement.gaussians.values.detach().select(parents)
+        children = halves(parent_values, SPLIT_OFFSET, SPLIT_LONGEST, SPLIT_ACROSS, SPLIT_OPACITY)
         self.edit(refinement, kept & ~selected, children, parents.repeat(2), Cause.SPLIT_GRADIENT)
 
     def decay(self, refinement: Refinement) -> None:
-        """Lower all opacities and scales a little; the moments stay."""
-        values, left = refinement.gaussians.values, max(0.0, 1 - refinement.step / self.decay_until)
-        opacities = values.opacities - self.opacity_decay * left
-        finest = max(LEAST_DECAYED, torch.finfo(opacities.dtype).eps)
-        values.opacity_logits.copy_(torch.logit(opacities.clamp(LEAST_DECAYED, 1 - finest)))
-        values.log_scales.add_(math.log(1 - self.scale_decay * left)).clamp_min_(math.log(LEAST_DECAYED))
+        """Lower all opacities and scales a little. Adam's moments stay."""
+        values, remaining = refinement.gaussians.values, max(0.0, 1 - refinement.step / self.decay_until)
+        opacities = values.opacities - self.opacity_decay * remaining
+        margin = max(
+            MIN_DECAYED, torch.finfo(opacities.dtype).eps
+        )  # in float32, 1 - 1e-12 would be 1: an infinite logit
+        values.opacity_logits.copy_(torch.logit(opacities.clamp(MIN_DECAYED, 1 - margin)))
+        values.log_scales.add_(math.log(1 - self.scale_decay * remaining)).clamp_min_(math.log(MIN_DECAYED))
 
     @torch.no_grad()
     def after_step(self, step: int, gaussians: TrainableGaussians, rng: torch.Generator) -> None:
@@ -150,8 +160,9 @@ class MRNF(Budgeted):
 
 
 def bounds(means: Tensor) -> tuple[Tensor, float, float]:
-    """The box between the quantiles `BOUNDS` of ``means`` [N, 3]: its centre [3], half its longest edge, and the edge
-    of middle length (world units).
+    """The box between the quantiles `BOUNDS` of ``means`` [N, 3], in world units.
+
+    Returns its centre [3], half its longest edge, and its edge of middle length.
     """
     ordered = means.sort(dim=0).values
     low, high = (ordered[int(share * (len(means) - 1))] for share in BOUNDS)

@@ -1,4 +1,4 @@
-"""Children of Gaussians: pure functions that every densifier shares."""
+"""Functions that several densifiers share: random points, children, opacities and quantiles."""
 
 import math
 
@@ -11,21 +11,21 @@ MIN_REVISED_OPACITY = 1e-6  # keeps the logit finite
 
 
 def standard_normal(shape: tuple[int, ...], rng: torch.Generator, like: Tensor) -> Tensor:
-    """Normal draws of ``shape`` with the dtype and on the device of ``like``, all determined by the CPU generator
+    """Draw normal numbers of ``shape``, with the dtype and on the device of ``like``, determined by the CPU generator
     ``rng``.
 
-    On another device a generator of its own draws, seeded by ``rng``: nothing is uploaded, and the state of ``rng``
-    stays all there is to save. The same seed gives other numbers there than on the CPU.
+    On another device, a temporary generator there draws the numbers, seeded by ``rng``. So no numbers are uploaded, and
+    the state of ``rng`` is all that a checkpoint must save. The same seed gives other numbers there than on the CPU.
     """
     if like.device.type == "cpu":
         return torch.randn(shape, generator=rng, dtype=like.dtype)
     seed = int(torch.randint(2**62, (1,), generator=rng))
-    own = torch.Generator(like.device).manual_seed(seed)
-    return torch.randn(shape, generator=own, dtype=like.dtype, device=like.device)
+    device_rng = torch.Generator(like.device).manual_seed(seed)
+    return torch.randn(shape, generator=device_rng, dtype=like.dtype, device=like.device)
 
 
 def sample_inside(gaussians: Gaussians, rng: torch.Generator) -> Tensor:
-    """One point drawn from each Gaussian as a density, mu + R e with e ~ N(0, diag(s^2)), [N, 3]."""
+    """Draw one point from the density of each Gaussian: mu + R e with e ~ N(0, diag(s^2)), [N, 3]."""
     noise = standard_normal((len(gaussians), 3), rng, gaussians.means)  # [N, 3]
     offsets = noise * gaussians.scales  # [N, 3] in the axes of each ellipsoid
     return gaussians.means + (gaussians.rotations @ offsets.unsqueeze(-1)).squeeze(-1)
@@ -34,9 +34,10 @@ def sample_inside(gaussians: Gaussians, rng: torch.Generator) -> Tensor:
 def split(
     parents: Gaussians, children: int, child_log_scales: Tensor, rng: torch.Generator, sampled: bool = True
 ) -> Gaussians:
-    """``children`` new Gaussians per parent, [children * N], parent order repeated; scales as given [N, 3].
+    """Return ``children`` new Gaussians per parent, [children * N]: all parents in order, repeated ``children`` times.
 
-    Means are drawn from the parent's density, or are the parent's (``sampled=False``); all else is copied.
+    Scales are ``child_log_scales`` [N, 3], the same for all children of a parent. Means are drawn from the parent's
+    density, or equal its mean (``sampled=False``). Other properties are copied.
     """
     repeated = Gaussians.concatenate([parents] * children)
     means = sample_inside(repeated, rng) if sampled else repeated.means.clone()
@@ -45,8 +46,10 @@ def split(
 
 
 def revised_logits(opacity_logits: Tensor) -> Tensor:
-    """Logits of 1 - sqrt(1 - o): two such children one behind the other are as opaque as the parent (arXiv
-    2404.06109)."""
+    """Logits of 1 - sqrt(1 - o): two such children, one behind the other, are as opaque as the parent.
+
+    From Revising Densification (arXiv 2404.06109).
+    """
     transmittance = (-opacity_logits).sigmoid().sqrt()  # sqrt(1 - o)
     return torch.logit((1 - transmittance).clamp_min(MIN_REVISED_OPACITY))
 

@@ -1,4 +1,4 @@
-"""Pixel-GS: ADC whose mean gradient weighs each view by the pixels that a Gaussian covers in it."""
+"""Pixel-GS: ADC whose mean gradient weights each view by the number of pixels that a Gaussian covers."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -17,10 +17,10 @@ from gsbench.settings import Switch
 class PixelGS(ADC):
     """ADC with the growth condition of Zhang et al. (arXiv 2403.15530).
 
-    With m_ik the pixels that Gaussian i is blended into in view k, g_ik its gradient there and z_ik its view z, the
-    mean gradient is sum_k m_ik f_ik |g_ik| / sum_k m_ik: a large Gaussian of which many views see but an edge is no
-    longer held back by them. f_ik = min(1, (z_ik / (``near_fraction`` extent))^2) holds back what is near a camera.
-    Only growth reads it; the optimiser's gradients stay as they are.
+    The mean gradient is sum_k m_ik f_ik |g_ik| / sum_k m_ik, where m_ik is the number of pixels that Gaussian i is
+    blended into in view k, g_ik its gradient and z_ik its depth there. So views that see only an edge of a large
+    Gaussian no longer lower its mean. The factor f_ik = min(1, (z_ik / (``near_fraction`` extent))^2) reduces growth
+    near cameras. Only growth uses this mean; the optimiser's gradients are not changed.
     """
 
     STATISTICS: ClassVar[dict[str, torch.dtype]] = {
@@ -46,11 +46,11 @@ class PixelGS(ADC):
         self.statistics["pixel_sum"] += footprint.pixels
 
     def nearness(self, depths: Tensor) -> Tensor:
-        """The factor f for view depths [N], in [0, 1]."""
+        """The factor f in [0, 1] for view depths [N]."""
         if self.near_fraction is None:
             return torch.ones_like(depths)
         return (depths / (self.near_fraction * self.context.extent)).square().clamp_max(1)
 
     def mean_gradient(self) -> Tensor:
-        """[N] NDC, over the views since the last refinement, each weighed by its pixels; 0 without any."""
+        """Mean gradient [N] NDC over the views since the last refinement, weighted by pixels; 0 without pixels."""
         return self.statistics["weighted_gradient_sum"] / self.statistics["pixel_sum"].clamp_min(1)

@@ -1,4 +1,4 @@
-"""ADC whose gradient threshold is what lets the count grow at a given rate."""
+"""ADC that grows at a given rate instead of by a fixed gradient threshold."""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -15,10 +15,11 @@ from gsbench.densify.operations import quantile
 
 @dataclass
 class QuantileADC(ADC):
-    """ADC with a rate instead of a threshold, after the proposal of an AdaptiveStrategy for gsplat (its PR 941).
+    """ADC with a growth rate, after the AdaptiveStrategy proposed for gsplat (its pull request 941).
 
-    In each round those of the largest mean gradients grow, so many that the count grows by ``growth_rate``; of those
-    that were never seen, nobody. The faintest ``prune_share`` go, and the huge as in ADC.
+    In each round the Gaussians with the largest mean gradients grow, as many as raise the count by ``growth_rate``.
+    Gaussians that no view has seen do not grow. The ``prune_share`` with the lowest opacities are pruned, and huge
+    Gaussians are pruned as in ADC.
     """
 
     growth_rate: PositiveFloat = 0.05
@@ -33,10 +34,11 @@ class QuantileADC(ADC):
         return chosen & (mean > 0), large
 
     def forecast(self, refinement: Refinement) -> int:
+        # The opacity threshold is a quantile over all Gaussians after growth, so each child needs its own entry.
         grown = self.grown(refinement)
         index = torch.arange(len(grown.number), device=grown.number.device).repeat_interleave(grown.number)
-        gone = self.faint(grown.opacity_logits[index]) | self.huge(refinement.step, grown.log_scales)[index]
-        return len(index) - int(gone.sum())
+        pruned = self.faint(grown.opacity_logits[index]) | self.huge(refinement.step, grown.log_scales)[index]
+        return len(index) - int(pruned.sum())
 
     def faint(self, opacity_logits: Tensor) -> Tensor:
         if len(opacity_logits) == 0:

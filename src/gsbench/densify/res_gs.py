@@ -1,4 +1,4 @@
-"""ResGS: a Gaussian that grows stays, fainter, and gets a smaller child; thresholds follow a level."""
+"""ResGS: a growing Gaussian stays, becomes fainter and gets a smaller child; thresholds depend on its level."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -18,20 +18,22 @@ from gsbench.events import Cause
 from gsbench.raster.base import RenderOutput
 from gsbench.settings import OpenFraction, Switch
 
-GATHER_ROUNDS = 2  # before the window's start gradients are gathered: 200 iterations in the authors' code
+GATHER_ROUNDS = 2  # gradients are gathered from so many rounds before the window (200 iterations in the authors' code)
 
 
 @dataclass
 class ResGS(ADC):
-    """ADC whose candidates keep their place with ``parent_opacity`` times their opacity and get one child each.
+    """ADC with the residual split of Lyu et al. (ICCV 2025, arXiv 2412.07494).
 
-    Lyu et al. (ICCV 2025, arXiv 2412.07494): the child is drawn from the parent's density, is ``split_shrink`` smaller
-    and as opaque as the parent was, so that it adds what is missing to what the parent showed. Its level is the
-    parent's plus one. The window has stages; a Gaussian of level l in stage s > l grows at ``gradient_threshold`` times
-    ``level_factor``^(l - s), so that those behind catch up. The stages are ``stages_a_phase`` equal parts of each
-    phase of the window; phases end at ``phase_ends``, fractions of it, and for ``warm_up`` of the window after each end
-    nothing is gathered and nothing grows. From ``fade_start`` of the window on all opacities are multiplied by ``fade``
-    every ``fade_interval`` iterations, until ``fade_stop``. No opacity reset; pruned are the faint alone.
+    Each candidate stays, with its opacity multiplied by ``parent_opacity``, and gets one child. The child's mean is
+    drawn from the parent's density, its scales are divided by ``split_shrink``, its opacity is the parent's former one,
+    and its level is the parent's plus one. So the child adds the detail that the parent lacks.
+
+    The window has phases, which end at the fractions ``phase_ends`` of it, and each phase has ``stages_a_phase`` equal
+    stages. A Gaussian of level l grows in stage s > l at ``gradient_threshold`` times ``level_factor``^(l - s), so that
+    Gaussians of low levels catch up. For ``warm_up`` of the window after the end of a phase, no gradients are gathered
+    and nothing grows. From the fraction ``fade_start`` of the window until iteration ``fade_stop``, all opacities are
+    multiplied by ``fade`` every ``fade_interval`` iterations. There is no opacity reset, and no pruning by size.
     """
 
     STATISTICS: ClassVar[dict[str, torch.dtype]] = {"level": torch.int32}  # how many residual splits made a Gaussian
@@ -60,23 +62,24 @@ class ResGS(ADC):
             raise InputError(f"densify.phase_ends must rise, got {list(self.phase_ends)}")
 
     def iteration_at(self, fraction: float) -> int:
-        """The iteration of the round nearest to a ``fraction`` of the window."""
+        """The iteration of the round nearest to the given fraction of the window."""
         return self.start + round(fraction * (self.stop - self.start) / self.interval) * self.interval
 
     def warming_up(self, step: int) -> bool:
-        """Return whether a phase ended so shortly before that nothing is gathered yet."""
+        """Return whether ``step`` is in the pause after the end of a phase."""
         length = self.iteration_at(self.warm_up) - self.start
         return any(0 < step - self.iteration_at(end) < length for end in self.phase_ends)
 
     def stage(self, step: int) -> int:
-        """The stage of the round at ``step``: 1, 2, …"""
+        """The stage (1, 2, …) of the round at ``step``."""
         ends = [self.iteration_at(end) for end in self.phase_ends]
         phase = sum(step > end for end in ends)
         length = self.iteration_at(self.warm_up) - self.start
         begin = self.start if phase == 0 else ends[phase - 1] + length
-        part = max(((*ends, self.stop)[phase] - begin) // self.stages_a_phase, 1)
-        late = 1 if phase == 0 else -1  # when the authors' loop begins to count the iterations of a phase
-        done = max(0, (step - begin - late) // part)
+        stage_length = max(((*ends, self.stop)[phase] - begin) // self.stages_a_phase, 1)
+        # The authors' loop begins to count one iteration late in the first phase and one early in the others.
+        offset = 1 if phase == 0 else -1
+        done = max(0, (step - begin - offset) // stage_length)
         return self.stages_a_phase * phase + 1 + min(done, self.stages_a_phase)
 
     def observe(self, step: int, render: RenderOutput) -> None:
@@ -94,8 +97,8 @@ class ResGS(ADC):
 
     def candidates(self, refinement: Refinement) -> tuple[Tensor, Tensor]:
         _, large = super().candidates(refinement)
-        behind = (self.statistics["level"] - self.stage(refinement.step)).clamp_max(0)  # [N]
-        mean = self.mean_gradient() * self.level_factor ** -behind.to(torch.float64)  # held against the same threshold
+        behind = (self.stage(refinement.step) - self.statistics["level"]).clamp_min(0)  # [N] levels
+        mean = self.mean_gradient() * self.level_factor ** behind.to(torch.float64)  # instead of a lower threshold
         return self.reaches(mean, self.gradient_threshold), large
 
     def forecast(self, refinement: Refinement) -> int:
@@ -106,7 +109,7 @@ class ResGS(ADC):
         return int((~self.faint(parents)).sum()) + int(children.sum())
 
     def grow_by_gradient(self, refinement: Refinement) -> None:
-        """Give each candidate a child, and make it fainter."""
+        """Give each candidate a child, then make the candidate fainter."""
         gaussians, before = refinement.gaussians, len(refinement.gaussians)
         over, _ = self.candidates(refinement)
         selected, blocked = self.choose(refinement, over, 1)
@@ -128,16 +131,16 @@ class ResGS(ADC):
         gaussians.overwrite("opacity_logits", fainter, where=parents)
 
     def huge(self, step: int, log_scales: Tensor) -> Tensor:
-        """A mask [N] without any Gaussian: these authors do not prune by size."""
+        """An empty mask [N]: the authors do not prune by size."""
         return torch.zeros_like(log_scales[:, 0], dtype=torch.bool)
 
     def reset_statistics(self, refinement: Refinement) -> None:
-        """Gather anew; levels stay."""
+        """Set all statistics but the levels to zero."""
         levels = self.statistics["level"]
         super().reset_statistics(refinement)
         self.statistics["level"] = levels
 
     def fade_all(self, refinement: Refinement) -> None:
-        """Make everything a little fainter, so that what is not needed goes."""
+        """Multiply all opacities by ``fade``: Gaussians that are not needed become faint and are pruned."""
         logits = refinement.gaussians.values.opacity_logits.detach()
         refinement.gaussians.overwrite("opacity_logits", faded(logits, self.fade))

@@ -1,4 +1,4 @@
-"""Scores by which Gaussians are drawn for growth: sums over the pixels of training views, and the draw."""
+"""Scores of Gaussians, which are sums over the pixels of training views, and random draws by score."""
 
 from collections.abc import Callable, Sequence
 from typing import Protocol
@@ -9,12 +9,13 @@ from torch import Tensor
 from gsbench.gaussians.model import C0, Gaussians
 from gsbench.raster.base import RenderOutput
 
-LUMINANCE = (19595, 38470, 7471)  # 2^16 times ITU-R 601-2, as Pillow turns RGB into L
+# Pillow's conversion of RGB to L: the weights of ITU-R 601-2 times 2^16, then a rounding shift by 16 bits.
+LUMINANCE = (19595, 38470, 7471)
 HALF, SHIFT = 1 << 15, 16
 
 
 class TrainingViews(Protocol):
-    """The training views of a scene, for a densifier that looks at more of them than the one just rendered."""
+    """The training views of a scene, for densifiers that need more than the view just rendered."""
 
     def __len__(self) -> int: ...
 
@@ -23,22 +24,21 @@ class TrainingViews(Protocol):
         ...
 
     def render(self, index: int, gaussians: Gaussians, step: int) -> RenderOutput:
-        """A view as the training renders it at iteration ``step``."""
+        """Render a view as the training does at iteration ``step``."""
         ...
 
     def dissimilarity(self, index: int, image: Tensor) -> Tensor:
-        """The dissimilarity [H, W] of a rendered ``image`` [H, W, 3] and its view: max(0, 1 - SSIM), SSIM's mean over
-        channels.
-        """
+        """max(0, 1 - SSIM) of a rendered ``image`` [H, W, 3] and its photograph, [H, W]; SSIM is the mean over
+        channels."""
         ...
 
     def loss(self, index: int, image: Tensor) -> Tensor:
-        """The photometric loss of a rendered ``image`` [H, W, 3] of a view; a scalar."""
+        """The photometric loss of a rendered ``image`` [H, W, 3]; a scalar."""
         ...
 
 
 def draw_views(views: TrainingViews, count: int, rng: torch.Generator) -> list[int]:
-    """``count`` different views, or all where there are fewer."""
+    """Draw ``count`` different views, or all if there are fewer."""
     indices: list[int] = torch.randperm(len(views), generator=rng)[:count].tolist()
     return indices
 
@@ -46,10 +46,12 @@ def draw_views(views: TrainingViews, count: int, rng: torch.Generator) -> list[i
 def blended_sums(
     views: TrainingViews, index: int, gaussians: Gaussians, step: int, weights: Tensor
 ) -> tuple[Tensor, RenderOutput]:
-    """Sum over pixels of w alpha T, [N, 3], of each Gaussian for three weights [H, W, 3]; and the render that it is of.
+    """Return the sum over pixels of w alpha T for each Gaussian and three weights w [H, W, 3], as [N, 3]; and the
+    render of the view.
 
-    alpha T is the derivative of a pixel with respect to the colour of the Gaussian, so the sum is the gradient of
-    ``(image * weights).sum()`` with respect to it: any rasterizer gives it. Colours are set to grey, which none clamps.
+    alpha T is the derivative of a pixel with respect to the colour of the Gaussian. So the sum is the gradient of
+    ``(image * weights).sum()`` with respect to that colour, which any rasterizer computes. All colours are set to grey,
+    so that no rasterizer clamps them (a clamped colour has no gradient).
     """
     probe = Gaussians(**{name: tensor.detach() for name, tensor in gaussians.tensors().items()})
     probe.sh_dc = torch.zeros_like(probe.sh_dc, requires_grad=True)
@@ -61,22 +63,22 @@ def blended_sums(
 
 
 def edge_map(image: Tensor) -> Tensor:
-    """The strength of edges in ``image`` [H, W, 3] uint8: [H, W] float32, from 0 to 1 (or all 0).
+    """The strength of edges in ``image`` [H, W, 3] uint8: [H, W] float32 in [0, 1] (all 0 without edges).
 
-    Eight times the luminance of a pixel minus that of its eight neighbours, in 8 bits and clipped to them, then shifted
-    and scaled to [0, 1]: what Pillow calls FIND_EDGES, but for the outermost pixels, which are 0 here.
+    Eight times the luminance of a pixel minus the sum over its eight neighbours, clipped to 8 bits, then shifted and
+    scaled to [0, 1]. This is Pillow's FIND_EDGES, except that the outermost pixels are 0 here.
     """
     rgb = image.to(torch.int32)
-    level = (rgb[..., 0] * LUMINANCE[0] + rgb[..., 1] * LUMINANCE[1] + rgb[..., 2] * LUMINANCE[2] + HALF) >> SHIFT
-    edges = torch.zeros_like(level)
-    height, width = level.shape
-    around = sum(level[y : height - 2 + y, x : width - 2 + x] for y in range(3) for x in range(3))
-    edges[1:-1, 1:-1] = (9 * level[1:-1, 1:-1] - around).clamp(0, 255)
+    luma = (rgb[..., 0] * LUMINANCE[0] + rgb[..., 1] * LUMINANCE[1] + rgb[..., 2] * LUMINANCE[2] + HALF) >> SHIFT
+    edges = torch.zeros_like(luma)
+    height, width = luma.shape
+    block = sum(luma[y : height - 2 + y, x : width - 2 + x] for y in range(3) for x in range(3))  # 3 x 3 pixels
+    edges[1:-1, 1:-1] = (9 * luma[1:-1, 1:-1] - block).clamp(0, 255)
     return to_unit_range(edges.float())
 
 
 def error_map(image: Tensor, photograph: Tensor) -> Tensor:
-    """The mean absolute error of ``image`` [H, W, 3] over the channels, [H, W], shifted and scaled to [0, 1].
+    """The absolute error of ``image`` [H, W, 3], mean over channels, [H, W], shifted and scaled to [0, 1].
 
     ``photograph`` is [H, W, 3] uint8.
     """
@@ -84,26 +86,26 @@ def error_map(image: Tensor, photograph: Tensor) -> Tensor:
 
 
 def to_unit_range(values: Tensor) -> Tensor:
-    """``values`` shifted and scaled to [0, 1]; 0 where all are equal."""
+    """``values`` shifted and scaled to [0, 1]; all 0 if they are equal."""
     low, high = values.amin(), values.amax()
     return (values - low) / (high - low).clamp_min(torch.finfo(values.dtype).tiny)
 
 
 def by_median(values: Tensor) -> Tensor:
-    """``values`` [N] over the median of the positive ones (the lower of two); what is not positive becomes 0."""
-    return _over(values, torch.median)
+    """``values`` [N] divided by the (lower) median of the positive ones; values that are not positive become 0."""
+    return _normalized(values, torch.median)
 
 
 def by_mean(values: Tensor) -> Tensor:
-    """``values`` [N] over the mean of the positive ones; what is not positive becomes 0."""
-    return _over(values, torch.mean)
+    """``values`` [N] divided by the mean of the positive ones; values that are not positive become 0."""
+    return _normalized(values, torch.mean)
 
 
-def _over(values: Tensor, middle: Callable[[Tensor], Tensor]) -> Tensor:
-    positive = values > 0  # NaN is not
+def _normalized(values: Tensor, average: Callable[[Tensor], Tensor]) -> Tensor:
+    positive = values > 0  # False for NaN
     if not positive.any():
         return torch.zeros_like(values)
-    return torch.where(positive, values / middle(values[positive]), 0.0)
+    return torch.where(positive, values / average(values[positive]), 0.0)
 
 
 def edge_scores(
@@ -113,8 +115,10 @@ def edge_scores(
     step: int,
     normalize: Callable[[Tensor], Tensor],
 ) -> Tensor:
-    """The share of the photographs' edges that each Gaussian covers, [N]: the mean over the ``chosen`` views of sum
-    over pixels of (edge strength) alpha T, each view's after ``normalize``.
+    """How much of the photographs' edges each Gaussian covers, [N].
+
+    In a view it is the sum over pixels of (edge strength) alpha T, passed through ``normalize``; the result is the
+    mean over the views ``chosen``.
     """
     total = torch.zeros_like(gaussians.opacity_logits)
     for index in chosen:
@@ -125,14 +129,14 @@ def edge_scores(
 
 
 def draw(candidates: Tensor, scores: Tensor, count: int, rng: torch.Generator) -> Tensor:
-    """Mask [N] of ``count`` of the ``candidates`` [N], or of all, if there are fewer: drawn without replacement in
-    proportion to their ``scores`` [N]; those without a score come last, in order.
+    """Draw ``count`` of the ``candidates`` [N] (all, if there are fewer), as a mask [N].
 
-    Efraimidis and Spirakis 2006: the smallest of e / score, with e ~ Exp(1). Drawn on the CPU, so that a seed means the
-    same anywhere.
+    The draw is without replacement, in proportion to ``scores`` [N]. Candidates with score 0 come last, in order of
+    index. Method: Efraimidis and Spirakis 2006, the smallest values of e / score with e ~ Exp(1). Random numbers are
+    drawn on the CPU, so a seed gives the same draw on every device.
     """
     index = candidates.nonzero().squeeze(-1).cpu()  # [C]
-    waits = torch.empty(len(index), dtype=torch.float64).exponential_(generator=rng) / scores.detach().cpu()[index]
+    keys = torch.empty(len(index), dtype=torch.float64).exponential_(generator=rng) / scores.detach().cpu()[index]
     drawn = torch.zeros(len(candidates), dtype=torch.bool)
-    drawn[index[torch.sort(waits, stable=True).indices[: max(count, 0)]]] = True
+    drawn[index[torch.sort(keys, stable=True).indices[: max(count, 0)]]] = True
     return drawn.to(candidates.device)

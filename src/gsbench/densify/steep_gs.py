@@ -1,4 +1,4 @@
-"""SteepGS: Gaussians at a saddle of the loss are split along the direction in which a split lowers it most."""
+"""SteepGS: Gaussians at saddle points of the loss are split along the direction that lowers it most."""
 
 import math
 from collections.abc import Mapping
@@ -20,12 +20,12 @@ from gsbench.settings import Switch
 
 
 class Saddles(NamedTuple):
-    """Candidates by rising index, with what `SteepGS.steepest` says of them."""
+    """Candidates for growth, with the result of `SteepGS.steepest`."""
 
-    indices: Tensor  # [C]
-    values: Tensor  # [C]
-    directions: Tensor  # [C, 3]
-    large: Tensor  # mask [N], of all
+    indices: Tensor  # [C], rising
+    values: Tensor  # [C], least eigenvalues
+    directions: Tensor  # [C, 3], their eigenvectors
+    large: Tensor  # mask [N] of all large Gaussians
 
     def mask(self) -> Tensor:
         """Mask [N] of the candidates."""
@@ -36,19 +36,19 @@ class Saddles(NamedTuple):
 
 @dataclass
 class SteepGS(ADC):
-    """ADC of the candidates that a split would help, into halves that go apart where it helps (Wang et al., CVPR 2025).
+    """ADC that splits a candidate only where a split lowers the loss (Wang et al., CVPR 2025, arXiv 2505.05587).
 
-    Of arXiv 2505.05587: to second order, two halves that a Gaussian leaves at small distances +-d change the loss by d
-    S d / 2, with S the splitting matrix: the sum over pixels of (d loss / d s) times the second derivative of s, the
-    opacity times the density there, by the mean. So only a Gaussian whose S has an eigenvalue below zero gains by a
-    split, most along the eigenvector of the least one; and of all weights of two halves a half each is the best.
+    Replace a Gaussian by two halves at small offsets +-d. To second order the loss changes by d S d / 2, where S is the
+    splitting matrix: the sum over pixels of (d loss / d s) times the second derivative of s by the mean, with s the
+    opacity times the density at the pixel. So a split lowers the loss only if S has a negative eigenvalue, and most
+    along the eigenvector of the least eigenvalue. Halves of equal weight are best.
 
     A candidate of ADC grows only if the least eigenvalue of its S, averaged over the iterations in which it was
-    visible, is below ``eigenvalue_threshold``, in units of the loss by the squared scene extent (None: no condition).
-    All become two of ``opacity_factor`` times the opacity on either side along the eigenvector: the large of scales
-    divided by ``split_shrink``, each at the length of a draw from the parent's density; the small as large as before,
-    at the present step of Adam on the means. The parent goes. Under a budget those of the least eigenvalues come first.
-    ``split_children`` and ``revised_opacity`` have no meaning here.
+    visible, is below ``eigenvalue_threshold``, in units of the loss per squared scene extent (None: no condition). Two
+    children replace it, on either side along the eigenvector, with ``opacity_factor`` times its opacity. If it is
+    large, their scales are divided by ``split_shrink``, and each offset has the length of a draw from the parent's
+    density. If it is small, their scales are the parent's, and the offset is the present learning rate of the means.
+    Under a cap, the least eigenvalues come first. ``split_children`` and ``revised_opacity`` have no effect.
     """
 
     STATISTICS: ClassVar[Mapping[str, torch.dtype | Statistic]] = {
@@ -71,8 +71,11 @@ class SteepGS(ADC):
             self.statistics["splitting_sum"] += render.require_splitting_matrix()
 
     def steepest(self, index: Tensor) -> tuple[Tensor, Tensor]:
-        """The least eigenvalue [S] of the mean splitting matrix of those at ``index`` [S], of the loss by the squared
-        extent, and its eigenvector [S, 3], whose largest component is positive."""
+        """The least eigenvalue [S] of the mean splitting matrix of the Gaussians at ``index`` [S], and its eigenvector
+        [S, 3].
+
+        Eigenvalues are in units of the loss per squared extent. The largest component of each eigenvector is positive.
+        """
         seen = self.statistics["visible_count"][index].clamp_min(1)  # [S]
         mean = self.statistics["splitting_sum"][index].double() / seen[:, None, None]  # [S, 3, 3]
         values, vectors = torch.linalg.eigh(mean)  # in rising order
@@ -81,13 +84,13 @@ class SteepGS(ADC):
         return values[:, 0] * self.context.extent**2, least * largest.sign()
 
     def saddles(self, refinement: Refinement) -> Saddles:
-        """The candidates of ADC that a split would help."""
+        """The candidates of ADC whose split lowers the loss."""
         over, large = super().candidates(refinement)
         index = over.nonzero().squeeze(-1)  # [C]
         values, directions = self.steepest(index)
         if self.eigenvalue_threshold is not None:
-            helped = values < self.eigenvalue_threshold
-            index, values, directions = index[helped], values[helped], directions[helped]
+            lowering = values < self.eigenvalue_threshold
+            index, values, directions = index[lowering], values[lowering], directions[lowering]
         return Saddles(index, values, directions, large)
 
     def candidates(self, refinement: Refinement) -> tuple[Tensor, Tensor]:
@@ -104,22 +107,22 @@ class SteepGS(ADC):
         )
 
     def grow_by_gradient(self, refinement: Refinement) -> None:
-        """Put two halves in the place of each candidate."""
+        """Replace each candidate by two halves."""
         gaussians = refinement.gaussians
         saddles = self.saddles(refinement)
-        gained = torch.zeros(len(gaussians), dtype=torch.float64, device=gaussians.device)
-        gained[saddles.indices] = -saddles.values
-        selected, blocked = admit(saddles.mask(), gained, 1, self.allowance(refinement))
-        parents = selected.nonzero().squeeze(-1)  # [S]
-        chosen, is_large = gaussians.values.detach().select(parents), saddles.large[parents].unsqueeze(-1)
-        direction = saddles.directions[selected[saddles.indices]].to(chosen.means)  # [S, 3]
-        noise = standard_normal((2 * len(parents), 3), refinement.rng, chosen.means)
-        lengths = (noise * chosen.scales.repeat(2, 1)).norm(dim=-1, keepdim=True)  # [2 S, 1]
+        gains = torch.zeros(len(gaussians), dtype=torch.float64, device=gaussians.device)
+        gains[saddles.indices] = -saddles.values
+        selected, blocked = admit(saddles.mask(), gains, 1, self.allowance(refinement))
+        indices = selected.nonzero().squeeze(-1)  # [S]
+        parents, is_large = gaussians.values.detach().select(indices), saddles.large[indices].unsqueeze(-1)
+        direction = saddles.directions[selected[saddles.indices]].to(parents.means)  # [S, 3]
+        noise = standard_normal((2 * len(parents), 3), refinement.rng, parents.means)
+        lengths = (noise * parents.scales.repeat(2, 1)).norm(dim=-1, keepdim=True)  # [2 S, 1]
         lengths = torch.where(is_large.repeat(2, 1), lengths, gaussians.position_rate)
-        children = Gaussians.concatenate([chosen, chosen])
+        children = Gaussians.concatenate([parents, parents])
         children.means = children.means + lengths * torch.cat([direction, -direction])
         children.log_scales = children.log_scales - math.log(self.split_shrink) * is_large.repeat(2, 1)
         children.opacity_logits = faded(children.opacity_logits, self.opacity_factor)
-        self.edit(refinement, ~selected, children, parents.repeat(2), Cause.SPLIT_GRADIENT)
+        self.edit(refinement, ~selected, children, indices.repeat(2), Cause.SPLIT_GRADIENT)
         refinement.event.split_gradient += len(parents)
         refinement.event.blocked_by_cap += blocked

@@ -1,4 +1,4 @@
-"""Taming 3DGS: a budget that is spent on Gaussians drawn by a score of many terms."""
+"""Taming 3DGS: a budget of Gaussians, spent on candidates drawn by a score of many terms."""
 
 from dataclasses import dataclass
 from typing import ClassVar, Literal
@@ -12,22 +12,24 @@ from gsbench.densify.base import Refinement, Rule
 from gsbench.densify.scores import blended_sums, by_median, draw, draw_views, edge_map, error_map
 from gsbench.gaussians.model import Gaussians
 
-LEAST_SCORE = 1e-6  # keeps the inverse finite by which the faint are drawn for pruning (the authors' code)
+MIN_SCORE = 1e-6  # keeps 1 / score finite, by which Gaussians are drawn for pruning (from the authors' code)
 
 
 @dataclass
 class Taming(ADC):
-    """ADC whose candidates are drawn by score, up to a budget, after Mallick et al. (arXiv 2406.15643).
+    """ADC whose candidates are drawn by score, up to a budget (Mallick et al., arXiv 2406.15643).
 
-    In each round, the score of a Gaussian is a sum over ``score_views`` training views, drawn anew, that see it: the
-    loss of the view times a weighted sum of what is listed below, each over its median. A pixel's value is
-    ``weight_error`` times its L1 error plus ``weight_edge`` times its edge strength, both from 0 to 1. The budget of
-    the round, up to the count that ``cap=curve`` allows (their eq. 2), is shared between clones and splits as
-    candidates are, and drawn without replacement in proportion to the score. Of those to prune, half as many as there
-    are are drawn from all in inverse proportion to the score, and only they go; in the first ``prune_rounds`` rounds.
+    Each round draws ``score_views`` training views. A view that sees a Gaussian adds to its score the loss of the view
+    times a weighted sum of the terms below (``weight_…``), each divided by its median. A pixel's value, which some
+    terms use, is ``weight_error`` times its L1 error plus ``weight_edge`` times its edge strength, both in [0, 1].
+
+    A round may grow to the count that ``cap=curve`` allows (eq. 2 of the paper). This budget is divided between clones
+    and splits in proportion to the numbers of their candidates, which are drawn without replacement in proportion to
+    the score. In the first ``prune_rounds`` rounds, if n Gaussians are faint or huge, n / 2 are drawn from all
+    Gaussians in inverse proportion to the score; faint and huge Gaussians are pruned only if drawn.
     """
 
-    STATISTICS: ClassVar[dict[str, torch.dtype]] = {"score": torch.float32}  # within a round; 0 for the new
+    STATISTICS: ClassVar[dict[str, torch.dtype]] = {"score": torch.float32}  # of this round; 0 for new Gaussians
     needs_footprint = True
 
     max_gaussians: PositiveInt = 1_000_000
@@ -38,31 +40,31 @@ class Taming(ADC):
     weight_opacity: NonNegativeFloat = 100.0
     weight_depth: NonNegativeFloat = 5.0  # view z
     weight_radius: NonNegativeFloat = 10.0  # px
-    weight_scale: NonNegativeFloat = 25.0  # product of the three
-    weight_distance: NonNegativeFloat = 50.0  # sum over its pixels of the distance to its mean
+    weight_scale: NonNegativeFloat = 25.0  # product of the three scales
+    weight_distance: NonNegativeFloat = 50.0  # sum over the Gaussian's pixels of their distance to its mean
     weight_values: NonNegativeFloat = 10.0  # sum over its pixels of their values
-    weight_pixels: NonNegativeFloat = 0.1  # their number
-    weight_blending: NonNegativeFloat = 50.0  # sum over them of alpha T
-    weight_error: NonNegativeFloat = 50.0  # of a pixel's value
-    weight_edge: NonNegativeFloat = 50.0
+    weight_pixels: NonNegativeFloat = 0.1  # number of its pixels
+    weight_blending: NonNegativeFloat = 50.0  # sum over its pixels of alpha T
+    weight_error: NonNegativeFloat = 50.0  # of the L1 error in a pixel's value
+    weight_edge: NonNegativeFloat = 50.0  # of the edge strength in a pixel's value
 
     def rules(self, refinement: Refinement) -> list[Rule]:
-        """The rules of ADC, and before growth the scores."""
+        """The rules of ADC, with scores before growth."""
         rules = super().rules(refinement)
         if self.grow_by_gradient in rules:
             rules.insert(rules.index(self.grow_by_gradient), self.score)
         return rules
 
     def score(self, refinement: Refinement) -> None:
-        """The rule that gives every Gaussian a score, which follows what the round does."""
+        """Compute the score of every Gaussian; edits of the round keep it with its Gaussian."""
         values, rng = refinement.gaussians.values, refinement.rng
         views, total = self.context.training_views, torch.zeros_like(values.opacity_logits)
         for index in draw_views(views, self.score_views, rng):
             total += self.score_in(index, values, refinement.step)
-        self.statistics["score"] = (total + LEAST_SCORE).float()
+        self.statistics["score"] = (total + MIN_SCORE).float()
 
     def score_in(self, index: int, gaussians: Gaussians, step: int) -> Tensor:
-        """The score [N] that one view adds."""
+        """The score [N] that the view at ``index`` adds."""
         views = self.context.training_views
         photograph = views.image(index)
         image = views.render(index, gaussians, step).image
@@ -87,7 +89,7 @@ class Taming(ADC):
     def choose(self, refinement: Refinement, candidates: Tensor, gain: int) -> tuple[Tensor, int]:
         _, large = self.candidates(refinement)
         count, allowed = int(candidates.sum()), self.allowance(refinement)
-        assert allowed is not None  # no cap of this class is without a limit
+        assert allowed is not None  # every cap of this class has a limit
         places = min(allowed // gain, count)
         drawn = torch.zeros_like(candidates)
         for kind in (candidates & ~large, candidates & large):
@@ -96,7 +98,7 @@ class Taming(ADC):
         return drawn, count - int(drawn.sum())
 
     def prune(self, refinement: Refinement) -> None:
-        """Remove some of the faint and, after the first opacity reset, of the huge: more likely those of low score."""
+        """Remove some of the faint and huge Gaussians, more likely those with low scores."""
         if refinement.step // self.interval - self.start // self.interval > self.prune_rounds:
             return
         values, score = refinement.gaussians.values, self.statistics["score"]

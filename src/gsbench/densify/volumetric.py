@@ -1,7 +1,7 @@
-"""The paper's rule: besides the gradient rule, split Gaussians whose volume is too large.
+"""The volume rule of arXiv 2508.05187: ADC that also splits Gaussians whose volume is too large.
 
-Every question that the paper leaves open is an option; the defaults are its equations where they speak and the ADC
-split, which the rule extends, where they do not. Volumes and condition numbers are computed in log space.
+Questions that the paper leaves open are options. Their defaults follow the paper's equations or, where these say
+nothing, the split of ADC. Volumes and condition numbers are computed in log space.
 """
 
 import math
@@ -14,7 +14,7 @@ from annotated_types import Ge, Interval
 from pydantic import NonNegativeInt, PositiveFloat, PositiveInt
 from torch import Tensor
 
-from gsbench.densify.adc import ADC, MOST_CHILDREN, Grown
+from gsbench.densify.adc import ADC, MAX_CHILDREN, Grown
 from gsbench.densify.base import Refinement, Rule
 from gsbench.densify.budget import admit
 from gsbench.densify.operations import quantile
@@ -43,11 +43,11 @@ def child_log_scales(
     max_condition: float | None = None,
     plain_shrink: float = 1.6,
 ) -> Tensor:
-    """Scales of the children (eq. 7), [N, 3].
+    """Log scales of children (eq. 7), [N, 3], given those of their parents.
 
     ``eigenvalues``: lambda' = lambda / kappa, so log s' = log s - log(kappa) / 2. ``scales``: s' = s / kappa.
-    ``nothing``: s' = s / ``plain_shrink``, as ADC splits, in place of eq. 7. ``max_condition`` (at least 1) limits the
-    kappa that is divided by.
+    ``nothing``: s' = s / ``plain_shrink``, as in ADC, instead of eq. 7. ``max_condition`` (at least 1) limits kappa in
+    these divisions.
     """
     if applied_to == "nothing":
         return log_scales - math.log(plain_shrink)
@@ -60,21 +60,25 @@ def child_log_scales(
 
 ThresholdMode = Literal["absolute", "extent_relative", "quantile", "auto"]
 TUKEY_FENCE = 1.5  # interquartile ranges above the third quartile (Tukey 1977)
-VANISHING_SIZE = 1e-4  # of the extent: a tenth of a pixel at a distance of one extent with a focal length of 1000 px
+VANISHING_SIZE = 1e-4  # of the extent: 0.1 px at a distance of one extent with a focal length of 1000 px
 
 
 @dataclass
 class Volumetric(ADC):
     """ADC, then a split of every Gaussian with V > V_th (eq. 5 to 7, Fig. 4), then the pruning of ADC.
 
-    ``threshold_mode`` says what ``volume_threshold`` is: ``absolute``, in the units of the COLMAP model, cubed (the
-    paper); ``extent_relative``, a fraction of the scene extent cubed; ``quantile`` ignores it and splits what lies
-    above the ``volume_quantile`` of all volumes; ``auto`` ignores both and takes the upper Tukey fence of log V (third
-    quartile plus 1.5 interquartile ranges), which follows the scene's own histogram in any gauge and selects little
-    where no volume stands out. ``volume_start``, ``volume_stop`` and ``volume_interval`` default to those of ADC.
+    ``threshold_mode`` determines V_th:
 
-    Under ``cap=governor`` one factor moves the gradient's threshold and V_th. ``governor_dimension`` says what of V_th
-    it multiplies: 3, the size of which V_th is the cube; 1, V_th itself, so that sizes move by the factor's cube root.
+    - ``absolute``: ``volume_threshold``, in cubed units of the COLMAP model (the paper);
+    - ``extent_relative``: ``volume_threshold`` times the cubed scene extent;
+    - ``quantile``: the ``volume_quantile`` of all volumes;
+    - ``auto``: the upper Tukey fence of log V, which is the third quartile plus 1.5 interquartile ranges. It adapts to
+      the scene in any gauge, and selects few Gaussians if no volume stands out.
+
+    ``volume_start``, ``volume_stop`` and ``volume_interval`` default to those of ADC.
+
+    ``cap=governor`` multiplies the gradient threshold by one factor, and V_th by that factor to the power
+    ``governor_dimension``. With 3 the factor acts on a size, whose cube is V_th. With 1 it acts on V_th itself.
     """
 
     SWITCHES: ClassVar[Mapping[str, Switch]] = {
@@ -90,10 +94,10 @@ class Volumetric(ADC):
     volume_threshold: PositiveFloat = VOLUME_THRESHOLD
     threshold_mode: ThresholdMode = "absolute"
     volume_quantile: OpenFraction = 0.9978  # 99.78 % of the volumes of Mip-NeRF 360 lie below 0.03
-    condition_of: ConditionOf = "eigenvalues"  # what kappa divides: these (eq. 7), scales, or nothing (ADC's shrink)
+    condition_of: ConditionOf = "eigenvalues"  # kappa divides eigenvalues (eq. 7) or scales; nothing: as ADC
     max_condition: Annotated[float, Ge(1)] | None = None  # limits kappa, so that children of needles do not vanish
-    split_isotropic: bool = True  # False: leave those whose children would be above the threshold again
-    volume_children: Annotated[int, Interval(ge=2, le=MOST_CHILDREN)] = 2
+    split_isotropic: bool = True  # False: do not split a Gaussian whose children would be above the threshold again
+    volume_children: Annotated[int, Interval(ge=2, le=MAX_CHILDREN)] = 2
     keep_parent: bool = False
     placement: Literal["sampled", "parent_mean"] = "sampled"
     volume_order: Literal["after_adc", "before_adc", "after_prune"] = "after_adc"
@@ -111,16 +115,16 @@ class Volumetric(ADC):
             )
 
     def rules(self, refinement: Refinement) -> list[Rule]:
-        """The rules of ADC, and the split by volume at the place that ``volume_order`` says."""
+        """The rules of ADC, with the split by volume inserted according to ``volume_order``."""
         rules = super().rules(refinement)
         if self.volume_due(refinement.step):
-            follower = {
+            next_rule = {
                 "before_adc": self.grow_by_gradient,
                 "after_adc": self.prune,
                 "after_prune": self.reset_statistics,
             }[self.volume_order]
-            if follower in rules:  # a round that is not frozen
-                rules.insert(rules.index(follower), self.split_by_volume)
+            if next_rule in rules:  # a frozen round has none of them
+                rules.insert(rules.index(next_rule), self.split_by_volume)
         return rules
 
     def volume_due(self, step: int) -> bool:
@@ -130,15 +134,15 @@ class Volumetric(ADC):
         return start < step < stop and step % (self.volume_interval or self.interval) == 0
 
     def child_log_scales(self, log_scales: Tensor) -> Tensor:
-        """Scales [N, 3] of the children of Gaussians with scales [N, 3] that are split by volume."""
+        """Log scales [N, 3] of children, given those of parents that are split by volume."""
         return child_log_scales(log_scales, self.condition_of, self.max_condition, self.split_shrink)
 
     @property
     def volume_gain(self) -> int:
-        """The number of Gaussians that a split by volume adds."""
+        """The number of Gaussians that one split by volume adds."""
         return self.volume_children - (0 if self.keep_parent else 1)
 
-    def voluminous(self, log_scales: Tensor) -> Tensor:
+    def selected_by_volume(self, log_scales: Tensor) -> Tensor:
         """Mask [N] of the Gaussians to split by volume."""
         volumes = log_volume(log_scales)
         threshold = self.log_threshold(volumes)
@@ -148,18 +152,19 @@ class Volumetric(ADC):
         return (volumes > threshold) & (children <= threshold)
 
     def grown(self, refinement: Refinement) -> Grown:
-        """The outcome of growth if all parents were replaced."""
+        """What each Gaussian would become if the cap admitted all candidates of both rules."""
         grown = super().grown(refinement)
         if not self.volume_due(refinement.step):
             return grown
         number, log_scales = grown.number, grown.log_scales
-        if self.volume_order == "before_adc":  # the gradient rule knows nothing of the children
-            own = refinement.gaussians.values.log_scales
-            large = self.voluminous(own)
-            number, log_scales = torch.where(large, 1, number), torch.where(large.unsqueeze(-1), own, log_scales)
+        if self.volume_order == "before_adc":  # children of the volume rule have no gradients, so they do not grow
+            before = refinement.gaussians.values.log_scales
+            large = self.selected_by_volume(before)
+            number, log_scales = torch.where(large, 1, number), torch.where(large.unsqueeze(-1), before, log_scales)
         else:
-            large = self.voluminous(log_scales)
+            large = self.selected_by_volume(log_scales)
         number = torch.where(large, (1 + self.volume_gain) * number, number)
+        # After pruning, the forecast of pruning must still see the parents' scales.
         if self.volume_order != "after_prune":
             children = self.child_log_scales(log_scales)
             log_scales = torch.where(large.unsqueeze(-1), children, log_scales)
@@ -172,12 +177,14 @@ class Volumetric(ADC):
         volumes = log_volume(log_scales)  # [N]
         threshold = self.log_threshold(volumes)
         children = self.child_log_scales(log_scales)  # [N, 3]
-        again = log_volume(children) > threshold  # [N] children that the next round would select too
-        selected, blocked = admit(self.voluminous(log_scales), volumes, self.volume_gain, self.allowance(refinement))
+        candidates = self.selected_by_volume(log_scales)
+        selected, blocked = admit(candidates, volumes, self.volume_gain, self.allowance(refinement))
+        split_again = log_volume(children) > threshold  # [N] the next round would select the children, too
+        vanishing = children.amax(-1) < math.log(VANISHING_SIZE * self.context.extent)  # [N]
         event.volume_threshold = math.exp(threshold)
         event.blocked_by_cap += blocked
-        event.isotropic_resplit += int((selected & again).sum())
-        event.vanished += int((selected & (children.amax(-1) < math.log(VANISHING_SIZE * self.context.extent))).sum())
+        event.isotropic_resplit += int((selected & split_again).sum())
+        event.vanished += int((selected & vanishing).sum())
         event.split_volume += self.split(
             refinement,
             selected,
@@ -189,10 +196,10 @@ class Volumetric(ADC):
         )
 
     def log_threshold(self, volumes: Tensor) -> float:
-        """log V_th for Gaussians with log volumes [N], by ``threshold_mode``, times a power of ``strictness``."""
-        return self._own_log_threshold(volumes) + self.governor_dimension * math.log(self.strictness)
+        """log V_th for Gaussians with log volumes [N], ``strictness`` of the governor included."""
+        return self._ungoverned_log_threshold(volumes) + self.governor_dimension * math.log(self.strictness)
 
-    def _own_log_threshold(self, volumes: Tensor) -> float:
+    def _ungoverned_log_threshold(self, volumes: Tensor) -> float:
         if self.threshold_mode == "absolute":
             return math.log(self.volume_threshold)
         if self.threshold_mode == "extent_relative":
