@@ -326,6 +326,7 @@ def test_a_sweep_in_looks_has_one_verdict_and_it_is_that_of_the_looks(tmp_path: 
     assert one.role(one.verdicts[0]) == "declared"
     assert one.verdicts[0].outcome == "supported"
     assert one.verdicts[0].p is None
+    assert any("look" in line for line in families([one]))
     page = build_report(experiment)
     assert "Seeds come in planned looks" in page
     assert page.count("better in LPIPS VGG raw") == 1

@@ -12,7 +12,9 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from gsbench.init.base import PoseErrors
+from gsbench.init import Sfm
+from gsbench.init.base import PoseErrors, Preparation, Timer
+from gsbench.init.colmap.job import Job, _finish
 from gsbench.init.colmap.reconstruct import similarity_to
 from gsbench.init.report import (
     compare_poses,
@@ -151,6 +153,21 @@ def test_pose_errors_after_a_similarity():
     errors = compare_poses(tilted, reference, similarity_to(tilted, reference), 2.0, exact=False)
     assert errors.rotation_mean_deg == pytest.approx(4.0)
     assert errors.center_max < 1e-9
+
+
+def test_where_two_cameras_are_common_nothing_is_compared_and_that_is_said(capture: Capture, tmp_path: Path) -> None:
+    """Three at least fix a similarity."""
+    model, reference = model_of(CENTERS), model_of(CENTERS)
+    for image_id in (3, 4):
+        reference.deregister_frame(reference.images[image_id].frame_id)
+    work = Job(Sfm(), capture, tmp_path / "out", tmp_path / "work", None, Preparation())
+    similarity = similarity_to(model, reference)
+    report = _finish(work, "own", model, reference, similarity, Timer({}), {})
+    assert report.pose_errors is None
+    (warning,) = [line for line in report.warnings if "common cameras" in line]
+    assert _finish(work, "own", model, None, None, Timer({}), {}).warnings == tuple(
+        line for line in report.warnings if line != warning
+    )
 
 
 def test_center_errors_are_in_reference_units_and_relative():

@@ -113,8 +113,12 @@ def test_departures_are_told() -> None:
         def render(self, *arguments, **options):  # type: ignore[no-untyped-def]
             raise RuntimeError("no kernel")
 
+    class Plain(ReferenceRasterizer):
+        name = "plain"  # and no offers
+
     case = CASES[-1]
     assert departures(ReferenceRasterizer(), cases=(case,)) == []
+    assert departures(Plain(), cases=(case,)) == []
     told = departures(Wrong(), cases=(case,))
     assert any("image is off" in line for line in told)
     assert any("radii differ for 20 of 20" in line for line in told)

@@ -190,6 +190,15 @@ def test_spherical_harmonics_match_gsplat() -> None:
         torch.testing.assert_close(ours, (theirs + 0.5).clamp_min(0))
 
 
+def test_the_pixel_at_a_mean_has_the_whole_opacity() -> None:
+    camera = Camera(40, 30, 36.0, 36.0, 20.5, 15.5, np.eye(3), np.zeros(3))  # pixel centres lie at halves
+    one = random_gaussians(1)
+    one.means[0] = torch.tensor([0.0, 0.0, 4.0])
+    out = ReferenceRasterizer().render(one, camera, 0, torch.zeros(3, dtype=torch.float64))
+    assert float(out.alpha[15, 20]) == pytest.approx(float(one.opacity_logits.sigmoid()))
+    assert out.alpha[15, 20] == out.alpha.max()
+
+
 def test_nothing_visible_gives_the_background() -> None:
     gaussians = random_gaussians(5)
     gaussians.means[:, 2] = -5.0
