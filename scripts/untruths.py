@@ -143,7 +143,7 @@ def _claim(kind: Kind, effect: float, rng: np.random.Generator) -> tuple[Verdict
     if kind.looks:
         return judgement._at_looks(asked, kind.looks, RATE / kind.claims), truth
     (answer,) = answer_family([pairs.differences], RATE / kind.claims)
-    return judgement._answered(asked, answer), truth
+    return judgement._decide(asked, answer), truth
 
 
 def scene_pairs(place: int, noise: Array, effect: float) -> ScenePairs:

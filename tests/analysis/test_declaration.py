@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gsbench.analysis.declaration import standing
+from gsbench.analysis.declaration import active_declaration
 from gsbench.analysis.judgement import Verdict
 from gsbench.analysis.pairing import choose_pairs
 from gsbench.analysis.report.build import build_report
@@ -40,7 +40,7 @@ def declared_experiment(runs: Path, *records: tuple[str, str], **plan: object) -
 def judged(experiment: Experiment) -> list[PairVerdicts]:
     trials = experiment.trials
     pairs = choose_pairs(sorted({trial.arm for trial in trials}))
-    return judge_pairs(trials, pairs, standing(experiment.folder, trials))
+    return judge_pairs(trials, pairs, active_declaration(experiment.folder, trials))
 
 
 # --- families
@@ -160,7 +160,7 @@ def test_a_declaration_after_results_is_said_and_gives_no_place_of_its_own(tmp_p
 
 def test_a_declaration_that_took_the_place_of_another_is_said(tmp_path: Path) -> None:
     experiment = declared_experiment(tmp_path, ("psnr", EARLY), ("flip", LATE))
-    found = standing(experiment.folder, experiment.trials)
+    found = active_declaration(experiment.folder, experiment.trials)
     assert found is not None
     assert found.metric == "flip"
     assert any("Declared before it: psnr (2020-01-01 00:00 UTC)." in line for line in found.sentences("FLIP"))
@@ -178,7 +178,7 @@ def test_what_was_measured_before_counts_also_where_results_were_written_later(t
         (path / "results.json").write_text(json.dumps(data))
         os.utime(path / "results.json", (after, after))
     experiment = load_experiment(tmp_path, "exp")
-    found = standing(experiment.folder, experiment.trials)
+    found = active_declaration(experiment.folder, experiment.trials)
     assert found is not None
     assert {trial.path for trial in found.seen} == set(paths[:2])
     assert not found.beforehand
@@ -210,12 +210,12 @@ def planned(seeds: list[int], arms: tuple[str, ...] = ("adc", "volumetric")) -> 
 def test_declared_trials_keep_the_metrics_place(tmp_path: Path) -> None:
     experiment = declared_experiment(tmp_path, effect=CLEAR)
     declare_trials(tmp_path, (EARLY, planned([0, 1, 2])))
-    found = standing(experiment.folder, experiment.trials)
+    found = active_declaration(experiment.folder, experiment.trials)
     assert found is not None
     assert found.beforehand
     assert len(found.sentences("LPIPS")) == 1
     declare_trials(tmp_path, (EARLY, planned([0])), ("2020-01-02T00:00:00Z", planned([0, 1, 2])))
-    found = standing(experiment.folder, experiment.trials)  # added while no result was there
+    found = active_declaration(experiment.folder, experiment.trials)  # added while no result was there
     assert found is not None
     assert found.beforehand
     assert found.declaration.when == "2020-01-01 00:00 UTC"
@@ -266,7 +266,7 @@ def test_the_report_says_that_trials_were_added(tmp_path: Path) -> None:
 def test_declared_trials_that_are_missing_are_said(tmp_path: Path) -> None:
     experiment = declared_experiment(tmp_path, effect=CLEAR)
     declare_trials(tmp_path, (EARLY, planned([0, 1, 2, 3])))
-    found = standing(experiment.folder, experiment.trials)
+    found = active_declaration(experiment.folder, experiment.trials)
     assert found is not None
     assert found.beforehand
     assert any("4 of the 16 declared trials are still missing" in line for line in found.sentences("LPIPS"))
@@ -281,7 +281,7 @@ def test_a_record_that_was_deleted_and_written_anew_does_not_hide_what_was_added
         (path / "results.json").write_text(json.dumps(data | {"measured": measured, "declared": declared}))
     declare_trials(tmp_path, ("2020-06-01T00:00:00Z", planned([0, 1, 2])))
     experiment = load_experiment(tmp_path, "exp")
-    found = standing(experiment.folder, experiment.trials)
+    found = active_declaration(experiment.folder, experiment.trials)
     assert found is not None
     assert len(found.added) == 4
     assert not found.beforehand
@@ -290,12 +290,12 @@ def test_a_record_that_was_deleted_and_written_anew_does_not_hide_what_was_added
 def test_records_without_trials_and_damaged_ones_are_read(tmp_path: Path) -> None:
     """A record may declare a metric alone."""
     experiment = declared_experiment(tmp_path, ("psnr", EARLY))
-    found = standing(experiment.folder, experiment.trials)
+    found = active_declaration(experiment.folder, experiment.trials)
     assert found is not None
     assert found.beforehand
     for trials in ({"a": [0]}, {"a/b/c/d": [0]}, {"a/b/c": 3}, {"a/b/d": ["x"]}):
         declare_trials(tmp_path, (EARLY, trials), metric="psnr")  # type: ignore[arg-type]
-        assert standing(experiment.folder, experiment.trials) is None  # a line that is damaged declares nothing
+        assert active_declaration(experiment.folder, experiment.trials) is None  # a damaged line declares nothing
 
 
 def test_every_declaration_is_a_line_of_one_kind_and_reads_back(tmp_path: Path) -> None:

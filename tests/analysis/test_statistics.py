@@ -12,31 +12,31 @@ from gsbench.analysis.statistics import (
     Interval,
     answer_family,
     holm_factors,
-    like_these,
+    judge_like_these,
     look_levels,
     median_interval,
     outcome_of,
     plan_looks,
-    student,
+    t_test,
 )
 from tests.analysis.untruths import KINDS, rates
 
 
 def test_the_test_of_one_scene_is_the_paired_t_test() -> None:
     values = np.array([0.3, 0.1, 0.25, 0.4])
-    found, expected = student(values[None]), scipy.stats.ttest_1samp(values, 0)
+    found, expected = t_test(values[None]), scipy.stats.ttest_1samp(values, 0)
     assert found is not None
     assert found.p == pytest.approx(expected.pvalue, rel=1e-9)
     for level in (0.95, 0.998):
         interval = found.interval(1 - level)
         assert (interval.low, interval.high) == pytest.approx(expected.confidence_interval(level))
-    assert student(np.array([[0.3]])) is None
+    assert t_test(np.array([[0.3]])) is None
 
 
 def test_scenes_weigh_alike_and_each_has_a_variance_of_its_own() -> None:
     """By hand: variances 1 and 9 of three pairs each; Satterthwaite's 2 (1 + 9)^2 / (1 + 81) degrees, halved."""
     rows = np.array([[1.0, 2.0, 3.0], [1.0, 4.0, 7.0]])
-    found = student(rows)
+    found = t_test(rows)
     assert found is not None
     assert found.mean == pytest.approx(3.0)
     assert found.error == pytest.approx((1 / 3 + 9 / 3) ** 0.5 / 2)
@@ -46,7 +46,7 @@ def test_scenes_weigh_alike_and_each_has_a_variance_of_its_own() -> None:
 def test_the_error_is_that_of_welch() -> None:
     rng = np.random.default_rng(0)
     one, other = rng.normal(0, 1, 5), rng.normal(0, 4, 5)
-    found, welch = student(np.stack([one, other])), scipy.stats.ttest_ind(one, -other, equal_var=False)
+    found, welch = t_test(np.stack([one, other])), scipy.stats.ttest_ind(one, -other, equal_var=False)
     assert found is not None
     assert found.mean / found.error == pytest.approx(welch.statistic)
     assert found.degrees == pytest.approx(max(4.0, welch.df / 2))
@@ -54,16 +54,16 @@ def test_the_error_is_that_of_welch() -> None:
 
 def test_of_single_pairs_the_spread_of_scenes_stands_for_that_of_trainings() -> None:
     values = np.array([[0.3], [0.1], [0.5]])
-    found = student(values)
+    found = t_test(values)
     assert found is not None
     assert found.p == pytest.approx(scipy.stats.ttest_1samp(values[:, 0], 0).pvalue)
 
 
 def test_trainings_that_do_not_differ_are_sure() -> None:
-    same = student(np.full((2, 3), 0.2))
+    same = t_test(np.full((2, 3), 0.2))
     assert same is not None
     assert (same.p, same.interval()) == (0.0, Interval(same.mean, same.mean))
-    nothing = student(np.zeros((2, 3)))
+    nothing = t_test(np.zeros((2, 3)))
     assert nothing is not None
     assert nothing.p == 1.0
 
@@ -119,7 +119,7 @@ def test_what_is_too_small_is_told_at_an_equal_part_of_the_error_rate() -> None:
 
 def test_scenes_like_these_are_asked_by_the_sign_test() -> None:
     means = np.array([-0.044, 0.001, 0.002, 0.003, 0.004, 0.005, 0.006, 0.007])
-    found = like_these(means, 1, 0.005)
+    found = judge_like_these(means, 1, 0.005)
     assert found is not None
     assert (found.helped, found.scenes, found.beyond) == (7, 8, 3)
     expected = scipy.stats.binomtest(7, 8)
@@ -129,8 +129,8 @@ def test_scenes_like_these_are_asked_by_the_sign_test() -> None:
     assert found.outcome == "undecided"
     assert found.needed == 8
     assert found.power() == pytest.approx(0.9**8)
-    assert like_these(np.abs(means), 1, 0.001).outcome == "supported"  # type: ignore[union-attr]
-    assert like_these(means[:5], 1, 0.005) is None
+    assert judge_like_these(np.abs(means), 1, 0.001).outcome == "supported"  # type: ignore[union-attr]
+    assert judge_like_these(means[:5], 1, 0.005) is None
 
 
 def test_the_interval_of_the_median_is_exact() -> None:
@@ -145,7 +145,9 @@ def test_the_interval_of_the_median_is_exact() -> None:
 def test_the_statement_agrees_with_the_sign_test_at_every_level() -> None:
     rng = np.random.default_rng(1)
     for _ in range(50):
-        found = like_these(rng.normal(0.5, 1, int(rng.integers(6, 14))), 1, None, float(rng.choice([0.05, 0.0125])))
+        found = judge_like_these(
+            rng.normal(0.5, 1, int(rng.integers(6, 14))), 1, None, float(rng.choice([0.05, 0.0125]))
+        )
         assert found is not None
         assert (found.outcome != "undecided") == (found.p <= found.level)
 
@@ -164,7 +166,7 @@ def test_no_look_may_use_more_than_its_share_and_where_the_looks_would_err_too_o
     rng = np.random.default_rng(1)
     sweeps = rng.normal(0, 1, (4000, scenes, looks[-1]))
     false = [
-        any(student(sweep[:, :seeds]).p < level for seeds, level in zip(looks, levels, strict=True))  # type: ignore[union-attr]
+        any(t_test(sweep[:, :seeds]).p < level for seeds, level in zip(looks, levels, strict=True))  # type: ignore[union-attr]
         for sweep in sweeps
     ]
     assert np.mean(false) < 0.05 + 3 * (0.05 * 0.95 / len(sweeps)) ** 0.5
@@ -211,7 +213,7 @@ def test_seeds_needed_give_the_promised_power() -> None:
     rng = np.random.default_rng(0)
 
     def power(count: int) -> float:
-        tests = [student(sample) for sample in rng.normal(0.1, 0.1, (2000, 2, count))]
+        tests = [t_test(sample) for sample in rng.normal(0.1, 0.1, (2000, 2, count))]
         return float(np.mean([test is not None and test.p < ALPHA for test in tests]))
 
     assert 0.76 < power(seeds) < 0.93

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from gsbench import cli
-from gsbench.analysis.declaration import standing
+from gsbench.analysis.declaration import active_declaration
 from gsbench.analysis.judgement import Verdict, judge
 from gsbench.analysis.results import read_experiment
 from gsbench.config.compose import Trial
@@ -123,7 +123,7 @@ def test_seeds_of_planned_looks_are_declared_at_once_and_cost_the_metric_nothing
 ) -> None:
     assert sweep(Fake(psnr)) == 0
     experiment = read_experiment(runs / "stop")
-    found = standing(experiment.folder, experiment.trials)
+    found = active_declaration(experiment.folder, experiment.trials)
     assert found is not None
     assert (found.beforehand, found.added) == (True, ())
     missing = 0 if psnr is noise else 4

@@ -85,7 +85,7 @@ def test_what_is_shown_not_to_be_worse_passes_though_it_may_be_better(tmp_path: 
     assert (verdict.outcome, result_of(verdict)) == ("undecided", PASSED)
     assert "not worse by 0.35 in PSNR" in describe(verdict)
     assert most < 4
-    assert result_of(replace(verdict, hangs=True)) == NOT_DECIDED
+    assert result_of(replace(verdict, rests_on_outlying=True)) == NOT_DECIDED
 
 
 def test_a_look_waits_for_every_scene_also_where_the_first_is_equal(tmp_path: Path) -> None:

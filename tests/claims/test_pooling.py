@@ -12,7 +12,7 @@ import pytest
 from scipy import stats
 
 from gsbench.analysis.results import load_experiment
-from gsbench.analysis.statistics import Interval, student
+from gsbench.analysis.statistics import Interval, t_test
 from gsbench.claims.archive import write_archive
 from gsbench.claims.pooling import Study, Wanted, describe, pool, read_studies
 from gsbench.cli import run
@@ -105,7 +105,7 @@ def test_an_archive_is_a_study_of_its_pairs(tmp_path: Path) -> None:
         ]
     )
     assert study.effect == pytest.approx(pairs.mean())
-    test = student(pairs)
+    test = t_test(pairs)
     assert test is not None
     assert study.interval is not None
     assert (study.interval.low, study.interval.high) == pytest.approx((test.interval().low, test.interval().high))

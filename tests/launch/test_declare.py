@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from gsbench.analysis.declaration import standing
+from gsbench.analysis.declaration import active_declaration
 from gsbench.analysis.results import load_experiment
 from gsbench.cli import run
 from gsbench.config.compose import Trial, compose_one
@@ -106,7 +106,7 @@ def test_results_keep_what_was_declared_and_a_change_computes_nothing(tmp_path: 
     (declared,) = read_declarations(tmp_path / "exp")
     assert results["declared"] == {"metric": "psnr", "time": declared.time}
     experiment = load_experiment(tmp_path, "exp")
-    found = standing(experiment.folder, experiment.trials)
+    found = active_declaration(experiment.folder, experiment.trials)
     assert found is not None
     assert found.beforehand
     assert experiment.trials[0].measured >= declared.moment
@@ -116,13 +116,13 @@ def test_results_keep_what_was_declared_and_a_change_computes_nothing(tmp_path: 
     assert run([*words, "eval.primary=ssim"]) == 0
     assert file.read_bytes() == before
     assert {path: path.stat().st_mtime_ns for path in tmp_path.glob("store/*/*")} == store
-    found = standing(experiment.folder, load_experiment(tmp_path, "exp").trials)
+    found = active_declaration(experiment.folder, load_experiment(tmp_path, "exp").trials)
     assert found is not None
     assert (found.metric, len(found.seen), [one.primary for one in found.earlier]) == ("ssim", 1, ["psnr"])
 
     # another name gets the same numbers from the store: they were there before, and are known to have been
     assert run([*words, "name=again", "eval.primary=ssim"]) == 0
     again = load_experiment(tmp_path, "again")
-    found = standing(again.folder, again.trials)
+    found = active_declaration(again.folder, again.trials)
     assert found is not None
     assert not found.beforehand

@@ -1,4 +1,4 @@
-"""Tables, statistics and reports from result files. Knows result files only, and loads no torch."""
+"""Tables, statistics and reports. They are made from result files alone, without torch."""
 
 from gsbench.analysis.cells import to_frame
 from gsbench.analysis.results import load_experiment

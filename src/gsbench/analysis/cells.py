@@ -1,4 +1,4 @@
-"""Trials as cells, one mean with its deviation, refused where they may not be averaged; and as rows of a data frame."""
+"""Table cells (a mean with its deviation) and data frames from trials. Unlike trials are never averaged."""
 
 from __future__ import annotations
 
@@ -24,18 +24,19 @@ if TYPE_CHECKING:
 K = TypeVar("K", bound=Hashable)
 
 TRIAL_FIELDS = ("scene", "init", "densify", "seed", "raster", "protocol", "iterations", "experiment")
-NAMES = ("experiment", "scene", "init", "densify", "seed")
+IDENTITY = ("experiment", "scene", "init", "densify", "seed")
 CONDITIONS = ("protocol", "raster", "iterations")
-COUNTS = ("num_init_points", "num_gaussians", "scene_extent", "peak_memory_mb", "train_views", "test_views")
+MEASUREMENTS = ("num_init_points", "num_gaussians", "scene_extent", "peak_memory_mb", "train_views", "test_views")
 
 
 @dataclass(frozen=True)
 class Cell:
-    """The mean of a quantity over trials, or over scenes of means over trials.
+    """The mean of a quantity over the trials of a scene, or the mean of several scenes' means.
 
-    ``std`` is the sample deviation (n - 1) over trials, None for a single one; over several scenes it is that of the
-    means of scenes, one for each seed that all scenes have. ``count`` of ``expected`` trials have the value; for
-    several scenes it is the smallest count of a scene. ``reason`` says why a value is missing.
+    ``std`` is the sample deviation (n - 1) over trials, None for a single trial. Over several scenes, each seed that
+    all scenes have gives one mean over the scenes, and ``std`` is the deviation of these means. ``count`` of
+    ``expected`` trials have a value; over several scenes it is the smallest count. ``reason`` says why the value is
+    missing.
     """
 
     mean: float | None
@@ -52,7 +53,7 @@ class Cell:
 
 
 def field_value(trial: TrialResult, name: str) -> str:
-    """A field of a trial, or a dotted key of its configuration, as text; a key that it lacks counts as unset, null."""
+    """A field of a trial, or a dotted key of its configuration, as text; a missing key counts as unset (null)."""
     if name in TRIAL_FIELDS:
         return str(getattr(trial.record, name))
     if name not in trial.config and name.startswith(NOT_HASHED):
@@ -61,21 +62,21 @@ def field_value(trial: TrialResult, name: str) -> str:
 
 
 def check_fields(trials: Iterable[TrialResult], names: Iterable[str]) -> None:
-    """Raise ``InputError`` for the first of ``names`` that is no field, and no setting of any of the trials."""
+    """Raise ``InputError`` for the first name that is neither a field nor a setting of any trial."""
     trials = list(trials)
     for name in names:
-        if name not in TRIAL_FIELDS and not any(_has(trial, name) for trial in trials):
+        if name not in TRIAL_FIELDS and not any(_has_setting(trial, name) for trial in trials):
             raise InputError(
                 f"no trial has a setting {name!r}; use {', '.join(TRIAL_FIELDS)} or a key of a trial's config.yaml"
             )
 
 
-def _has(trial: TrialResult, name: str) -> bool:
+def _has_setting(trial: TrialResult, name: str) -> bool:
     return name in trial.config or (name.startswith(NOT_HASHED) and name in trial.whole_config)
 
 
 def select_trials(trials: Iterable[TrialResult], where: Mapping[str, str]) -> list[TrialResult]:
-    """The trials whose fields have the given values; raises ``InputError`` where none is left."""
+    """The trials whose fields have the given values; raises ``InputError`` if there are none."""
     trials = list(trials)
     check_fields(trials, where)
     kept = [trial for trial in trials if all(field_value(trial, key) == value for key, value in where.items())]
@@ -85,7 +86,7 @@ def select_trials(trials: Iterable[TrialResult], where: Mapping[str, str]) -> li
 
 
 def check_averageable(trials: Sequence[TrialResult], where: str) -> None:
-    """Raise ``InputError``, naming the differing keys, unless the trials are repetitions of the same thing by scene."""
+    """Raise ``InputError`` that names the differing keys, unless each scene's trials repeat one configuration."""
     if code := differing_code(trials):
         raise _code_refusal(where, code, trials[0].experiment)
     by_scene = by_key(trials, lambda trial: trial.scene)
@@ -99,20 +100,20 @@ def check_averageable(trials: Sequence[TrialResult], where: str) -> None:
             paths = ", ".join(trial.label for trial in group if trial.seed == twice[0])
             raise InputError(f"the table cell {where} has seed {twice[0]} twice: {paths}; remove one of the folders")
     across = differing_conditions([group[0] for group in by_scene.values()])
-    for key in ("resolution", "data"):  # these belong to a scene
+    for key in ("resolution", "data"):  # each scene has its own
         across.pop(key, None)
     if across:
         raise _refusal(where, across, trials)
 
 
 def swept_settings(trials: Iterable[TrialResult]) -> list[str]:
-    """The settings in which trials of one scene, initialiser and densifier differ, apart from what may differ."""
+    """The settings in which trials of one scene, initialiser and densifier differ, without `IGNORED_SETTINGS`."""
     groups = by_key(trials, lambda trial: (trial.scene, trial.init, trial.densify)).values()
     return sorted({key for group in groups for key in differing_settings(group)})
 
 
 def with_variants(trials: Sequence[TrialResult]) -> list[TrialResult]:
-    """The trials, each with its values of the swept settings as its variant, so that they are arms of their own."""
+    """The trials, each with its values of the swept settings as ``variant``: different values are different arms."""
     swept = swept_settings(trials)
     if not swept:
         return list(trials)
@@ -120,34 +121,33 @@ def with_variants(trials: Sequence[TrialResult]) -> list[TrialResult]:
 
 
 def make_cell(trials: Sequence[TrialResult], quantity: Quantity, scenes: Sequence[str], expected: int) -> Cell:
-    """The cell over ``scenes``, each expected to have ``expected`` trials, of what ``check_averageable`` accepts."""
+    """The cell of trials that passed `check_averageable`; each of ``scenes`` should have ``expected`` trials."""
     values: dict[str, dict[int, float]] = {scene: {} for scene in scenes}
     for trial in trials:
         value = quantity.read(trial)
         if value is not None:
             values[trial.scene][trial.seed] = value
     count = min((len(group) for group in values.values()), default=0)
-    kept = tuple(trials)
     if count == 0:
         reasons = [trial.unavailable[quantity.key] for trial in trials if quantity.key in trial.unavailable]
-        reason = in_brief(reasons[0]) if reasons else "no value" if trials else "no trial"
-        return Cell(None, None, 0, expected, len(values), kept, reason)
+        reason = short_reason(reasons[0]) if reasons else "no value" if trials else "no trial"
+        return Cell(None, None, 0, expected, len(values), tuple(trials), reason)
     mean = statistics.fmean(statistics.fmean(group.values()) for group in values.values())
-    shared = set.intersection(*(set(group) for group in values.values()))
-    per_seed = [statistics.fmean(group[seed] for group in values.values()) for seed in sorted(shared)]
+    shared_seeds = set.intersection(*(set(group) for group in values.values()))
+    per_seed = [statistics.fmean(group[seed] for group in values.values()) for seed in sorted(shared_seeds)]
     std = statistics.stdev(per_seed) if len(per_seed) > 1 else None
-    return Cell(mean, std, count, expected, len(values), kept)
+    return Cell(mean, std, count, expected, len(values), tuple(trials))
 
 
-def in_brief(reason: str) -> str:
-    """The reason why a metric has no value in a short line, with the command that helps; results.json has it whole."""
+def short_reason(reason: str) -> str:
+    """The reason why a metric is missing; missing weights in one line, of which results.json has the full text."""
     if reason.startswith("weights not found: "):
         return f"{reason.partition(' (')[0]}; gsbench doctor says where they come from"
     return reason
 
 
 def best_cells(cells: Mapping[K, Cell], quantity: Quantity) -> set[K]:
-    """The keys of the best means after rounding to the quantity's decimals; empty where all are equal."""
+    """The keys of the best means after rounding to the quantity's decimals; empty if all are equal."""
     means = {key: round(cell.mean, quantity.decimals) for key, cell in cells.items() if cell.mean is not None}
     if quantity.cost or quantity.direction == 0 or len(means) < 2:
         return set()
@@ -175,21 +175,23 @@ def _refusal(where: str, keys: Mapping[str, Sequence[str]], trials: Sequence[Tri
 
 
 def to_frame(trials: Experiment | Sequence[TrialResult]) -> pd.DataFrame:
-    """The complete trials of an experiment, or some of them, as a data frame with these columns:
+    """The complete trials of an experiment, or the given trials, as a data frame with one row per trial.
 
-    - ``experiment``, ``scene``, ``init``, ``densify``, ``seed``: which trial it is;
-    - every setting that was swept within those, by its dotted key, such as ``densify.max_gaussians``;
+    It has these columns:
+
+    - ``experiment``, ``scene``, ``init``, ``densify``, ``seed``: the trial's identity;
+    - every setting in which trials of one scene, initialiser and densifier differ, by its dotted key, such as
+      ``densify.max_gaussians``;
     - ``protocol``, ``raster``, ``iterations``, and ``width`` and ``height`` of the views in px;
-    - every metric that some trial has, as the mean over its test views (``psnr`` in dB; not a number where it could
-      not be computed);
+    - every metric of any trial, as the mean over its test views (``psnr`` in dB; NaN where it could not be computed);
     - ``num_init_points``, ``num_gaussians``, ``scene_extent`` (world units), ``peak_memory_mb``, ``train_views`` and
       ``test_views``;
     - ``seconds_init``, ``seconds_train``, ``seconds_evaluate``;
-    - ``event_<cause>``: how many Gaussians the refinements cloned, split, pruned and so on, by cause;
-    - ``hash_config``, ``hash_data``, ``hash_init`` and so on: what the trial came from;
-    - ``folder``: where its files lie.
+    - ``event_<cause>``: number of Gaussians that the refinements cloned, split, pruned and so on, by cause;
+    - ``hash_config``, ``hash_data``, ``hash_init`` and so on: hashes of the trial's inputs;
+    - ``folder``: the folder of the trial's files.
 
-    What a trial lacks is missing in its row, never 0.
+    A value that a trial does not have is missing (NA), never 0.
     """
     import pandas as pd  # here, since it is slow to import
 
@@ -198,11 +200,12 @@ def to_frame(trials: Experiment | Sequence[TrialResult]) -> pd.DataFrame:
     rows = []
     for trial in chosen:
         record = trial.record
-        row: dict[str, Any] = {name: getattr(record, name) for name in NAMES}
+        row: dict[str, Any] = {name: getattr(record, name) for name in IDENTITY}
         row |= {key: trial.config.get(key) for key in swept}
         row |= {name: getattr(record, name) for name in CONDITIONS}
         row |= dict(zip(("width", "height"), record.resolution or (None, None), strict=True))
-        row |= {key: trial.metrics.get(key) for key in metrics} | {name: getattr(record, name) for name in COUNTS}
+        row |= {key: trial.metrics.get(key) for key in metrics}
+        row |= {name: getattr(record, name) for name in MEASUREMENTS}
         for prefix, group in (("seconds", record.seconds), ("event", record.events), ("hash", record.hashes)):
             row |= {f"{prefix}_{key}": value for key, value in group.items()}
         rows.append(row | {"folder": str(trial.path)})

@@ -1,8 +1,8 @@
-"""The settings of trials and of the arms that gsbench ships, with dotted keys.
+"""The settings of trials (with dotted keys) and of the arms that gsbench ships.
 
-Each configuration of an experiment is read once for all trials that share it. The shipped arms are read as plain files
-of ``conf/densify``, without composing: what an arm's authors wrote, and where gsbench departs from it, stands in the
-comments of its file: lines above the settings, ``theirs: VALUE`` beside one, and facts under fixed keys at the end.
+Trials that share a configuration read it once. The shipped arms are read as plain files of ``conf/densify``, without
+Hydra. The comments of such a file state what the arm's authors wrote and where gsbench departs from it: lines above the
+settings, ``theirs: VALUE`` beside a setting, and facts under fixed keys at the end (`FACTS`).
 """
 
 import json
@@ -22,13 +22,14 @@ from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.install import conf_dir
 
 ENCODER = json.JSONEncoder(sort_keys=True, separators=(",", ":"))
-GROUPS = ("scene", "init", "densify")  # of a configuration: what every trial has
+GROUPS = ("scene", "init", "densify")  # groups that every trial's configuration has
 
 
 class Configurations:
-    """The settings that determine the results of an experiment's trials, read once for all seeds of a trial.
+    """The settings that determine results, of all trials of an experiment. Each file is read once for all seeds.
 
-    Those that are ``known`` are not read: of trials that have not run. ``trial`` is the key that seeds share.
+    ``trial`` is the key that the seeds of a trial share (`TrialResult.key`). ``known`` has, by this key, the settings
+    of trials that have not run and thus have no file.
     """
 
     def __init__(self, known: Mapping[str, Mapping[str, Any]] | None = None) -> None:
@@ -36,30 +37,30 @@ class Configurations:
         self._texts: dict[str, Mapping[str, str]] = {}
 
     def texts(self, trial: str, folder: Path) -> Mapping[str, str]:
-        """The same as `shared`, each as comparable text."""
+        """The settings of `shared` as text that is equal for equal values."""
         if trial not in self._texts:
             self._texts[trial] = {key: canonical(value) for key, value in self.shared(trial, folder).items()}
         return self._texts[trial]
 
     def shared(self, trial: str, folder: Path) -> Mapping[str, Any]:
-        """The settings of the trial in ``folder``, as those of its other seeds; {} where they cannot be read."""
+        """The settings of a trial, read from ``folder`` or from another seed before; {} if they cannot be read."""
         if trial not in self._known:
-            self.find(trial, [folder])
+            self.read(trial, [folder])
         return self._known[trial]
 
-    def find(self, trial: str, folders: Iterable[Path]) -> str:
-        """Read the settings of a trial from the first of ``folders`` that has them; else why the last has not."""
+    def read(self, trial: str, folders: Iterable[Path]) -> str:
+        """Read the settings of a trial from its first readable folder; return "", or the last folder's fault."""
         fault = ""
         for folder in folders:
             try:
-                found = load_flat_config(folder)
+                config = load_flat_config(folder)
             except FileNotFoundError:
                 fault = f"{CONFIG} is not there"
             except DamagedError as error:
                 fault = f"{error.path.name} {error.reason}"
             else:
-                own = {key: value for key, value in found.items() if key.split(".")[0] not in NOT_HASHED}
-                self._known[trial] = own
+                hashed = {key: value for key, value in config.items() if key.split(".")[0] not in NOT_HASHED}
+                self._known[trial] = hashed
                 return ""
         self._known.setdefault(trial, {})
         return fault
@@ -76,46 +77,54 @@ def load_flat_config(folder: Path) -> dict[str, Any]:
 def canonical(value: object) -> str:
     """JSON text that is equal for equal values."""
     if type(value) is int or (type(value) is float and math.isfinite(value)):
-        return repr(value)  # as JSON writes it; most settings are such
+        return repr(value)  # the same text as JSON's, but faster: most settings are numbers
     return ENCODER.encode(value)
 
 
-GROUP = "densify"
 FACTS = ("Source", "Compared", "Tests", "Otherwise", "Departs from adc by")
-FACT = re.compile(rf"^# (?P<key>{'|'.join(FACTS)}): (?P<text>.*(?:\n#   .*)*)$", re.MULTILINE)  # may go on, indented
-
+# A fact is one comment line; indented comment lines continue it.
+FACT = re.compile(rf"^# (?P<key>{'|'.join(FACTS)}): (?P<text>.*(?:\n#   .*)*)$", re.MULTILINE)
 
 _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 @cache
 def shipped_arms() -> dict[str, Mapping[str, Any]]:
-    """The settings of each densifier of gsbench by its name; programs of others are none."""
-    return {path.stem: _read(path.stem) for path in sorted((conf_dir() / GROUP).glob("*.yaml"))}
+    """The settings of each densifier that gsbench ships, by name, without ``densify/external``."""
+    return {path.stem: _with_defaults(path.stem) for path in sorted(_arms_folder().glob("*.yaml"))}
 
 
 @cache
 def facts_of(name: str) -> dict[str, str]:
     """The facts at the end of the file of the shipped arm ``name``, by their key (`FACTS`)."""
-    content = (conf_dir() / GROUP / f"{name}.yaml").read_text(encoding="utf-8")
-    return {found["key"]: found["text"].replace("\n#   ", " ") for found in FACT.finditer(content)}
+    content = (_arms_folder() / f"{name}.yaml").read_text(encoding="utf-8")
+    return {match["key"]: match["text"].replace("\n#   ", " ") for match in FACT.finditer(content)}
 
 
 @cache
 def departures() -> dict[str, tuple[str, ...]]:
-    """Ingredients in which each shipped class of densifiers, by its import path, departs from ADC."""
-    found = {}
+    """The ingredients in which each shipped densifier class (by import path) departs from ADC."""
+    by_class = {}
     for name in shipped_arms():
-        content = yaml.load((conf_dir() / GROUP / f"{name}.yaml").read_text(encoding="utf-8"), Loader=_LOADER)
-        if "_target_" in content:  # a file built on another one is of the other's class
+        content = _own_settings(name)
+        if "_target_" in content:  # without it, the arm has the class of the arm in its defaults
             text = facts_of(name).get("Departs from adc by", "")
-            found[content["_target_"]] = tuple(filter(None, text.split(", ")))
-    return found
+            by_class[content["_target_"]] = tuple(filter(None, text.split(", ")))
+    return by_class
 
 
 @cache
-def _read(name: str) -> dict[str, Any]:
-    """An arm's own settings above those of the arms that its list of defaults names."""
-    content = yaml.load((conf_dir() / GROUP / f"{name}.yaml").read_text(encoding="utf-8"), Loader=_LOADER)
+def _with_defaults(name: str) -> dict[str, Any]:
+    """The settings of an arm, which override those of the arms in its ``defaults``."""
+    content = _own_settings(name)
     parents = [parent for parent in content.pop("defaults", []) if parent != "_self_"]
-    return {key: value for parent in parents for key, value in _read(parent).items()} | content
+    return {key: value for parent in parents for key, value in _with_defaults(parent).items()} | content
+
+
+def _own_settings(name: str) -> dict[str, Any]:
+    settings: dict[str, Any] = yaml.load((_arms_folder() / f"{name}.yaml").read_text(encoding="utf-8"), Loader=_LOADER)
+    return settings
+
+
+def _arms_folder() -> Path:
+    return conf_dir() / "densify"

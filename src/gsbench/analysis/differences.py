@@ -1,7 +1,8 @@
 """Differences between trials and between arms: conditions, settings, versions of the code, and *ingredients*.
 
-Ingredients are read from the trials' recorded configurations and code: each setting is one, settings that only make
-sense together share a name, and a class of densifiers brings those in which it departs from ADC.
+An ingredient is one difference that may explain a result. Each setting is an ingredient; settings that belong together
+share one name. A densifier class adds the ingredients in which it departs from ADC. All are read from the trials'
+recorded configurations and code.
 """
 
 import itertools
@@ -18,19 +19,19 @@ from gsbench.words import counted, listed
 
 Versions = dict[str, list[TrialResult]]  # version -> the trials that it made
 
-# Settings in which trials of one cell may differ: they name the trial or say where it runs, not what is computed.
+# Settings in which trials of one cell may differ: they do not change what is computed.
 IGNORED_SETTINGS = (
     *("seed", "name", "device", "threads", "tracking.", "launch.", "hydra.", "experiment", "scene.path"),
     *("eval.primary", "eval.controls", "densify.switches"),
 )
-MOST_NAMED = 6  # ingredients that a headline names before it counts
+MOST_NAMED = 6  # a sentence names so many ingredients and counts the rest
 NO_RECORD = "settings that are not recorded (a trial has no readable config.yaml)"
 ELSEWHERE = "a training elsewhere, which left no record"
 BY_PROGRAM = "everything that the program {} does differently"
-TARGET, INIT = "densify._target_", "initial cloud"
+TARGET, INITIAL_CLOUD = "densify._target_", "initial cloud"
 
-# Settings with one name for several keys. All others are called as their key, without the group of the densifier.
-NAMES = {
+# Ingredients of several settings. The name of any other is the setting's key without ``densify.``.
+INGREDIENT_NAMES = {
     "densify.gradient_threshold": "threshold",
     "densify.threshold_inclusive": "threshold",
     **{f"densify.{key}": "schedule" for key in ("start", "stop", "interval")},
@@ -46,7 +47,7 @@ NAMES = {
         for key in ("position_initial", "position_final", "sh_dc", "sh_rest", "opacity", "scale", "rotation")
     },
 }
-# Settings without effect on what is trained.
+# Settings that do not change the trained model.
 WITHOUT_EFFECT = (
     *IGNORED_SETTINGS,
     *("eval.", "scene.name", "init.name", "densify.name", "raster.name", "runs", "allow_targets", "init.device"),
@@ -56,77 +57,82 @@ WITHOUT_EFFECT = (
 
 
 UNSET = canonical(None)
-CODE = "code of "  # how the keys of ``TrialResult.code`` start that are a user's modules
+CODE = "code of "  # prefix of a user's modules among the keys of ``TrialResult.code``
 
 
 def differing_conditions(trials: Sequence[TrialResult], code: bool = True) -> dict[str, list[str]]:
-    """The conditions in which trials differ, with their values; the ``code`` that made them is one, where it counts.
+    """The conditions in which trials differ, with their values; with ``code``, versions of the code are conditions.
 
-    Unlike budgets of which none acted are no difference: all of the trials grew as they liked.
+    Different budgets count only if a budget limited one of the trials.
     """
-    seen: dict[str, set[str]] = defaultdict(set)
+    values_by_condition: dict[str, set[str]] = defaultdict(set)
     for trial in trials:
         for key, value in trial.conditions.items():
-            seen[key].add(value)
+            values_by_condition[key].add(value)
     for part, versions in (differing_code(trials) if code else {}).items():
-        seen[part] = {short_version(version) for version in versions}
+        values_by_condition[part] = {short_version(version) for version in versions}
     if not any(trial.budget_acted for trial in trials):
-        seen.pop("budget", None)
-    return {key: sorted(values) for key, values in seen.items() if len(values) > 1}
+        values_by_condition.pop("budget", None)
+    return {key: sorted(values) for key, values in values_by_condition.items() if len(values) > 1}
 
 
 def differing_settings(trials: Sequence[TrialResult]) -> dict[str, list[str]]:
-    """The settings in which trials with different configuration hashes differ, those that may differ left out.
+    """The settings in which trials differ, with their values, without `IGNORED_SETTINGS`.
 
-    A key that a configuration lacks counts as unset: a metric that was added later is null in earlier trials.
+    A missing key counts as unset (null): trials from before a setting existed equal later ones that leave it unset.
     """
     if len({trial.config_hash for trial in trials}) == 1:
         return {}
-    known = {trial.key: trial.config_texts for trial in trials}.values()
-    keys = {key for texts in known for key in texts if not key.startswith(IGNORED_SETTINGS)}
-    values = {key: {texts.get(key, UNSET) for texts in known} for key in keys}
-    return {key: sorted(found) for key, found in sorted(values.items()) if len(found) > 1}
+    configs = {trial.key: trial.config_texts for trial in trials}.values()
+    keys = {key for texts in configs for key in texts if not key.startswith(IGNORED_SETTINGS)}
+    values_by_key = {key: {texts.get(key, UNSET) for texts in configs} for key in keys}
+    return {key: sorted(values) for key, values in sorted(values_by_key.items()) if len(values) > 1}
 
 
 def differing_code(trials: Iterable[TrialResult]) -> dict[str, Versions]:
-    """The user's modules, stages and rooms of gsbench of which the trials used several versions; of many rooms, one."""
+    """The parts of the code (user's modules, gsbench's stages and rooms) of which trials used several versions.
+
+    Of several such rooms, the first stands for all, under a name that counts the others.
+    """
     trials = list(trials)
-    found = _several(trials, lambda trial: trial.code)
-    rooms = list(_several(trials, lambda trial: trial.rooms).items())
+    differing = _with_several_versions(trials, lambda trial: trial.code)
+    rooms = list(_with_several_versions(trials, lambda trial: trial.rooms).items())
     if rooms:
         part, versions = rooms[0]
-        found[part if len(rooms) == 1 else f"{part} and {counted(len(rooms) - 1, 'more room')}"] = versions
-    return found
+        differing[part if len(rooms) == 1 else f"{part} and {counted(len(rooms) - 1, 'more room')}"] = versions
+    return differing
 
 
-def _several(trials: Iterable[TrialResult], parts: Callable[[TrialResult], Mapping[str, str]]) -> dict[str, Versions]:
-    found: dict[str, Versions] = defaultdict(lambda: defaultdict(list))
+def _with_several_versions(
+    trials: Iterable[TrialResult], versions_of: Callable[[TrialResult], Mapping[str, str]]
+) -> dict[str, Versions]:
+    by_part: dict[str, Versions] = defaultdict(lambda: defaultdict(list))
     for trial in trials:
-        for part, version in parts(trial).items():
-            found[part][version].append(trial)
-    return {part: dict(versions) for part, versions in found.items() if len(versions) > 1}
+        for part, version in versions_of(trial).items():
+            by_part[part][version].append(trial)
+    return {part: dict(versions) for part, versions in by_part.items() if len(versions) > 1}
 
 
 def describe_code(part: str, versions: Mapping[str, Sequence[TrialResult]]) -> str:
     """``mine.Patient: 3fa9c1d2 (garden seeds 0, 1; 2026-11-21 18:40) | …``, the oldest version first."""
     ordered = sorted(versions.items(), key=lambda item: max(trial.finished for trial in item[1]))
-    texts = [f"{short_version(version)} ({_places(own)}; {_when(own)})" for version, own in ordered]
+    texts = [f"{short_version(version)} ({_scenes_and_seeds(own)}; {_when(own)})" for version, own in ordered]
     return f"{part.removeprefix(CODE)}: {' | '.join(texts)}"
 
 
 def short_version(version: str) -> str:
-    """A version as people see it: the start of a hash."""
+    """The first characters of a version, which is a hash or short anyway."""
     return version[:SHOWN]
 
 
-def _places(trials: Sequence[TrialResult]) -> str:
+def _scenes_and_seeds(trials: Sequence[TrialResult]) -> str:
     """``garden seeds 0, 1; room seed 0``"""
     by_scene = sorted(by_key(trials, lambda trial: trial.scene).items())
     return "; ".join(f"{scene} {seeds_words(own)}" for scene, own in by_scene)
 
 
 def _when(trials: Sequence[TrialResult]) -> str:
-    """Time at which the trials were finished: a minute, or the first and the last."""
+    """The time at which the trials were finished, to the minute: one time, or the first and the last."""
     times = sorted(trial.finished for trial in trials)
     minutes = [time.strftime("%Y-%m-%d %H:%M", time.localtime(finished)) for finished in times]
     return minutes[0] if minutes[0] == minutes[-1] else f"{minutes[0]} to {minutes[-1]}"
@@ -135,10 +141,10 @@ def _when(trials: Sequence[TrialResult]) -> str:
 def find_superseded(
     trials: Sequence[TrialResult], present: Callable[[str, TrialResult], str | None] = lambda module, trial: None
 ) -> dict[Path, str]:
-    """Folders of trials whose code is no longer the present one, each with the reason.
+    """The folders of trials that older code made, each with the reason.
 
-    ``present(module, trial)`` is the hash of a user's module as it is now, None where that cannot be seen; then
-    the version that finished a trial last is the present one, as it is among the stages of gsbench.
+    ``present(module, trial)`` is the present hash of a user's module, None if it cannot be found. In this case, and for
+    gsbench's own stages and rooms, the version of the trial that finished last counts as the present one.
     """
     reasons: dict[Path, str] = {}
     ordered = sorted(trials, key=lambda trial: trial.finished)
@@ -155,30 +161,30 @@ def find_superseded(
 
 
 def ingredients(one: Mapping[str, Any], other: Mapping[str, Any]) -> tuple[str, ...]:
-    """The ingredients in which two configurations with dotted keys differ, those of the rule first."""
+    """The ingredients in which two configurations with dotted keys differ, those of the densifier classes first."""
     if not one or not other:
         return (NO_RECORD,)
-    rule = {*_rule_names(one)} ^ {*_rule_names(other)}
-    order = [name for config in (other, one) for name in _rule_names(config) if name in rule]
-    cloud = one.get("init._target_") != other.get("init._target_") or one.get("init.name") != other.get("init.name")
+    of_one_class = {*_class_ingredients(one)} ^ {*_class_ingredients(other)}
+    names = [name for config in (other, one) for name in _class_ingredients(config) if name in of_one_class]
+    other_init = any(one.get(key) != other.get(key) for key in ("init._target_", "init.name"))
     for key in differing_keys(one, other):
-        if key == TARGET or (one.get(TARGET) != other.get(TARGET) and _belongs_to_rule(key, one, other)):
+        if key == TARGET or (one.get(TARGET) != other.get(TARGET) and _is_of_one_class(key, one, other)):
             continue
-        is_cloud = cloud and key.startswith("init.") and key not in NAMES
-        order.append(INIT if is_cloud else NAMES.get(key, key.removeprefix("densify.")))
-    return tuple(dict.fromkeys(order))
+        is_cloud = other_init and key.startswith("init.") and key not in INGREDIENT_NAMES
+        names.append(INITIAL_CLOUD if is_cloud else INGREDIENT_NAMES.get(key, key.removeprefix("densify.")))
+    return tuple(dict.fromkeys(names))
 
 
 def differing_keys(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[str]:
-    """The settings in which two configurations differ, those left out that have no effect on what is trained."""
+    """The settings in which two configurations differ, without those that do not change the trained model."""
     keys = [key for key in {**one, **other} if not key.startswith(WITHOUT_EFFECT)]
     return [key for key in keys if one.get(key) != other.get(key)]
 
 
 def ingredients_between(trials: Sequence[TrialResult], first: Arm, second: Arm) -> tuple[str, ...]:
-    """The ingredients in which two arms of ``trials`` differ: of their configurations, and code of several versions.
+    """The ingredients in which two arms of ``trials`` differ, in their configurations and in versions of the code.
 
-    A difference can be put down to an ingredient only where it is the one in which the arms differ.
+    Only if there is exactly one, a difference of results can be put down to it.
     """
     one, other = representatives(trials, first, second)
     if one.made_elsewhere or other.made_elsewhere:
@@ -186,21 +192,21 @@ def ingredients_between(trials: Sequence[TrialResult], first: Arm, second: Arm) 
     return tuple(dict.fromkeys([*ingredients(one.config, other.config), *differing_code((one, other))]))
 
 
-def ingredients_sentence(found: Sequence[str], first: Arm, second: Arm) -> str:
+def ingredients_sentence(names: Sequence[str], first: Arm, second: Arm) -> str:
     """``sfm-longaxis differs from sfm-adc by split, gradient and threshold.``"""
-    if not found:
+    if not names:
         return f"{second} and {first} differ in no recorded setting."
-    named = [*found[:MOST_NAMED], *([f"{len(found) - MOST_NAMED} more"] if len(found) > MOST_NAMED else [])]
-    return f"{second} differs from {first} by {listed(named)}{'' if is_mixed(found) else ' alone'}."
+    shown = [*names[:MOST_NAMED], *([f"{len(names) - MOST_NAMED} more"] if len(names) > MOST_NAMED else [])]
+    return f"{second} differs from {first} by {listed(shown)}{'' if is_mixed(names) else ' alone'}."
 
 
-def is_mixed(found: Sequence[str]) -> bool:
-    """Return whether a difference between arms may come from more than one ingredient."""
-    return len(found) > 1 or any(_is_bundle(name) for name in found)
+def is_mixed(names: Sequence[str]) -> bool:
+    """Return whether the named ingredients are more than one, or stand for an unknown number."""
+    return len(names) > 1 or any(_is_bundle(name) for name in names)
 
 
 def representatives(trials: Iterable[TrialResult], first: Arm, second: Arm) -> tuple[TrialResult, TrialResult]:
-    """A trial of each arm, of one scene and seed where there is such a pair, else of one scene, else of one seed.
+    """One trial of each arm: of the same scene and seed if possible, else of the same scene, else of the same seed.
 
     Raises ValueError for an arm without trials.
     """
@@ -212,16 +218,17 @@ def representatives(trials: Iterable[TrialResult], first: Arm, second: Arm) -> t
 
 
 def _is_bundle(ingredient: str) -> bool:
-    """Return whether it stands for many at once, which nobody can tell apart."""
+    """Return whether the name stands for an unknown number of differences."""
     return ingredient in (NO_RECORD, ELSEWHERE) or ingredient.startswith(BY_PROGRAM.partition("{")[0])
 
 
-def _belongs_to_rule(key: str, one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
-    """Return whether a setting of the densifier is there for one of two classes alone."""
+def _is_of_one_class(key: str, one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
+    """Return whether only one of two densifier classes has this setting."""
     return key.startswith("densify.") and ((key in one) != (key in other))
 
 
-def _rule_names(config: Mapping[str, Any]) -> tuple[str, ...]:
+def _class_ingredients(config: Mapping[str, Any]) -> tuple[str, ...]:
+    """The ingredients in which the configuration's densifier class departs from ADC."""
     target = config.get(TARGET)
     if target is None:
         return ()

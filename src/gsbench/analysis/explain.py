@@ -1,4 +1,4 @@
-"""Origin of one number of a table."""
+"""The origin of one number in a table."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,13 +16,13 @@ ADDRESS = "EXPERIMENT:SCENE:METRIC:ARM, such as table1:garden:lpips:volumetric o
 
 
 def explain_cell(address: str, runs: Path) -> str:
-    """Plain text on the cell at ``address``; raises ``InputError`` where there is no such cell."""
+    """Plain text about the cell at ``address``; raises ``InputError`` if there is no such cell."""
     parts = address.split(":")
     if len(parts) != 4 or not all(parts):
         raise InputError(f"{address!r} is not {ADDRESS}")
     name, scene, metric, arm = parts
     experiment = load_experiment(runs, name)
-    trials = _find(experiment, scene, arm)
+    trials = _trials_at(experiment, scene, arm)
     shown = quantity(metric, trials)
     variants = swept_settings(trials)
     if variants:
@@ -44,14 +44,14 @@ def explain_cell(address: str, runs: Path) -> str:
     return "\n".join(lines)
 
 
-def _find(experiment: Experiment, scene: str, arm: str) -> list[TrialResult]:
-    """The trials of a scene and an arm, given as ``<init>-<densify>`` or as the densifier alone where that is clear."""
+def _trials_at(experiment: Experiment, scene: str, arm: str) -> list[TrialResult]:
+    """The trials of a scene and an arm: ``<init>-<densify>``, or the densifier alone if only one arm has it."""
     of_scene = [trial for trial in experiment.trials if trial.scene == scene]
     if not of_scene:
-        known = ", ".join(sorted({trial.scene for trial in experiment.trials}))
-        raise InputError(f"experiment {experiment.name!r} has no scene {scene!r}; it has {known}")
+        scenes = ", ".join(sorted({trial.scene for trial in experiment.trials}))
+        raise InputError(f"experiment {experiment.name!r} has no scene {scene!r}; it has {scenes}")
     arms = sorted({(trial.init, trial.densify) for trial in of_scene})
-    chosen = [found for found in arms if arm in (f"{found[0]}-{found[1]}", found[1])]
+    chosen = [(init, densify) for init, densify in arms if arm in (f"{init}-{densify}", densify)]
     if len(chosen) != 1:
         names = ", ".join(f"{init}-{densify}" for init, densify in arms)
         raise InputError(f"{arm!r} names {len(chosen)} arms of {scene}; choose one of {names}")
@@ -59,19 +59,19 @@ def _find(experiment: Experiment, scene: str, arm: str) -> list[TrialResult]:
 
 
 def _trials_lines(trials: Sequence[TrialResult], shown: Quantity) -> list[str]:
-    """Say what each trial came from; what all of them share is said with the first."""
+    """The value and the origin of each trial; a line that equals the previous trial's is not repeated."""
     lines = ["", "Trials"]
-    said: dict[str, str] = {}
+    previous: dict[str, str] = {}
     for trial in trials:
         value, origin = shown.read(trial), _origin(trial)
         lines.append(f"  seed {trial.seed}: {'n/a' if value is None else f'{value:.6g}'}")
-        lines += [f"    {label:<9} {text}" for label, text in origin.items() if said.get(label) != text]
-        said = said | origin
+        lines += [f"    {label:<9} {text}" for label, text in origin.items() if previous.get(label) != text]
+        previous = previous | origin
     return lines
 
 
 def _origin(trial: TrialResult) -> dict[str, str]:
-    """The folder of a trial, its counts, hashes, and the programs that made it, each in a line by its label."""
+    """The folder of a trial, its counts, hashes, and the programs that made it, by label."""
     record = trial.record
     if trial.from_renders and not trial.program:
         counts = ", ".join(f"{key} {value}" for key, value in record.renders.items())
@@ -90,8 +90,8 @@ def _origin(trial: TrialResult) -> dict[str, str]:
         origin["code"] = ", ".join(f"{part} {short_version(version)}" for part, version in trial.code.items())
     if record.code.commit:
         origin["commit"] = f"{record.code.commit}{', edited' if record.code.edited else ''}"
-    rooms = [name.removeprefix("gsbench's ") for name, state in trial.rooms.items() if state != AS_RELEASED]
-    if rooms and len(rooms) < len(trial.rooms):  # else it was before the first release
-        origin["edited"] = f"since the last release: {some_of(rooms)}"
+    edited = [name.removeprefix("gsbench's ") for name, state in trial.rooms.items() if state != AS_RELEASED]
+    if edited and len(edited) < len(trial.rooms):  # before the first release all rooms count as edited
+        origin["edited"] = f"since the last release: {some_of(edited)}"
     origin["versions"] = ", ".join(f"{key} {value}" for key, value in record.versions.items())
     return origin

@@ -1,6 +1,6 @@
-"""The fairness of a comparison: all in which two arms differ, and what was tuned, as a sheet and in a sentence.
+"""The fairness of a comparison: everything in which two arms differ, and how each was tuned.
 
-It is made from the trials' records, never written by hand, so nothing can be left out of it that was recorded.
+The sheet and the sentences are made from the trials' records, so they leave out nothing that was recorded.
 """
 
 import statistics
@@ -26,30 +26,28 @@ from gsbench.runs.experiments import Point, TuningRecord
 from gsbench.runs.layout import TUNING
 from gsbench.words import counted, listed
 
-LONGEST = 60  # characters of a value that are shown
+LONGEST = 60  # shown characters of a value
 UNKNOWN, NONE = "not recorded", "–"
 ALIKE, UNLIKE = "", "≠"
-DIFFERS = "differs"  # heading of the column that marks what does
-EQUAL_COUNTS = 0.02  # relative: arms closer than this have one count, as governed ones do
-MOST_VALUES = 8  # points of a search that are named
+DIFFERS = "differs"  # heading of the column that marks differing rows
+EQUAL_COUNTS = 0.02  # relative difference up to which counts are equal; densify.cap=governor holds counts closer
+MOST_VALUES = 8  # shown points of a search
 NOTHING = "No tuning is recorded: each arm ran with one choice of settings. What was tried elsewhere is not known."
-VIEWS = "validation views"  # on which every search judges its points
+VIEWS = "validation views"  # every search judges its points on them
 
 Reader = Callable[[TrialResult], float | None]
 
 
 def caveats(trials: Sequence[TrialResult], first: Arm, second: Arm) -> str:
-    """Say where two arms of ``trials`` have unlike counts, differ in more than one ingredient, and where one was tuned
-    more; else "".
-    """
-    found = ingredients_between(trials, first, second)
-    mixed = ingredients_sentence(found, first, second) if is_mixed(found) else ""
+    """Sentences on unequal counts, on more than one differing ingredient, and on unequal tuning; "" if none applies."""
+    names = ingredients_between(trials, first, second)
+    mixed = ingredients_sentence(names, first, second) if is_mixed(names) else ""
     counts = counts_sentence(trials, first, second)
     return " ".join(filter(None, [counts, mixed, tuning_sentence(trials, (first, second))]))
 
 
 def counts_sentence(trials: Sequence[TrialResult], first: Arm, second: Arm) -> str:
-    """Say how many more Gaussians the second arm has, over the scenes that both have; "" where counts are equal."""
+    """Say how many more Gaussians the second arm has, over the scenes that both have; "" if counts are equal."""
     baseline, other = ([trial for trial in trials if trial.arm == arm] for arm in (first, second))
     change = relative_change(baseline, other, COSTS["gaussians"][1])
     if change is None or abs(change.of_totals) <= EQUAL_COUNTS:
@@ -62,19 +60,19 @@ def counts_sentence(trials: Sequence[TrialResult], first: Arm, second: Arm) -> s
 
 
 def fairness_table(trials: Sequence[TrialResult], first: Arm, second: Arm) -> Table:
-    """The sheet of two arms of ``trials`` (all of the experiment, each with its variant) as a table with notes.
+    """The fairness sheet of two arms as a table with notes.
 
-    What was measured is over the pairs of trials that are compared: a value, or the smallest and the largest of a
-    trial. Raises ValueError for an arm without trials.
+    ``trials`` are all trials of the experiment, each with its variant. Measured rows cover the paired trials: one
+    value, or the smallest, the largest and the mean. Raises ValueError for an arm without trials.
     """
     pairs = pair_trials(trials, first, second)
     one, other = pairs[0] if pairs else representatives(trials, first, second)
     compared = [trial for pair in pairs for trial in pair] or trials
     groups = [[trial for trial in compared if trial.arm == arm] for arm in (first, second)]
-    rows = [_row(what, [read(group) for group in groups]) for what, read in MEASURED.items()]
-    for place, key in enumerate(differing_keys(one.config, other.config)):
+    rows = [_row(what, [show(group) for group in groups]) for what, show in MEASURED.items()]
+    for index, key in enumerate(differing_keys(one.config, other.config)):
         values = [_shown(trial.config[key]) if key in trial.config else NONE for trial in (one, other)]
-        rows.append(_row(key, values, rule_above=place == 0))
+        rows.append(_row(key, values, rule_above=index == 0))
     notes = [ingredients_sentence(ingredients_between(trials, first, second), first, second)]
     notes += [f"Compared: {counted(len(pairs), 'pair')} of trials of one scene and seed."]
     notes += [f"Tuning. {line}" for line in tuning_lines(trials, (first, second))]
@@ -84,7 +82,7 @@ def fairness_table(trials: Sequence[TrialResult], first: Arm, second: Arm) -> Ta
 
 
 def _row(what: str, values: Sequence[str], rule_above: bool = False) -> Row:
-    """A row with the values of both arms."""
+    """A row with the values of both arms, and whether they differ."""
     differs = ALIKE if values[0] == values[1] else UNLIKE
     return Row((what,), tuple(map(Entry, [*values, differs])), rule_above)
 
@@ -95,7 +93,7 @@ def _shown(value: Any) -> str:
 
 
 def _span(read: Reader) -> Callable[[Sequence[TrialResult]], str]:
-    """Shows a number of trials: one value, or the smallest and the largest with the mean."""
+    """A function that shows a number over trials: one value, or the smallest, the largest and the mean."""
 
     def show(trials: Sequence[TrialResult]) -> str:
         values = [value for trial in trials if (value := read(trial)) is not None]
@@ -107,13 +105,13 @@ def _span(read: Reader) -> Callable[[Sequence[TrialResult]], str]:
     return show
 
 
-def _each(read: Callable[[TrialResult], str | None]) -> Callable[[Sequence[TrialResult]], str]:
-    """Shows the different texts of trials."""
+def _distinct(read: Callable[[TrialResult], str | None]) -> Callable[[Sequence[TrialResult]], str]:
+    """A function that lists the different texts of trials."""
     return lambda trials: ", ".join(sorted({read(trial) or UNKNOWN for trial in trials}))
 
 
-def _rounds(trial: TrialResult) -> float | None:
-    """Say how often the densifier refined; a log that is missing or empty says nothing."""
+def _refinements(trial: TrialResult) -> float | None:
+    """The number of times that the densifier refined; None if the log is missing or empty."""
     return float(len(trial.folder.events())) or None
 
 
@@ -123,7 +121,7 @@ def _resolution(trial: TrialResult) -> str | None:
 
 
 def budget_words(trial: TrialResult) -> str | None:
-    """``15,000 Gaussians (governor), 600 s``; "none" without limits, None where nobody knows them."""
+    """``15,000 Gaussians (governor), 600 s``; "none" without limits, None if the budget is not recorded."""
     budget = trial.record.budget
     if budget is None:
         return None
@@ -139,80 +137,80 @@ def _code(trial: TrialResult) -> str | None:
     return ", ".join(filter(None, [program, f"gsbench {release}" if release else "", *parts])) or None
 
 
-# Settings that are shown of both arms, whether they differ in them or not.
+# Rows that every sheet has, with the function that shows an arm's trials.
 MEASURED: dict[str, Callable[[Sequence[TrialResult]], str]] = {
     "trials": lambda trials: str(len(trials)),
     "views for training": _span(lambda trial: trial.record.train_views),
     "held-out views": _span(lambda trial: trial.record.test_views),
-    "pictures": _each(_resolution),
-    "photographs (hash)": _each(lambda trial: trial.record.hashes.get("data", "")[:12]),
+    "pictures": _distinct(_resolution),
+    "photographs (hash)": _distinct(lambda trial: trial.record.hashes.get("data", "")[:12]),
     "initial points": _span(lambda trial: trial.record.num_init_points),
-    "initial cloud (hash)": _each(lambda trial: trial.cloud[:12]),
+    "initial cloud (hash)": _distinct(lambda trial: trial.cloud[:12]),
     "iterations": _span(lambda trial: trial.record.iterations),
-    "rounds of the densifier": _span(_rounds),
-    "budget": _each(budget_words),
+    "rounds of the densifier": _span(_refinements),
+    "budget": _distinct(budget_words),
     "Gaussians in the end": _span(lambda trial: trial.record.num_gaussians),
     "seconds of training": _span(lambda trial: trial.record.seconds.get("train")),
     "memory (MB)": _span(lambda trial: trial.record.peak_memory_mb),
-    "rasterizer": _each(lambda trial: trial.record.raster),
-    "protocol": _each(lambda trial: trial.record.protocol),
-    "machine": _each(lambda trial: trial.machine),
-    "code": _each(_code),
+    "rasterizer": _distinct(lambda trial: trial.record.raster),
+    "protocol": _distinct(lambda trial: trial.record.protocol),
+    "machine": _distinct(lambda trial: trial.machine),
+    "code": _distinct(_code),
 }
 
 
 def tuning_lines(trials: Sequence[TrialResult], pair: Sequence[Arm]) -> list[str]:
-    """List, for each arm of a pair, the searches for its values, and which values were tried in these trials.
+    """For each arm of a pair: the searches for its settings, and the settings that were varied among these trials.
 
-    Values that were tried in these trials were seen on the held-out views, which judge the verdict as well.
+    These trials are measured on the test views, so varying settings among them is tuning on the verdict's own views.
     """
     lines = [sentence] if (sentence := tuning_sentence(trials, pair)) else []
     for arm in pair:
         own = [trial for trial in trials if trial.arm == arm]
         lines += [_search_line(own, name, record) for name, record in _searches(own[0]).items()]
-        lines += _tried_here(trials, own[0])
+        lines += _varied_settings(trials, own[0])
     return lines or [NOTHING]
 
 
 def tuning_sentence(trials: Sequence[TrialResult], pair: Sequence[Arm]) -> str:
     """``They were not tuned alike: sfm-adc none, sfm-volumetric 6 points of 1 seed on validation views.``
 
-    Empty where two arms had the same budget. What counts are searches whose best has the very values of an arm; several
-    values that were all run as arms are no search, since each has its verdict.
+    "" if both arms had the same tuning budget. A search counts if its best point has exactly the arm's settings.
+    Settings that were all run as arms are no search, since each has its own verdict.
     """
     budgets = [_tuning_budget(next(trial for trial in trials if trial.arm == arm)) for arm in pair]
     if len(set(budgets)) < 2:
         return ""
-    said = listed([f"{arm} {budget}" for arm, budget in zip(pair, budgets, strict=True)])
-    return f"They were not tuned alike: {said}."
+    each = listed([f"{arm} {budget}" for arm, budget in zip(pair, budgets, strict=True)])
+    return f"They were not tuned alike: {each}."
 
 
 def _tuning_budget(trial: TrialResult) -> str:
-    """``6 points of 2 seeds on validation views``: of the largest search whose best the trial has; or ``none``."""
-    found = [one for one in _searches(trial).values() if _has_values(trial, one.best)]
-    if not found:
+    """``6 points of 2 seeds on validation views``: the largest search whose best point the trial has; or ``none``."""
+    searches = [search for search in _searches(trial).values() if _has_settings(trial, search.best)]
+    if not searches:
         return "none"
-    largest = max(found, key=lambda one: len(one.points) * len(one.seeds))
+    largest = max(searches, key=lambda search: len(search.points) * len(search.seeds))
     return f"{counted(len(largest.points), 'point')} of {counted(len(largest.seeds), 'seed')} on {VIEWS}"
 
 
 def _searches(trial: TrialResult) -> dict[str, TuningRecord]:
-    """The searches of a trial's arm in its runs folder, by their experiments: by its own sweep, and others that
-    proposed the trial's very values.
+    """The searches of a trial's arm in its runs folder, by experiment: those for its own sweep, and those that tried
+    exactly the trial's settings.
     """
     arm, sweep = f"{trial.init}-{trial.densify}", trial.path.parents[2].name
-    found = {}
+    searches = {}
     for file in sorted(trial.path.parents[3].glob(f"*/{TUNING}")):
-        one = read_if_sound(file, TuningRecord)
-        if one is None or one.arm != arm:
+        search = read_if_sound(file, TuningRecord)
+        if search is None or search.arm != arm:
             continue
-        if one.sweep == sweep or any(_has_values(trial, point) for point in one.points):
-            found[file.parent.name] = one
-    return found
+        if search.sweep == sweep or any(_has_settings(trial, point) for point in search.points):
+            searches[file.parent.name] = search
+    return searches
 
 
 def _search_line(own: Sequence[TrialResult], experiment: str, search: TuningRecord) -> str:
-    """Say what a search tried of an arm and chose, and whether the arm's trials ``own`` came later and have that."""
+    """Say what a search tried and chose for an arm, and whether the arm's trials ``own`` came later and use it."""
     best = search.best
     if best is None:
         return f"{search.arm}: the search {experiment} found nothing."
@@ -228,11 +226,11 @@ def _search_line(own: Sequence[TrialResult], experiment: str, search: TuningReco
         f"{_when(own, experiment)}. "
         f"Tried: {', '.join(tried)}{f' and {more} more' if more > 0 else ''}."
     )
-    return line if _has_values(own[0], best) else f"{line} These trials have other values."
+    return line if _has_settings(own[0], best) else f"{line} These trials have other values."
 
 
 def _when(own: Sequence[TrialResult], experiment: str) -> str:
-    """Say whether the trials of the search were measured before these: a search that ends later may follow them."""
+    """Say whether the search ended before these trials: a search that ends later may be guided by their results."""
     times = [trial.measured for trial in read_experiment(own[0].path.parents[3] / experiment).trials]
     if not times:
         return "whose own trials are missing"
@@ -240,11 +238,11 @@ def _when(own: Sequence[TrialResult], experiment: str) -> str:
     return f"ended when {later} of these {len(own)} trials had been measured" if later else "before any of these trials"
 
 
-def _tried_here(trials: Sequence[TrialResult], own: TrialResult) -> list[str]:
-    """Name the settings in which arms of one class differ within an experiment: several values were tried."""
+def _varied_settings(trials: Sequence[TrialResult], own: TrialResult) -> list[str]:
+    """Name the settings that were varied among the experiment's arms with one initialiser and densifier class."""
     target = own.config.get("densify._target_")
-    kin = [t for t in trials if t.init == own.init and t.config and t.config.get("densify._target_") == target]
-    choices = [group[0] for group in by_key(kin, lambda trial: trial.arm).values()]
+    same_class = [t for t in trials if t.init == own.init and t.config and t.config.get("densify._target_") == target]
+    choices = [group[0] for group in by_key(same_class, lambda trial: trial.arm).values()]
     keys = sorted({key for other in choices for key in differing_keys(own.config, other.config)})
     if len(choices) < 2 or not keys:
         return []
@@ -254,9 +252,9 @@ def _tried_here(trials: Sequence[TrialResult], own: TrialResult) -> list[str]:
     ]
 
 
-def _has_values(trial: TrialResult, point: Point | None) -> bool:
-    """Return whether a trial has the very values of a point."""
+def _has_settings(trial: TrialResult, point: Point | None) -> bool:
+    """Return whether a trial has exactly the settings of a search point."""
     if point is None or not point.settings:
         return False
-    settings = {key.lstrip("+~"): value for key, value in point.settings.items()}
+    settings = {key.lstrip("+~"): value for key, value in point.settings.items()}  # without Hydra's override prefixes
     return all(trial.config.get(key) == value for key, value in settings.items())

@@ -1,4 +1,4 @@
-"""The pictures of a trial's test views: the error in their textured parts, and the views in which two arms differ."""
+"""Pictures of test views: the error in textured parts, and two arms' renders side by side."""
 
 import base64
 import io
@@ -17,16 +17,16 @@ from gsbench.records import Number, Record, read_if_sound
 from gsbench.runs.layout import FROM_PIXELS, GROUND_TRUTH, MASKS, RENDERS
 from gsbench.scene.masks import read_mask
 
-TEXTURE_SIGMA = 2.0  # px: texture energy is the gradient's square averaged over such a Gaussian
+TEXTURE_SIGMA = 2.0  # px: the Gaussian over which the squared gradient is averaged
 LUMINANCE = (0.2126, 0.7152, 0.0722)  # Rec. 709
-TEXTURED_SHARE = 0.2  # of a photograph's pixels, those with the most texture
-STRIPE, STRIPES = 4, (110, 150)  # px, grey levels: how ignored pixels are shown
-WIDEST = 1200  # px: whole views are shown at most as wide
-FULL_COLOUR = 32.0  # 8-bit levels: differences of error from here on have the strongest colour
+TEXTURED_SHARE = 0.2  # share of a photograph's pixels that count as textured
+STRIPE, STRIPES = 4, (110, 150)  # px, grey levels: stripes over ignored pixels
+WIDEST = 1200  # px: largest width and height of a shown view
+FULL_COLOUR = 32.0  # 8-bit levels: difference of error that has the strongest colour
 
 Array = NDArray[np.float64]
 Pixels = NDArray[np.uint8]  # [H, W, 3]
-Pair = tuple[TrialResult, TrialResult]
+TrialPair = tuple[TrialResult, TrialResult]
 
 
 def texture_energy(image: Pixels) -> Array:
@@ -39,7 +39,7 @@ def texture_energy(image: Pixels) -> Array:
 
 
 def read_ignored(trial: TrialResult, view: str) -> NDArray[np.bool_] | None:
-    """True where a mask ignores a pixel of the test view, [H, W]; None where all count."""
+    """The pixels [H, W] of a test view that a mask ignores; None without a mask."""
     path = trial.path / MASKS / f"{view}.png"
     return ~read_mask(path) if path.is_file() else None
 
@@ -50,20 +50,21 @@ def absolute_error(render: Pixels, truth: Pixels) -> Array:
 
 
 @dataclass(frozen=True, kw_only=True)
-class FromPixels(Record):
-    """Measures of a trial's pictures, as an archive keeps them, which has no pictures."""
+class PixelMeasures(Record):
+    """Measures of a trial's pictures, which an archive stores in place of the pictures."""
 
     error_textured: Number
 
 
 def textured_error(trial: TrialResult) -> float:
-    """Mean absolute error (8-bit levels) over the most textured fifth of each held-out photograph, mean over views.
+    """Mean absolute error (8-bit levels) over the most textured fifth of each test photograph, mean over views.
 
-    Grass, foliage, fabric and gravel lie there. Raises InputError where renders are missing, and so is their measure.
+    This fifth shows grass, foliage, fabric or gravel. Raises InputError if neither renders nor their stored measure
+    exist.
     """
-    kept = read_if_sound(trial.path / FROM_PIXELS, FromPixels)
-    if kept is not None:
-        return float(kept.error_textured)
+    stored = read_if_sound(trial.path / FROM_PIXELS, PixelMeasures)
+    if stored is not None:
+        return float(stored.error_textured)
     errors = []
     for view in view_names(trial):
         truth = read_image(trial.path / GROUND_TRUTH / f"{view}.png")
@@ -76,7 +77,7 @@ def textured_error(trial: TrialResult) -> float:
 
 
 def view_names(trial: TrialResult) -> list[str]:
-    """The names of the rendered test views, sorted; raises ``InputError`` where there are none."""
+    """The names of the rendered test views, sorted; raises ``InputError`` if there are none."""
     folder = trial.path / RENDERS
     names = sorted(path.stem for path in folder.glob("*.png"))
     if not names:
@@ -85,7 +86,7 @@ def view_names(trial: TrialResult) -> list[str]:
 
 
 def read_image(path: Path) -> Pixels:
-    """An image as [H, W, 3] uint8; raises ``InputError`` naming a damaged or missing file."""
+    """An image as [H, W, 3] uint8; raises ``InputError`` that names a damaged or missing file."""
     try:
         with Image.open(path) as image:
             return np.asarray(image.convert("RGB"))
@@ -94,13 +95,13 @@ def read_image(path: Path) -> Pixels:
 
 
 @dataclass(frozen=True)
-class WholeView:
-    """One test view: data URIs of the photograph, both renders and their difference, and the mean errors (levels).
+class ViewComparison:
+    """One test view of two arms: data URIs of photograph, renders and difference, and the mean errors (8-bit levels).
 
-    The difference is blue where the second arm is nearer to the photograph, red where the first is.
+    The difference is blue where the second arm is nearer to the photograph, red where the first arm is.
     """
 
-    which: str  # of all views, such as "the view with the least gain"
+    which: str  # such as "the view with the least gain"
     scene: str
     view: str
     seed: int
@@ -112,46 +113,47 @@ class WholeView:
     second_error: float
 
 
-def choose_views(pairs: Sequence[Pair]) -> tuple[list[WholeView], list[str]]:
-    """Choose the worst, the median and the best view of all, by gain; the second list says what could not be read.
+def choose_views(pairs: Sequence[TrialPair]) -> tuple[list[ViewComparison], list[str]]:
+    """The views with the least, the median and the largest gain, and messages on what could not be read.
 
-    A view's gain is the mean error of the first arm minus that of the second. One seed of each scene is looked at.
+    A view's gain is the first arm's mean error minus the second arm's. Of each scene, one seed is used: the first whose
+    pictures can be read.
     """
-    views: list[tuple[float, Pair, str]] = []
+    views: list[tuple[float, TrialPair, str]] = []
     faults: dict[str, str] = {}  # by scene
-    seen: set[str] = set()
+    scenes_read: set[str] = set()
     for one, other in pairs:
-        if one.scene in seen:
+        if one.scene in scenes_read:
             continue
         try:
             for view in view_names(one):
                 first, second, truth = _read(one, other, view)
                 gain = absolute_error(first, truth).mean() - absolute_error(second, truth).mean()
                 views.append((float(gain), (one, other), view))
-            seen.add(one.scene)
+            scenes_read.add(one.scene)
         except InputError as error:
             faults.setdefault(one.scene, str(error))
-    return [_whole(which, *place) for which, place in _worst_median_best(views)], list(faults.values())
+    return [_compare_view(which, pair, view) for which, pair, view in _worst_median_best(views)], list(faults.values())
 
 
-def _worst_median_best(views: Sequence[tuple[float, Pair, str]]) -> list[tuple[str, tuple[Pair, str]]]:
-    """The views with the least, the median and the largest gain, each once."""
-    ordered = sorted(views, key=lambda entry: (entry[0], entry[1][0].label, entry[2]))
+def _worst_median_best(views: Sequence[tuple[float, TrialPair, str]]) -> list[tuple[str, TrialPair, str]]:
+    """From (gain, pair, view), the views with the least, the median and the largest gain, each once."""
+    ordered = sorted(views, key=lambda view: (view[0], view[1][0].label, view[2]))
     if len(ordered) < 2:
-        return [("the only view", entry[1:]) for entry in ordered]
+        return [("the only view", pair, view) for _, pair, view in ordered]
     chosen = [("the view with the least gain", ordered[0]), ("the view with the largest gain", ordered[-1])]
     if len(ordered) > 2:
         chosen.insert(1, ("the view with the median gain", ordered[len(ordered) // 2]))
-    return [(which, entry[1:]) for which, entry in chosen]
+    return [(which, pair, view) for which, (_, pair, view) in chosen]
 
 
-def _whole(which: str, pair: Pair, view: str) -> WholeView:
+def _compare_view(which: str, pair: TrialPair, view: str) -> ViewComparison:
     first, second, truth = _read(*pair, view)
     errors = [absolute_error(image, truth) for image in (first, second)]  # [H, W] each
-    part = np.clip((errors[0] - errors[1]) / FULL_COLOUR, -1, 1)[..., None]  # [H, W, 1], 1 where the second is nearer
+    gain = np.clip((errors[0] - errors[1]) / FULL_COLOUR, -1, 1)[..., None]  # [H, W, 1], 1 where the second is nearer
     white, blue, red = (np.array(colour) for colour in ((255, 255, 255), (33, 102, 172), (178, 24, 43)))
-    colours = white + np.abs(part) * (np.where(part > 0, blue, red) - white)
-    return WholeView(
+    colours = white + np.abs(gain) * (np.where(gain > 0, blue, red) - white)
+    return ViewComparison(
         which,
         pair[0].scene,
         view,
@@ -166,7 +168,7 @@ def _whole(which: str, pair: Pair, view: str) -> WholeView:
 
 
 def _jpeg_uri(image: Pixels) -> str:
-    """A whole picture as a data URI: as PNG it would make the page ten times as large."""
+    """A picture as a JPEG data URI; PNG would make the page ten times as large."""
     picture = Image.fromarray(image)
     picture.thumbnail((WIDEST, WIDEST))
     return _data_uri(picture, "jpeg", quality=92, subsampling=0)
@@ -184,7 +186,7 @@ def _data_uri(picture: Image.Image, kind: str, **options: Any) -> str:
 
 
 def _read(one: TrialResult, other: TrialResult, view: str) -> list[Pixels]:
-    """Both renders and the photograph, ignored pixels striped."""
+    """Both renders and the photograph, with stripes over ignored pixels."""
     first = read_image(one.path / RENDERS / f"{view}.png")
     second = read_image(other.path / RENDERS / f"{view}.png")
     truth = read_image(one.path / GROUND_TRUTH / f"{view}.png")
@@ -196,7 +198,7 @@ def _read(one: TrialResult, other: TrialResult, view: str) -> list[Pixels]:
 
 
 def _hatched(image: Pixels, ignored: NDArray[np.bool_]) -> Pixels:
-    """``image`` with stripes on ignored pixels, which are thus equal in all images."""
+    """``image`` with stripes over ignored pixels; the stripes are the same in all images, so they show no error."""
     rows, columns = np.indices(ignored.shape)
     stripes = np.where((rows + columns) % (2 * STRIPE) < STRIPE, *STRIPES).astype(np.uint8)  # [H, W]
     return np.where(ignored[..., None], stripes[..., None], image)

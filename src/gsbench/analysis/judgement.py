@@ -1,7 +1,7 @@
-"""The one engine of evidence: `judge` says what the pairs of trials say that a declaration's questions compare.
+"""The verdicts on the questions of a declaration. `judge` is the only code that decides them.
 
-Reports, tables, checks of claims, sweeps that stop when decided, planning, ablation and pooling call it and
-`gsbench.analysis.pairing.pair`.
+It serves reports, tables, checks of claims, sweeps that stop when decided and ablations, and gets its pairs of trials
+from `gsbench.analysis.pairing.find_pairs`.
 """
 
 import math
@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gsbench.analysis.pairing import Pairs, TrialPair, pair
+from gsbench.analysis.pairing import Pairs, TrialPair, find_pairs
 from gsbench.analysis.quantities import Quantity, asked_quantity
 from gsbench.analysis.results import TrialResult, by_key
 from gsbench.analysis.statistics import (
@@ -21,21 +21,21 @@ from gsbench.analysis.statistics import (
     LikeThese,
     Outcome,
     answer_family,
-    like_these,
+    judge_like_these,
     look_levels,
-    student,
+    t_test,
 )
 from gsbench.runs.declaration import Declaration, Question
 from gsbench.words import counted, signed
 
-OUTLYING = 5.0  # deviations of other trials of its scene and arm, beyond which a trial is named
-LEAST_OTHERS = 2  # trials that one must be held against
-FEW = 1.2  # the deviation in medians of the deviations of three trials, which come out too small
+OUTLYING = 5.0  # deviations from the other trials of its scene and arm, beyond which a trial is outlying
+LEAST_OTHERS = 2  # other trials that this needs
+FEW = 1.2  # corrects the median sample deviation of three trials, which is too small: 1 / sqrt(ln 2)
 
 
 @dataclass(frozen=True)
 class SceneVerdict:
-    """One scene of a verdict: the mean of its pairs' differences, its test adjusted for all scenes of all questions."""
+    """One scene of a verdict: its mean paired difference, with a test adjusted for all scenes of all questions."""
 
     scene: str
     mean: float
@@ -47,15 +47,15 @@ class SceneVerdict:
 
 @dataclass(frozen=True)
 class Verdict:
-    """The answer to a question from the ``pairs`` that count.
+    """The answer to a question from ``pairs`` of trials.
 
-    ``answer`` is about these scenes, None where nothing could be paired; ``like_these`` about scenes like them.
-    ``untestable`` says why the question cannot be answered from such trials at all. ``seeds`` is the look that
-    decided, or the last one so far; ``final`` is False where further seeds are planned and may decide. Trials far
-    outside the others of their scene and arm are ``outlying``; ``without`` is what is said without them. A verdict that
-    ``hangs`` on them, since the mean of the others contradicts it, is undecided. ``late`` trials had been measured
-    before the question was asked; then the metric is one of all that could have been chosen, and has its part of the
-    error rate.
+    ``answer`` is about these scenes, None if no trials could be paired; ``like_these`` is about scenes like these.
+    ``untestable`` says why such trials can never answer the question. ``final`` is False while further planned seeds
+    may decide. ``outlying`` trials lie far outside the others of their scene and arm; ``outcome_without`` is the
+    outcome without them. If the mean of the other trials contradicts the outcome, the verdict
+    ``rests_on_outlying`` trials and is undecided. ``late`` is the number of trials that were measured before the
+    question was asked. If there are any, each metric could have been chosen by its result, and the error rate is
+    divided by the number of metrics.
     """
 
     question: Question
@@ -69,8 +69,8 @@ class Verdict:
     final: bool = True
     untestable: str = ""
     outlying: tuple[TrialResult, ...] = ()
-    without: Outcome | None = None
-    hangs: bool = False
+    outcome_without: Outcome | None = None
+    rests_on_outlying: bool = False
     late: int = 0
     notes: tuple[str, ...] = ()
 
@@ -92,7 +92,7 @@ class Verdict:
 
     @property
     def relative(self) -> float:
-        """The mean difference as a part of the baseline's value."""
+        """The mean difference relative to the baseline's value."""
         if self.mean is None:
             return math.nan
         if self.pairs.relative:
@@ -101,17 +101,17 @@ class Verdict:
 
     @property
     def deviation(self) -> float | None:
-        """The deviation of pairs within scenes; None without a repetition."""
+        """The deviation of paired differences within scenes; None with one pair per scene."""
         values = self.pairs.differences if self.pairs.rows else np.empty((0, 0))
         return float(np.sqrt(values.var(axis=1, ddof=1).mean())) if self.pairs.seeds > 1 else None
 
     @property
     def equal(self) -> bool:
-        """Return whether no pair differs at all."""
+        """Return whether all pairs have a difference of exactly 0."""
         return bool(self.pairs.rows) and not self.pairs.differences.any()
 
     def shown(self, value: float) -> str:
-        """A difference as people read it: ``−0.0123``, or ``+28.4 %`` of one that is a part of the baseline's."""
+        """A difference as text: ``−0.0123``, or ``+28.4 %`` if the question is relative."""
         if self.question.relative:
             return f"{signed(100 * math.expm1(value), '.1f')} %"
         return signed(value, f".{self.quantity.decimals + 1}f")
@@ -121,46 +121,49 @@ class Verdict:
 
 
 def margin(question: Question) -> float | None:
-    """The least difference that matters, in the scale in which trials are compared."""
+    """The least difference that matters; for a relative question in logarithms, in which it is tested."""
     return math.log1p(question.least) if question.relative and question.least is not None else question.least
 
 
 def judge(trials: Sequence[TrialResult], declaration: Declaration) -> list[Verdict]:
-    """The verdict on each question of ``declaration`` from those of ``trials`` that it compares, in their order.
+    """The verdicts on the questions of ``declaration`` from ``trials``, in the order of the questions.
 
-    Questions share the error rate. Where seeds come in looks, they share it equally, and each is answered at the first
-    look that decides it; otherwise they are one family by Holm's method. Secondary questions have a rate of their own.
+    Questions share the error rate. If seeds come in looks, each question gets an equal share and is answered at the
+    first look that decides it; otherwise Holm's method adjusts them as one family. Secondary questions have an error
+    rate of their own.
     """
     by_arm, by_folder = by_key(trials, lambda trial: trial.arm), by_key(trials, lambda trial: trial.key)
 
-    def own(question: Question) -> list[TrialResult]:
-        """The trials of the question's arms: to search all trials for each of many questions takes long."""
+    def trials_of(question: Question) -> list[TrialResult]:
+        # Grouped once above: searching all trials for each of many questions is slow.
         if question.scenes:
             keys = dict.fromkeys(key for both in question.scenes.values() for key in both)
             return [trial for key in keys for trial in by_folder.get(key, [])]
         return [trial for arm in (question.baseline, question.arm) for trial in by_arm.get(arm, [])]  # type: ignore[arg-type]
 
-    asked = [_asked(own(question), question, declaration) for question in declaration.questions]
-    found: dict[int, Verdict] = {k: one for k, one in enumerate(asked) if one.untestable or not one.pairs.rows}
+    unjudged = [_with_pairs(trials_of(question), question, declaration) for question in declaration.questions]
+    judged: dict[int, Verdict] = {k: one for k, one in enumerate(unjudged) if one.untestable or not one.pairs.rows}
     for secondary in (False, True):
-        places = [k for k, one in enumerate(asked) if k not in found and one.question.secondary == secondary]
+        family = [k for k, one in enumerate(unjudged) if k not in judged and one.question.secondary == secondary]
+        # With looks, the shares of the error rate were fixed beforehand: questions without pairs keep theirs.
         sharing = sum(question.secondary == secondary for question in declaration.questions)
         if declaration.looks:
-            for k in places:
-                rate = declaration.error_rate / sharing / _candidates(asked[k])
-                found[k] = _at_looks(asked[k], declaration.looks, rate)
+            for k in family:
+                rate = declaration.error_rate / sharing / _candidate_metrics(unjudged[k])
+                judged[k] = _at_looks(unjudged[k], declaration.looks, rate)
         else:
-            late = max((_candidates(asked[k]) for k in places), default=1)
-            answers = answer_family([asked[k].pairs.differences for k in places], declaration.error_rate / late)
-            for k, answer in zip(places, answers, strict=True):
-                found[k] = _answered(replace(asked[k], family=len(places)), answer)
-    return _with_scenes([found[k] for k in range(len(asked))], declaration.error_rate)
+            candidates = max((_candidate_metrics(unjudged[k]) for k in family), default=1)
+            differences = [unjudged[k].pairs.differences for k in family]
+            answers = answer_family(differences, declaration.error_rate / candidates)
+            for k, answer in zip(family, answers, strict=True):
+                judged[k] = _decide(replace(unjudged[k], family=len(family)), answer)
+    return _with_scenes([judged[k] for k in range(len(unjudged))], declaration.error_rate)
 
 
-def _asked(trials: Sequence[TrialResult], question: Question, declaration: Declaration) -> Verdict:
-    """The question with its pairs, before it is answered."""
-    pairs = pair(trials, question)
-    new = pairs.trials[1::2] if question.versions else pairs.trials  # a baseline alone tells no difference
+def _with_pairs(trials: Sequence[TrialResult], question: Question, declaration: Declaration) -> Verdict:
+    """The question with its pairs of trials, not judged yet."""
+    pairs = find_pairs(trials, question)
+    new = pairs.trials[1::2] if question.versions else pairs.trials  # an earlier baseline alone shows no difference
     late = sum(trial.measured < declaration.moment for trial in new)
     quantity = asked_quantity(question.metric, trials)
     verdict = Verdict(question, quantity, pairs, notes=pairs.left_out, late=late, final=not declaration.looks)
@@ -178,110 +181,109 @@ def _asked(trials: Sequence[TrialResult], question: Question, declaration: Decla
     return verdict
 
 
-def _candidates(verdict: Verdict) -> int:
-    """The number of metrics of which the question's could have been chosen: one where it was asked beforehand."""
+def _candidate_metrics(verdict: Verdict) -> int:
+    """The number of metrics that could have been chosen by their results: 1 if the question was asked beforehand."""
     if not verdict.late:
         return 1
     return len({name for trial in verdict.pairs.trials for name in trial.metrics} | {verdict.question.metric})
 
 
 def _at_looks(asked: Verdict, looks: tuple[int, ...], rate: float) -> Verdict:
-    """Go through the looks that the trials suffice for, and stop at the first that decides."""
+    """Judge at each look that has enough seeds, and stop at the first look that decides."""
     verdict = replace(asked, pairs=asked.pairs.first(0), final=False)
     for seeds, level in zip(looks, look_levels(len(asked.pairs.rows), looks, rate), strict=True):
         if seeds > asked.pairs.seeds:
             break
         pairs = asked.pairs.first(seeds)
-        test = student(pairs.differences)
+        test = t_test(pairs.differences)
         answer = Answer(float(pairs.differences.mean()), test, rate, level, level)
-        verdict = _answered(replace(asked, pairs=pairs), answer)
+        verdict = _decide(replace(asked, pairs=pairs), answer)
         verdict = replace(verdict, final=verdict.outcome != UNDECIDED or seeds == looks[-1])
         if verdict.final:
             break
     return verdict
 
 
-def _answered(verdict: Verdict, answer: Answer) -> Verdict:
-    """The verdict with its outcome; undecided where it hangs on trials that lie far outside the others."""
+def _decide(verdict: Verdict, answer: Answer) -> Verdict:
+    """The verdict with its outcome; undecided if it rests on outlying trials."""
     question, least, pairs = verdict.question, margin(verdict.question), verdict.pairs
     level = answer.level if question.scenes else answer.level / verdict.family
-    about = like_these(pairs.differences.mean(axis=1), question.sign, least, level)
+    about_like_these = judge_like_these(pairs.differences.mean(axis=1), question.sign, least, level)
     outcome = answer.outcome(question.sign, least)
-    without, hangs = None, False
+    outcome_without, rests_on_outlying = None, False
     if outlying := find_outlying(pairs):
         rest = pairs.without(outlying)
-        fewer = replace(answer, test=student(rest.differences)) if rest.rows else replace(answer, test=None)
-        without = fewer.outcome(question.sign, least)
-        hangs = bool(rest.rows) and _contradicts(float(rest.differences.mean()), answer.mean, outcome, least)
+        answer_without = replace(answer, test=t_test(rest.differences) if rest.rows else None)
+        outcome_without = answer_without.outcome(question.sign, least)
+        if rest.rows:
+            rests_on_outlying = _contradicts(float(rest.differences.mean()), answer.mean, outcome, least)
     return replace(
         verdict,
         answer=answer,
-        like_these=about,
-        outcome="undecided" if hangs else outcome,
+        like_these=about_like_these,
+        outcome="undecided" if rests_on_outlying else outcome,
         outlying=tuple(outlying),
-        without=without,
-        hangs=hangs,
+        outcome_without=outcome_without,
+        rests_on_outlying=rests_on_outlying,
     )
 
 
 def _contradicts(rest: float, mean: float, outcome: Outcome, least: float | None) -> bool:
-    """Return whether the mean of the other trials has the other sign, or is not too small, where all decided so."""
+    """Return whether ``rest``, the mean without outlying trials, contradicts the outcome that ``mean`` led to.
+
+    It does if it is not too small although the outcome says so, or if it has the other sign.
+    """
     if outcome == TOO_SMALL:
         return least is not None and abs(rest) >= least
     return outcome != UNDECIDED and rest * mean <= 0
 
 
 def find_outlying(pairs: Pairs) -> list[TrialResult]:
-    """The trials that lie more than `OUTLYING` deviations outside the others of their scene and arm.
+    """The trials that lie more than `OUTLYING` deviations from the mean of the other trials of their scene and arm.
 
-    The deviation is the largest of the others' own, that of the scene's other arm, and the typical one of all scenes,
-    since that of two or three trials is often small by chance.
+    The deviation of two or three trials is often small by chance. So the largest of three counts: the other trials'
+    deviation, that of the scene's other arm, and the typical deviation over all scenes and arms.
     """
     rows = [row for row in pairs.rows if len(row.seeds) > LEAST_OTHERS]
-    spreads = [(float(row.before.std(ddof=1)), float(row.after.std(ddof=1))) for row in rows]
-    ordered = sorted(spread for both in spreads for spread in both)
+    deviations = [(float(row.baseline.std(ddof=1)), float(row.arm.std(ddof=1))) for row in rows]
+    ordered = sorted(deviation for both in deviations for deviation in both)
     typical = FEW * ordered[(len(ordered) - 1) // 2] if ordered else 0.0
-    found = []
-    for row, both in zip(rows, spreads, strict=True):
-        for side, values in enumerate((row.before, row.after)):
-            for place, value in enumerate(values):
-                others = np.delete(values, place)
+    outlying = []
+    for row, both in zip(rows, deviations, strict=True):
+        for side, values in enumerate((row.baseline, row.arm)):
+            for index, value in enumerate(values):
+                others = np.delete(values, index)
                 deviation = max(float(others.std(ddof=1)), both[1 - side], typical)
                 if abs(value - others.mean()) > OUTLYING * deviation > 0:
-                    found.append(row.trials[place][side])
-    return found
+                    outlying.append(row.trials[index][side])
+    return outlying
 
 
-def _is_equal(both: TrialPair) -> bool:
-    """Return whether the two models are one and the same, as far as numbers tell."""
-    one, other = both
+def _is_equal(trials: TrialPair) -> bool:
+    """Return whether two trials have the same metrics and number of Gaussians."""
+    one, other = trials
     same_count = one.record.num_gaussians == other.record.num_gaussians
     return bool(one.metrics) and one.metrics == other.metrics and same_count
 
 
 def _with_scenes(verdicts: Sequence[Verdict], level: float) -> list[Verdict]:
-    """The verdicts with their single scenes, which are one family over all questions; one scene is the whole."""
-    rows = [verdict.pairs.differences if verdict.answer is not None else np.empty((0, 1)) for verdict in verdicts]
-    answers = iter(answer_family([row[None] for own in rows if len(own) > 1 for row in own], level))
-    return [
-        replace(
-            verdict,
-            scenes=tuple(
-                SceneVerdict(
-                    scene,
-                    float(row.mean()),
-                    float(row.std(ddof=1)) if len(row) > 1 else None,
-                    len(row),
-                    *(
-                        (one.interval, one.p)
-                        if (one := next(answers) if len(own) > 1 else verdict.answer)
-                        else (None, None)
-                    ),
-                )
-                for scene, row in zip(verdict.pairs.scenes, own, strict=True)
-            )
-            if verdict.answer is not None
-            else (),
-        )
-        for verdict, own in zip(verdicts, rows, strict=True)
-    ]
+    """The verdicts with a `SceneVerdict` for each scene.
+
+    All scenes of all questions are one family. If a question has one scene, that scene has the question's own answer.
+    """
+    answered = [verdict for verdict in verdicts if verdict.answer is not None]
+    several = [verdict.pairs.differences for verdict in answered if len(verdict.pairs.rows) > 1]
+    answers = iter(answer_family([row[None] for differences in several for row in differences], level))
+    completed = []
+    for verdict in verdicts:
+        if verdict.answer is None:
+            completed.append(verdict)
+            continue
+        rows = list(zip(verdict.pairs.scenes, verdict.pairs.differences, strict=True))
+        scenes = []
+        for scene, row in rows:
+            answer = next(answers) if len(rows) > 1 else verdict.answer
+            deviation = float(row.std(ddof=1)) if len(row) > 1 else None
+            scenes.append(SceneVerdict(scene, float(row.mean()), deviation, len(row), answer.interval, answer.p))
+        completed.append(replace(verdict, scenes=tuple(scenes)))
+    return completed

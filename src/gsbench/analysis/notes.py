@@ -1,10 +1,10 @@
-"""Notes below a table and beside a verdict: who trained, what was declared, in what else arms differ."""
+"""Notes below tables and beside verdicts: who trained, what was declared, how else the arms differ."""
 
 from collections import Counter
 from collections.abc import Sequence
 
 from gsbench.analysis.cells import with_variants
-from gsbench.analysis.declaration import standing
+from gsbench.analysis.declaration import active_declaration
 from gsbench.analysis.fairness import caveats
 from gsbench.analysis.pairing import choose_pairs, controls_of
 from gsbench.analysis.results import Arm, Experiment, TrialResult, by_key, seeds_words
@@ -13,7 +13,7 @@ from gsbench.runs.layout import TUNING
 from gsbench.runs.trial_record import FROM_MODEL, FROM_RENDERS
 from gsbench.words import counted
 
-ORIGINS = (  # who trained (here or elsewhere), what was measured, and how that is said
+ORIGINS = (  # trained here by another program (or elsewhere), what was measured, and its description
     (True, FROM_MODEL, "Trained here by another program, its model rendered by gsbench"),
     (True, FROM_RENDERS, "Trained here by another program, its own renders measured as they are"),
     (False, FROM_MODEL, "A model that another program trained, rendered here"),
@@ -22,14 +22,19 @@ ORIGINS = (  # who trained (here or elsewhere), what was measured, and how that 
 
 
 def trials_notes(experiment: Experiment, trials: Sequence[TrialResult]) -> list[str]:
-    """All that must be known of ``trials`` of an experiment, and of the comparison that they are part of."""
-    of_trials = (held_out_notes, points_notes, machine_notes, cloud_notes)
-    notes = origin_notes(trials) + comparison_notes(experiment)
-    return notes + [line for say in of_trials for line in say(trials)]
+    """All notes on ``trials`` of an experiment and on its comparisons."""
+    return [
+        *origin_notes(trials),
+        *comparison_notes(experiment),
+        *held_out_notes(trials),
+        *points_notes(trials),
+        *machine_notes(trials),
+        *cloud_notes(trials),
+    ]
 
 
 def origin_notes(trials: Sequence[TrialResult]) -> list[str]:
-    """Lines that say which arms gsbench did not train, and what of them it saw."""
+    """Lines on the arms that gsbench did not train: who did, and whether a model or renders were measured."""
     notes = []
     others = [trial for trial in trials if trial.program or trial.made_elsewhere]
     for here, measured, what in ORIGINS:
@@ -46,15 +51,15 @@ def origin_notes(trials: Sequence[TrialResult]) -> list[str]:
 
 
 def comparison_notes(experiment: Experiment) -> list[str]:
-    """Lines on the arms that are compared: the declared verdict, which are equal to the last bit, and caveats.
+    """Lines on the compared arms: the declared verdict, arms that are equal to the last bit, and caveats.
 
-    They are of the whole experiment: nobody can choose a verdict by choosing the trials that a table shows.
+    They are about the whole experiment, so choosing the trials that a table shows cannot change a verdict.
     """
     trials, pairs = compared_pairs(experiment)
-    declared = standing(experiment.folder, experiment.trials)
+    declared = active_declaration(experiment.folder, experiment.trials)
     notes = []
     if declared is not None:
-        from gsbench.analysis.verdicts import declared_lines, judge_pairs  # here, for a quick start without a test
+        from gsbench.analysis.verdicts import declared_lines, judge_pairs  # here, since SciPy is slow to import
 
         notes = declared_lines(declared, judge_pairs(trials, pairs, declared))
     by_arm = by_key(trials, lambda trial: trial.arm)
@@ -64,8 +69,8 @@ def comparison_notes(experiment: Experiment) -> list[str]:
             notes.append(
                 f"{names} are equal to the last bit in all their trials: the settings that differ had no effect."
             )
-    said = (caveats([*by_arm[first], *by_arm[second]], first, second) for first, second in pairs)
-    return notes + list(filter(None, said))
+    sentences = (caveats([*by_arm[first], *by_arm[second]], first, second) for first, second in pairs)
+    return notes + list(filter(None, sentences))
 
 
 def _are_equal(first: Sequence[TrialResult], second: Sequence[TrialResult]) -> bool:
@@ -79,7 +84,7 @@ def _are_equal(first: Sequence[TrialResult], second: Sequence[TrialResult]) -> b
 
 
 def compared_pairs(experiment: Experiment) -> tuple[list[TrialResult], list[tuple[Arm, Arm]]]:
-    """The experiment's trials as arms, and the pairs of arms that are compared. Points of a search are not."""
+    """The experiment's trials with their variants, and the pairs of arms to compare: none in a search."""
     trials = with_variants(experiment.trials)
     if (experiment.folder / TUNING).exists():
         return trials, []
@@ -88,7 +93,7 @@ def compared_pairs(experiment: Experiment) -> tuple[list[TrialResult], list[tupl
 
 
 def machine_notes(trials: Sequence[TrialResult]) -> list[str]:
-    """A line that names the kinds of machine, where trials ran on several."""
+    """A line that names the kinds of machine if trials ran on several."""
     kinds = Counter(trial.machine for trial in trials)
     unknown = kinds.pop(None, 0)
     if len(kinds) < 2:
@@ -102,7 +107,7 @@ def machine_notes(trials: Sequence[TrialResult]) -> list[str]:
 
 
 def cloud_notes(trials: Sequence[TrialResult]) -> list[str]:
-    """A line for each scene and initialiser whose trials, by the same settings, started from several clouds."""
+    """A line for each scene and initialiser whose trials have the same settings but started from several clouds."""
     notes = []
     groups = by_key(trials, lambda trial: (trial.scene, trial.init, trial.record.hashes.get("init")))
     for (scene, init, _), group in groups.items():
@@ -114,21 +119,21 @@ def cloud_notes(trials: Sequence[TrialResult]) -> list[str]:
 
 
 def held_out_notes(trials: Sequence[TrialResult]) -> list[str]:
-    """A line for each way in which views were held out, with the scenes where there are several."""
+    """A line for each way in which views were held out; it names the scenes if there are several ways and scenes."""
     notes = []
-    told = [trial for trial in trials if trial.record.held_out]
-    ways = by_key(told, lambda trial: (trial.question, trial.record.held_out))
-    for (question, words), group in sorted(ways.items(), key=lambda item: (-len(item[1]), item[0])):
+    recorded = [trial for trial in trials if trial.record.held_out]
+    splits = by_key(recorded, lambda trial: (trial.question, trial.record.held_out))
+    for (question, words), group in sorted(splits.items(), key=lambda item: (-len(item[1]), item[0])):
         scenes = sorted({trial.scene for trial in group})
         counts = sorted({(trial.record.test_views or 0, trial.record.train_views or 0) for trial in group})
         views = " and ".join(f"{test} of {test + train} views" for test, train in counts)
-        where = f", {', '.join(scenes)}" if len(ways) > 1 and len({trial.scene for trial in told}) > 1 else ""
+        where = f", {', '.join(scenes)}" if len(splits) > 1 and len({trial.scene for trial in recorded}) > 1 else ""
         notes.append(f"Held out{f' ({question})' if question else ''}{where}: {words}; {views}.")
     return notes
 
 
 def points_notes(trials: Sequence[TrialResult]) -> list[str]:
-    """A line for each initialiser and choice of the views that made its points; none where photographs made none."""
+    """A line for each initialiser on the views that made its points; none for points that no photographs made."""
     notes = []
     for init, choice in sorted({(trial.init, _points_from(trial)) for trial in trials}):
         if choice == "all":
@@ -139,7 +144,7 @@ def points_notes(trials: Sequence[TrialResult]) -> list[str]:
 
 
 def _points_from(trial: TrialResult) -> str:
-    """The views that made the trial's initial points: all or train; "" where no observations did."""
+    """The views that made the trial's initial points: all or train; "" if no views did."""
     if "init.points_from" in trial.config:
         return str(trial.config["init.points_from"])
     return "all" if trial.record.init_report.get("mean_track_length") is not None else ""

@@ -1,6 +1,6 @@
-"""Pairs: `pair` finds the trials that a question compares, `choose_pairs` the arms that are held against each other.
+"""Pairs of trials (`find_pairs`, of one scene and seed) and pairs of arms (`choose_pairs`).
 
-`pair` is the only place that pairs trials; `gsbench.analysis.judgement.judge` says what the pairs say.
+All verdicts pair trials here; `gsbench.analysis.judgement.judge` decides what the pairs show.
 """
 
 from __future__ import annotations
@@ -27,37 +27,37 @@ BASELINE = "adc"
 CONTROLS = "eval.controls."
 
 Array = NDArray[np.float64]
-TrialPair = tuple[TrialResult, TrialResult]  # of the baseline, and of the arm
+TrialPair = tuple[TrialResult, TrialResult]  # a trial of the baseline and one of the arm
 
 
 @dataclass(frozen=True)
 class ScenePairs:
-    """The pairs of trials of one scene by seed, in the order in which seeds are added, with both arms' values [K]."""
+    """The pairs of trials of one scene, one per seed in the order of adding seeds, with both arms' values [K]."""
 
     scene: str
     seeds: tuple[int, ...]
     trials: tuple[TrialPair, ...]
-    before: Array
-    after: Array
+    baseline: Array
+    arm: Array
 
-    def kept(self, places: Sequence[int]) -> ScenePairs:
-        chosen = list(places)
+    def subset(self, indices: Sequence[int]) -> ScenePairs:
+        chosen = list(indices)
         return ScenePairs(
             self.scene,
             tuple(self.seeds[k] for k in chosen),
             tuple(self.trials[k] for k in chosen),
-            self.before[chosen],
-            self.after[chosen],
+            self.baseline[chosen],
+            self.arm[chosen],
         )
 
 
 @dataclass(frozen=True)
 class Pairs:
-    """The trials that a question compares, scene by scene, and in one line each what could not be paired."""
+    """The pairs of trials of a question by scene, and a line on each thing that could not be paired."""
 
     rows: tuple[ScenePairs, ...]
     left_out: tuple[str, ...] = ()
-    relative: bool = False  # differences are of logarithms
+    relative: bool = False  # compare logarithms
 
     @property
     def scenes(self) -> tuple[str, ...]:
@@ -70,14 +70,14 @@ class Pairs:
 
     @cached_property
     def differences(self) -> Array:
-        """Arm minus baseline [S, K] over the seeds that all scenes have: further ones would weigh scenes unlike."""
-        change = [np.log(row.after / row.before) if self.relative else row.after - row.before for row in self.rows]
-        return np.array([values[: self.seeds] for values in change])
+        """Arm minus baseline [S, K]. Seeds that some scenes lack are dropped, so that all scenes weigh the same."""
+        changes = [np.log(row.arm / row.baseline) if self.relative else row.arm - row.baseline for row in self.rows]
+        return np.array([change[: self.seeds] for change in changes])
 
     @property
     def baseline(self) -> float:
         """The baseline's mean over the same trials, in the metric's own unit."""
-        return float(np.mean([row.before[: self.seeds].mean() for row in self.rows]))
+        return float(np.mean([row.baseline[: self.seeds].mean() for row in self.rows]))
 
     @property
     def trials(self) -> tuple[TrialResult, ...]:
@@ -86,29 +86,29 @@ class Pairs:
 
     def first(self, seeds: int) -> Pairs:
         """The pairs of the first ``seeds`` seeds of every scene."""
-        return replace(self, rows=tuple(row.kept(range(min(seeds, len(row.seeds)))) for row in self.rows))
+        return replace(self, rows=tuple(row.subset(range(min(seeds, len(row.seeds)))) for row in self.rows))
 
     def without(self, outlying: Sequence[TrialResult]) -> Pairs:
-        """The pairs of which neither trial is ``outlying``; a scene that has no other is left out."""
+        """The pairs without those of an ``outlying`` trial; a scene without pairs is left out."""
         paths = {trial.path for trial in outlying}
         rows = [
-            row.kept([k for k, pair in enumerate(row.trials) if not paths & {one.path for one in pair}])
+            row.subset([k for k, pair in enumerate(row.trials) if not paths & {one.path for one in pair}])
             for row in self.rows
         ]
         return replace(self, rows=tuple(row for row in rows if row.seeds))
 
 
-def pair(trials: Sequence[TrialResult], question: Question) -> Pairs:
-    """Pair the trials that a question compares by scene and seed, and say what has no partner or cannot be compared.
+def find_pairs(trials: Sequence[TrialResult], question: Question) -> Pairs:
+    """Pair the trials of a question by scene and seed, and say which have no partner or cannot be compared.
 
-    Trials under unlike conditions are not compared; unlike budgets are no hindrance where the question names its
-    trials itself, since a claim may be about arms with budgets of their own. Of seeds in planned order none beyond the
-    first that is missing counts: one that comes late never changes what an earlier look saw.
+    Trials are compared only under equal conditions. Budgets may differ if the question names its trials itself, since a
+    claim may be about arms with different budgets. Of seeds in planned order, those after the first missing seed do not
+    count: a seed that comes late cannot change what an earlier look saw.
     """
     rows, left_out = [], list[str]()
     for scene, sides in _sides(trials, question).items():
         try:
-            row, faults = _row(scene, *sides, question)
+            row, faults = _pair_scene(scene, *sides, question)
         except InputError as error:
             left_out.append(str(error))
             continue
@@ -124,7 +124,7 @@ def pair(trials: Sequence[TrialResult], question: Question) -> Pairs:
 
 
 def _sides(trials: Sequence[TrialResult], question: Question) -> dict[str, tuple[list[TrialResult], list[TrialResult]]]:
-    """The trials of the baseline and of the arm by scene."""
+    """The trials of the baseline and of the arm, by scene."""
     if question.scenes:
         by_folder = by_key(trials, lambda trial: trial.key)
         return {
@@ -137,89 +137,92 @@ def _sides(trials: Sequence[TrialResult], question: Question) -> dict[str, tuple
 
 
 def pair_trials(trials: Sequence[TrialResult], baseline: Arm, arm: Arm) -> list[TrialPair]:
-    """The pairs of trials of two arms, sorted by scene and seed, whatever their metrics are."""
+    """The pairs of trials of two arms, sorted by scene and seed, without regard to metrics."""
     question = Question(metric="", baseline=baseline, arm=arm)
-    found: list[TrialPair] = []
+    pairs: list[TrialPair] = []
     for scene, sides in sorted(_sides(trials, question).items()):
-        with suppress(InputError):  # said where the arms are judged
-            found += _matched(scene, *sides, question)[0].values()
-    return found
+        with suppress(InputError):  # the verdict on these arms reports it
+            pairs += _match_seeds(scene, *sides, question)[0].values()
+    return pairs
 
 
-def _matched(
+def _match_seeds(
     scene: str, baseline: Sequence[TrialResult], arm: Sequence[TrialResult], question: Question
 ) -> tuple[dict[int, TrialPair], list[str]]:
-    """The pairs of one scene by seed, in the planned order, and the seeds that have no partner.
+    """The pairs of one scene by seed, in the planned order, and a line for each seed without a partner.
 
-    Raises InputError where trials of one arm cannot be averaged, or the arms' conditions are unlike.
+    Raises InputError if trials of one arm cannot be averaged, or if the arms' conditions differ.
     """
     for own in (baseline, arm):
         if own:
             check_averageable(own, f"scene={scene} {own[0].arm}")
-    one, other = ({trial.seed: trial for trial in own} for own in (baseline, arm))
-    wanted = question.seeds or sorted(one.keys() | other.keys())
-    both = {seed: (one[seed], other[seed]) for seed in wanted if seed in one and seed in other}
-    if both:
+    baseline_by_seed, arm_by_seed = ({trial.seed: trial for trial in own} for own in (baseline, arm))
+    wanted = question.seeds or sorted(baseline_by_seed.keys() | arm_by_seed.keys())
+    shared = baseline_by_seed.keys() & arm_by_seed.keys()
+    pairs = {seed: (baseline_by_seed[seed], arm_by_seed[seed]) for seed in wanted if seed in shared}
+    if pairs:
         differing = differing_conditions([*baseline, *arm], code=not question.versions)
         if question.scenes:
             differing.pop("budget", None)
         if differing:
             raise InputError(f"{scene}: the arms differ in {', '.join(differing)}, so they are not compared")
-    alone = () if question.seeds else tuple(seed for seed in wanted if seed not in both)
-    return both, [f"{scene}: seed {seed} has no partner" for seed in alone]
+    unpaired = () if question.seeds else tuple(seed for seed in wanted if seed not in pairs)
+    return pairs, [f"{scene}: seed {seed} has no partner" for seed in unpaired]
 
 
-def _row(
+def _pair_scene(
     scene: str, baseline: Sequence[TrialResult], arm: Sequence[TrialResult], question: Question
 ) -> tuple[ScenePairs, list[str]]:
-    both, faults = _matched(scene, baseline, arm, question)
+    """The pairs of one scene that have values, and a line on each thing that could not be paired."""
+    pairs, faults = _match_seeds(scene, baseline, arm, question)
     values: dict[int, tuple[float, float]] = {}
     reasons: dict[str, list[str]] = {}
-    for seed, trials in both.items():
+    for seed, trials in pairs.items():
         try:
             values[seed] = _values(question, *trials)
         except InputError as error:
             reasons.setdefault(str(error), []).append(f"{scene} seed {seed}")
-    faults += [f"{some_of(places)}: {reason}" for reason, places in reasons.items()]
-    seeds = list(takewhile(values.__contains__, question.seeds)) if question.seeds else list(values)
-    before, after = (np.array([values[seed][side] for seed in seeds]) for side in (0, 1))
-    return ScenePairs(scene, tuple(seeds), tuple(both[seed] for seed in seeds), before, after), faults
+    faults += [f"{some_of(seeds)}: {reason}" for reason, seeds in reasons.items()]
+    counted_seeds = list(takewhile(values.__contains__, question.seeds)) if question.seeds else list(values)
+    of_baseline, of_arm = (np.array([values[seed][side] for seed in counted_seeds]) for side in (0, 1))
+    chosen = tuple(pairs[seed] for seed in counted_seeds)
+    return ScenePairs(scene, tuple(counted_seeds), chosen, of_baseline, of_arm), faults
 
 
-def _values(question: Question, one: TrialResult, other: TrialResult) -> tuple[float, float]:
-    asked = asked_quantity(question.metric, [one, other])
-    before, after = value_of(asked, one), value_of(asked, other)
-    if question.relative and min(before, after) <= 0:
-        raise InputError(f"{asked.name} is {min(before, after):g}, and a ratio needs numbers above 0")
-    return before, after
+def _values(question: Question, baseline: TrialResult, arm: TrialResult) -> tuple[float, float]:
+    asked = asked_quantity(question.metric, [baseline, arm])
+    values = value_of(asked, baseline), value_of(asked, arm)
+    if question.relative and min(values) <= 0:
+        raise InputError(f"{asked.name} is {min(values):g}, and a ratio needs numbers above 0")
+    return values
 
 
 def choose_pairs(
     arms: Sequence[Arm], baseline: str = BASELINE, controls: Mapping[str, str] = MappingProxyType({})
 ) -> list[tuple[Arm, Arm]]:
-    """(baseline arm, other arm) for every densifier whose initialiser also has the baseline, then those of controls.
+    """The pairs (baseline, arm) of arms to compare: first those with the baseline, then those with controls.
 
-    An arm with swept settings is held against the baseline with the same ones where there is one. Without the baseline,
-    the other arms are held against the first of ``arms``. ``controls`` names for a densifier another one that it is
-    held against besides (`controls_of`), where both are there.
+    An arm is compared with the baseline densifier of the same initialiser, with the same swept settings if such an arm
+    exists. If no arm has the baseline, all are compared with the first of ``arms``. ``controls`` maps a densifier to a
+    further one that it is compared with (`controls_of`).
     """
 
-    def partners(arm: Arm, densify: str) -> list[Arm]:
-        alike = replace(arm, densify=densify)
-        return [one for one in (alike, replace(alike, variant=())) if one in arms]
+    def partner(arm: Arm, densify: str) -> Arm | None:
+        same_settings = replace(arm, densify=densify)
+        return next((one for one in (same_settings, replace(same_settings, variant=())) if one in arms), None)
 
-    pairs = [(found[0], arm) for arm in arms if arm.densify != baseline and (found := partners(arm, baseline))]
+    pairs = [(found, arm) for arm in arms if arm.densify != baseline and (found := partner(arm, baseline))]
     pairs = pairs or [(arms[0], arm) for arm in arms[1:]]
     for arm in arms:
         control = controls.get(arm.densify, arm.densify)
-        found = [] if control == arm.densify else partners(arm, control)
-        if found and (found[0], arm) not in pairs:
-            pairs.append((found[0], arm))
+        found = None if control == arm.densify else partner(arm, control)
+        if found and (found, arm) not in pairs:
+            pairs.append((found, arm))
     return pairs
 
 
 def controls_of(trials: Sequence[TrialResult]) -> dict[str, str]:
-    """The control of each densifier, another one that the trials' settings name (``eval.controls``)."""
+    """The control of each densifier, another densifier that the trials' settings name (``eval.controls``)."""
     firsts = [group[0] for group in by_key(trials, lambda trial: trial.arm).values()]
     return {
         key.removeprefix(CONTROLS): str(value)

@@ -1,9 +1,10 @@
 """Planning from pilot trials: the scenes and seeds that resolve a difference.
 
-A paired difference of scene s and seed k is ``mean + scene effect + noise``: the effect differs between scenes by a
-deviation, and trainings of one scene differ by another. From pilot trials both are estimated by the analysis of
-variance (Searle, Casella and McCulloch 1992, *Variance components*, section 3.6). More seeds shrink the noise alone; a
-statement about scenes like these needs more scenes. Power is that of the two-sided 5 % tests of `analysis.statistics`.
+The paired difference of scene s and seed k is ``mean + scene effect + noise``. The scene effect has one deviation
+between scenes, the noise another one between trainings of a scene. Both are estimated from pilot trials by the analysis
+of variance (Searle, Casella and McCulloch 1992, *Variance components*, section 3.6). More seeds shrink only the noise;
+a statement about scenes like these needs more scenes. Power is that of the two-sided 5 % tests of
+`analysis.statistics`.
 """
 
 import math
@@ -19,15 +20,15 @@ from gsbench.analysis.statistics import ALPHA, MIN_SCENES, error_and_degrees, si
 from gsbench.errors import InputError
 
 POWER = 0.8
-MAX_SCENES, MAX_SEEDS = 30, 40  # the largest designs that are looked at
-DRAWS = 2000  # of a design's variances: they give its power to about 0.005
+MAX_SCENES, MAX_SEEDS = 30, 40  # the largest designs that are considered
+DRAWS = 2000  # simulated variances of a design; they give its power to about 0.005
 
 
 @dataclass(frozen=True)
 class Components:
-    """Deviations of paired differences: of the effect ``between`` scenes, of trainings ``within`` one.
+    """Deviations of paired differences: of the effect ``between`` scenes, and of trainings ``within`` a scene.
 
-    ``between`` is None where one scene cannot tell; it is 0 where scenes differ by no more than trainings explain.
+    ``between`` is None for a single scene; it is 0 if scenes differ by no more than trainings explain.
     """
 
     between: float | None
@@ -37,8 +38,8 @@ class Components:
 
 
 @dataclass(frozen=True)
-class Size:
-    """A design of ``scenes`` scenes with ``seeds`` seeds each, two arms."""
+class Design:
+    """A design of two arms on ``scenes`` scenes, with ``seeds`` seeds each."""
 
     scenes: int
     seeds: int
@@ -48,10 +49,10 @@ class Size:
         return 2 * self.scenes * self.seeds
 
 
-def components(differences: Sequence[NDArray[np.float64]]) -> Components:
-    """The two deviations from pilot trials: for each scene the mean difference of every pair, by seed.
+def estimate_components(differences: Sequence[NDArray[np.float64]]) -> Components:
+    """Estimate the two deviations from the paired differences of pilot trials, an array for each scene.
 
-    Raises InputError where no scene has two pairs.
+    Raises InputError if no scene has two pairs.
     """
     degrees = sum(len(values) - 1 for values in differences)
     if degrees == 0:
@@ -63,69 +64,69 @@ def components(differences: Sequence[NDArray[np.float64]]) -> Components:
     if len(differences) > 1:
         means = np.array([values.mean() for values in differences])
         overall = float(np.concatenate(list(differences)).mean())
-        per_scene = (total - float((counts**2).sum()) / total) / (len(counts) - 1)  # pairs a scene, were all alike
+        pairs_per_scene = (total - float((counts**2).sum()) / total) / (len(counts) - 1)  # n_0 of unbalanced data
         square = float((counts * (means - overall) ** 2).sum()) / (len(counts) - 1)
-        between = math.sqrt(max(0.0, (square - within**2) / per_scene))
+        between = math.sqrt(max(0.0, (square - within**2) / pairs_per_scene))
     return Components(between, within, len(differences), total)
 
 
-def power(size: Size, difference: float, found: Components, like_these: bool) -> float:
-    """The chance to see ``difference``: in the mean of these scenes, or in how many of ``scenes like these`` it helps.
+def power(design: Design, difference: float, components: Components, like_these: bool) -> float:
+    """The chance to see ``difference`` in the mean of these scenes, or by the sign test of scenes ``like_these``.
 
-    Raises InputError where the pilot had one scene and others are asked about.
+    Raises InputError for scenes like these if the pilot had only one scene.
     """
     if not like_these:
-        return power_of_mean(found.within, size, difference)
-    if found.between is None:
+        return power_of_mean(components.within, design, difference)
+    if components.between is None:
         raise InputError("one scene cannot show how an effect differs between scenes: run pilot trials on two")
-    needed = sign_test_needs(size.scenes, ALPHA)
+    needed = sign_test_needs(design.scenes, ALPHA)
     if needed is None:
         return 0.0
-    spread = math.hypot(found.between, found.within / math.sqrt(size.seeds))
-    helps = float(special.ndtr(abs(difference) / spread)) if spread else 1.0  # a scene is seen to be helped
-    return float(special.bdtrc(needed - 1, size.scenes, helps))
+    spread = math.hypot(components.between, components.within / math.sqrt(design.seeds))
+    chance = float(special.ndtr(abs(difference) / spread)) if spread else 1.0  # that one scene's mean has the sign
+    return float(special.bdtrc(needed - 1, design.scenes, chance))
 
 
-def power_of_mean(deviation: float, size: Size, difference: float) -> float:
-    """The chance that the t test of these scenes sees ``difference``, where trainings differ by ``deviation``.
+def power_of_mean(deviation: float, design: Design, difference: float) -> float:
+    """The chance that the t test of these scenes sees ``difference`` if trainings differ by ``deviation``.
 
-    The test estimates each scene's variance, and with it its degrees of freedom: the power is the mean over
-    simulated variances, given each of which it is that of a normal mean. The far tail of the wrong sign is left out.
+    The test estimates each scene's variance and its own degrees of freedom. Given these, the power is that of a normal
+    mean; the result is its average over simulated variances. The far tail of the wrong sign is left out.
     """
     if deviation == 0:
         return 1.0 if difference else 0.0
-    shift = abs(difference) / deviation * math.sqrt(size.scenes * size.seeds)
-    return float(special.ndtr(shift - _thresholds(size)).mean())
+    shift = abs(difference) / deviation * math.sqrt(design.scenes * design.seeds)
+    return float(special.ndtr(shift - _thresholds(design)).mean())
 
 
 @cache
-def _thresholds(size: Size) -> NDArray[np.float64]:
-    """Beyond how many of its true standard errors a mean is seen [DRAWS], for simulated variances of the scenes."""
-    freedom = size.seeds - 1
-    variances = np.random.default_rng(0).chisquare(freedom, (DRAWS, size.scenes)) / freedom
-    error, degrees = error_and_degrees(variances, size.seeds)
-    return special.stdtrit(degrees, 1 - ALPHA / 2) * error * math.sqrt(size.scenes * size.seeds)
+def _thresholds(design: Design) -> NDArray[np.float64]:
+    """The significant means [DRAWS], in true standard errors, for simulated variances of the scenes."""
+    freedom = design.seeds - 1
+    variances = np.random.default_rng(0).chisquare(freedom, (DRAWS, design.scenes)) / freedom
+    error, degrees = error_and_degrees(variances, design.seeds)
+    return special.stdtrit(degrees, 1 - ALPHA / 2) * error * math.sqrt(design.scenes * design.seeds)
 
 
 def seeds_needed(deviation: float, scenes: int, difference: float) -> int | None:
     """Seeds of each arm on these ``scenes`` that see ``difference`` with a power of `POWER`; None above `MAX_SEEDS`."""
-    sizes = (Size(scenes, seeds) for seeds in range(2, MAX_SEEDS + 1))
-    return next((one.seeds for one in sizes if power_of_mean(deviation, one, difference) >= POWER), None)
+    designs = (Design(scenes, seeds) for seeds in range(2, MAX_SEEDS + 1))
+    return next((one.seeds for one in designs if power_of_mean(deviation, one, difference) >= POWER), None)
 
 
-def sizes_needed(difference: float, found: Components, like_these: bool) -> list[Size]:
-    """List the fewest seeds that see ``difference`` with a power of `POWER`, by number of scenes; [] where none do.
+def designs_needed(difference: float, components: Components, like_these: bool) -> list[Design]:
+    """The designs that see ``difference`` with a power of `POWER`: by number of scenes, the fewest seeds.
 
-    Scenes that would need more seeds than ``MAX_SEEDS`` are left out, and so is what needs more scenes and no fewer
-    seeds than a design before it. A statement about scenes like these starts at ``MIN_SCENES``.
+    A number of scenes is left out if it needs more than ``MAX_SEEDS`` seeds, or no fewer seeds than fewer scenes do. A
+    statement about scenes like these starts at ``MIN_SCENES``.
     """
     if difference == 0 or not math.isfinite(difference):
         raise InputError(f"the difference to resolve must be a number other than 0, got {difference}")
-    chosen: list[Size] = []
+    chosen: list[Design] = []
     for scenes in range(MIN_SCENES if like_these else 1, MAX_SCENES + 1):
         most = chosen[-1].seeds - 1 if chosen else MAX_SEEDS
-        for one in (Size(scenes, seeds) for seeds in range(2, most + 1)):
-            if power(one, difference, found, like_these) >= POWER:
-                chosen.append(one)
+        for design in (Design(scenes, seeds) for seeds in range(2, most + 1)):
+            if power(design, difference, components, like_these) >= POWER:
+                chosen.append(design)
                 break
     return chosen

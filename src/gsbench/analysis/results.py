@@ -297,7 +297,7 @@ def _with_known_settings(
     for trial in trials:
         folders.setdefault(trial.key.rpartition("/")[0], {}).setdefault(trial.key, []).append(trial.path)
     several = [found for found in folders.values() if len(found) > 1]
-    faults = {key: settings.find(key, paths) for found in several for key, paths in found.items()}
+    faults = {key: settings.read(key, paths) for found in several for key, paths in found.items()}
     known = [trial for trial in trials if not faults.get(trial.key)]
     return known, [(trial, faults[trial.key]) for trial in trials if faults.get(trial.key)]
 

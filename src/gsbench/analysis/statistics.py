@@ -1,12 +1,12 @@
-"""Tests of paired differences: of these scenes, and of scenes like these.
+"""Tests of paired differences, about these scenes and about scenes like these.
 
-Differences are matrices [S, K]: of S scenes, each with K pairs of trainings. The views of a trial share its training,
-so a trial is the smallest unit that counts.
+Differences are matrices [S, K] of S scenes, each with K pairs of trainings. The views of a trial share its training, so
+a trial is the smallest independent unit.
 
-*These scenes*: the mean over the scenes at hand, each with the same weight; scenes are fixed, the units are pairs
-within them, and each scene has a variance of its own (Welch 1947; Satterthwaite 1946). *Scenes like these*, from
-``MIN_SCENES`` on: in how many of them it helps, by the sign test, with the exact interval of the median effect. It
-assumes nothing about the shape of the effects; no test of their mean could stand one scene that differs much from seven
+*These scenes*: the mean over the given scenes, each with the same weight. Scenes are fixed, pairs within them are the
+units, and each scene has its own variance (Welch 1947; Satterthwaite 1946). *Scenes like these*, from ``MIN_SCENES``
+scenes on: the sign test of the number of scenes that gain, with the exact interval of the median effect. It assumes
+nothing about the distribution of effects; tests of the mean effect fail if one scene in eight differs much from the
 others.
 """
 
@@ -23,17 +23,17 @@ from scipy import special
 from gsbench.runs.declaration import ERROR_RATE
 
 ALPHA = ERROR_RATE
-MIN_SCENES = 6  # of which a statement about scenes like these is made
+MIN_SCENES = 6  # for a statement about scenes like these: the fewest with which the sign test can reach 5 %
 SUPPORTED, REFUTED, TOO_SMALL, UNDECIDED = "supported", "refuted", "too small to matter", "undecided"
 Outcome = Literal["supported", "refuted", "too small to matter", "undecided"]
 
-# Satterthwaite's degrees of freedom are twice too many where one scene is noisier than the others and seeds are two to
-# four, as simulations show (docs/verdict.md): its own deviation comes out too small as often as too large.
+# Factor on Satterthwaite's degrees of freedom. They are twice too many if one scene is noisier than the others and has
+# two to four seeds, as simulations show (docs/verdict.md): its deviation is often underestimated.
 DEGREES = 0.5
-SPENDING_POWER = 1.5
-DRAWS = 100_000
-FIRST_LOOK = 2  # seeds: one training of each arm says nothing of how trainings differ
-EACH_UP_TO = 12  # seeds up to which every seed is a look; beyond, a look costs little patience and a bound's precision
+SPENDING_POWER = 1.5  # exponent of the error-spending function of looks
+DRAWS = 100_000  # simulated sequences of trainings, for the error rates of looks
+FIRST_LOOK = 2  # seeds: one training of each arm does not show how trainings differ
+EACH_UP_TO = 12  # seeds up to which each seed is a look; more looks would save little and make bounds less precise
 
 Array = NDArray[np.floating]
 
@@ -49,7 +49,7 @@ class Interval:
 
 @dataclass(frozen=True)
 class StudentT:
-    """Student's t of a mean with a standard error, on so many degrees of freedom: its p and its interval."""
+    """Student's t test of a mean with a standard error and degrees of freedom."""
 
     mean: float
     error: float
@@ -57,45 +57,46 @@ class StudentT:
 
     @property
     def p(self) -> float:
-        """Two-sided; of units that do not spread at all 0, or 1 where their mean is 0."""
+        """The two-sided p. Without any spread it is 0, or 1 if the mean is 0."""
         if self.error == 0:
             return 1.0 if self.mean == 0 else 0.0
         return float(2 * special.stdtr(self.degrees, -abs(self.mean / self.error)))
 
     def interval(self, alpha: float = ALPHA) -> Interval:
-        """The values that the test with error rate ``alpha`` would not refuse; zero is none exactly where p < alpha."""
+        """The values that the test with error rate ``alpha`` does not reject; it excludes 0 exactly if p < alpha."""
         half = float(special.stdtrit(self.degrees, 1 - alpha / 2)) * self.error
         return Interval(self.mean - half, self.mean + half)
 
 
-def student(differences: Array) -> StudentT | None:
-    """The test of the mean over scenes of ``differences`` [S, K]; None of a single pair.
+def t_test(differences: Array) -> StudentT | None:
+    """The test of the mean over scenes of ``differences`` [S, K]; None for a single pair.
 
-    With one pair a scene, the spread of the scenes stands for that of trainings: it is never too small in the mean.
+    With one pair per scene, the variance over scenes replaces that of trainings; on average it is never too small.
     """
     scenes, seeds = differences.shape
     if differences.size < 2:
         return None
     if seeds == 1:
         return StudentT(float(differences.mean()), float(differences.std(ddof=1)) / math.sqrt(scenes), scenes - 1)
-    variances = (differences - differences[:, :1]).var(axis=1, ddof=1)  # of pairs that are equal exactly 0
+    # Without the shift, rounding would give equal pairs a tiny variance in place of 0.
+    variances = (differences - differences[:, :1]).var(axis=1, ddof=1)
     error, degrees = error_and_degrees(variances[None], seeds)
     return StudentT(float(differences.mean()), float(error[0]), float(degrees[0]))
 
 
 def error_and_degrees(variances: Array, seeds: int) -> tuple[Array, Array]:
-    """Standard error and degrees of freedom [D] of the mean over scenes, from the scenes' variances [D, S]."""
+    """Standard errors and degrees of freedom [D] of means over scenes, from the scenes' variances [D, S]."""
     total, squares = variances.sum(axis=1), (variances**2).sum(axis=1)
     satterthwaite = np.divide(total**2 * (seeds - 1), squares, out=np.full_like(total, seeds - 1.0), where=squares > 0)
     return np.sqrt(total / seeds) / variances.shape[1], np.maximum(seeds - 1, DEGREES * satterthwaite)
 
 
 def outcome_of(interval: Interval, sign: int, least: float | None) -> Outcome:
-    """The one of four outcomes that an interval of the difference makes of "it has this sign, and matters".
+    """The outcome of the claim "the difference has this sign, and matters", from the interval of the difference.
 
-    Supported where the interval lies wholly on the claimed side of zero, refuted on the other; too small to matter
-    where it lies within ± ``least``, whichever its sign. Of "there is no difference to speak of" (sign 0): supported
-    within ± ``least``, refuted beyond it.
+    Too small to matter: the interval lies within ± ``least``. Supported: it lies on the claimed side of 0. Refuted: it
+    lies on the other side. Otherwise undecided. Sign 0 claims that no difference matters: supported within ± ``least``,
+    refuted if the interval lies beyond it on one side.
     """
     within = least is not None and max(-interval.low, interval.high) < least
     if not sign:
@@ -110,11 +111,11 @@ def outcome_of(interval: Interval, sign: int, least: float | None) -> Outcome:
 
 @dataclass(frozen=True)
 class Answer:
-    """A mean difference with its test as one of a family whose error rate is ``level``.
+    """A mean difference with its test, as a member of a family with the error rate ``level``.
 
-    ``p`` is adjusted for the family, and so is ``interval``, at the error rate ``rate``: it leaves zero out exactly
-    where ``p`` is below ``level``. What is too small is told at ``equal_rate``, a member's equal part of ``level``. Of
-    a single pair there is no test.
+    ``p`` is adjusted for the family. ``interval`` has the adjusted error rate ``rate``: it excludes 0 exactly if ``p``
+    is below ``level``. "Too small to matter" is decided at ``equal_rate``, the member's equal share of ``level``. A
+    single pair has no test.
     """
 
     mean: float
@@ -131,30 +132,33 @@ class Answer:
     def outcome(self, sign: int, least: float | None) -> Outcome:
         if self.test is None or self.interval is None:
             return "undecided"
-        found = outcome_of(self.test.interval(self.equal_rate), sign, least)
-        return found if found == TOO_SMALL or not sign else outcome_of(self.interval, sign, None)
+        at_equal_rate = outcome_of(self.test.interval(self.equal_rate), sign, least)
+        return at_equal_rate if at_equal_rate == TOO_SMALL or not sign else outcome_of(self.interval, sign, None)
 
 
 def answer_family(members: Sequence[Array], level: float = ALPHA) -> list[Answer]:
-    """Test each of ``members`` [S, K] as one of a family, by Holm's method (1979).
+    """Test each of ``members`` [S, K] as a member of one family, by Holm's method (1979).
 
-    The chance that any sign which is told is false is at most ``level``, and so it is for what is called too small.
+    The chance that any stated sign is false is at most ``level``; so is the chance that any "too small" is false.
     """
-    tests = [student(member) for member in members]
+    tests = [t_test(member) for member in members]
     factors = holm_factors([None if test is None else test.p for test in tests])
-    equal = level / max(1, sum(test is not None for test in tests))
-    return [
-        Answer(float(member.mean()), None, level, level, level)
-        if test is None or factor is None
-        else Answer(test.mean, test, level, level / factor, equal, min(1.0, factor * test.p))
-        for member, test, factor in zip(members, tests, factors, strict=True)
-    ]
+    equal_rate = level / max(1, sum(test is not None for test in tests))
+    answers = []
+    for member, test, factor in zip(members, tests, factors, strict=True):
+        if test is None or factor is None:
+            answers.append(Answer(float(member.mean()), None, level, level, level))
+        else:
+            p = min(1.0, factor * test.p)
+            answers.append(Answer(test.mean, test, level, level / factor, equal_rate, p))
+    return answers
 
 
 def holm_factors(p_values: Iterable[float | None]) -> list[float | None]:
-    """The factor by which Holm's method multiplies each p, at least 1; None for None, which is not counted.
+    """The factor (at least 1) by which Holm's method multiplies each p; a p of None is not counted and gives None.
 
-    The smallest of m by m, the next by m - 1, and so on, but none below the one before it.
+    The smallest of m p is multiplied by m, the next by m - 1, and so on. A product below the one before it is raised to
+    that one.
     """
     p_values = list(p_values)
     order = sorted((p, index) for index, p in enumerate(p_values) if p is not None)
@@ -168,11 +172,11 @@ def holm_factors(p_values: Iterable[float | None]) -> list[float | None]:
 
 @dataclass(frozen=True)
 class LikeThese:
-    """A statement of scenes about scenes like them: in how many the arm has the sign that is asked for.
+    """A statement about scenes like the given ``scenes``. In ``helped`` of them the difference has the asked sign.
 
-    ``beyond`` of them have it by the least that matters, None where that is not known. ``share`` is the exact interval
-    (Clopper and Pearson 1934) of the share of such scenes with the sign, ``median`` that of their median effect, from
-    the order of the scenes; None with too few scenes for ``level``. ``p`` is that of the sign test.
+    In ``beyond`` of them it is at least the least that matters; None if that is not known. ``share`` is the exact
+    interval (Clopper and Pearson 1934) of the share of such scenes with the sign. ``median`` is the interval of their
+    median effect, from order statistics; None with too few scenes for ``level``. ``p`` is that of the sign test.
     """
 
     scenes: int
@@ -186,18 +190,18 @@ class LikeThese:
 
     @property
     def needed(self) -> int | None:
-        """The number of scenes that must agree before it can be said; None where all of them would not suffice."""
+        """The number of scenes that must have the same sign to decide; None if all of them would not suffice."""
         return sign_test_needs(self.scenes, self.level)
 
     def power(self, share: float = 0.9) -> float:
-        """The chance to say it where it helps in this share of scenes like these."""
+        """The chance to decide if this share of scenes like these gains."""
         if self.needed is None:
             return 0.0
         return float(special.bdtrc(self.needed - 1, self.scenes, share))
 
 
-def like_these(means: Array, sign: int, least: float | None, level: float = ALPHA) -> LikeThese | None:
-    """The statement about scenes like these from the scenes' ``means`` [S]; None below `MIN_SCENES`."""
+def judge_like_these(means: Array, sign: int, least: float | None, level: float = ALPHA) -> LikeThese | None:
+    """The statement about scenes like these from the scenes' mean differences [S]; None below `MIN_SCENES`."""
     count = len(means)
     if count < MIN_SCENES:
         return None
@@ -217,7 +221,7 @@ def like_these(means: Array, sign: int, least: float | None, level: float = ALPH
 
 
 def median_interval(values: Array, level: float) -> Interval | None:
-    """The exact interval of the median that ``values`` [n] are drawn with, from order statistics; None of too few."""
+    """The exact interval of the median of the distribution of ``values`` [n], or None for too few."""
     count = len(values)
     outer = [k for k in range(count // 2) if 2 * float(special.bdtr(k, count, 0.5)) <= level]
     if not outer:
@@ -227,53 +231,54 @@ def median_interval(values: Array, level: float) -> Interval | None:
 
 
 def sign_test_needs(scenes: int, level: float) -> int | None:
-    """The number of ``scenes`` with one sign from which on the sign test is below ``level``; None where none is."""
+    """The fewest of ``scenes`` with the same sign for which the sign test's p is at most ``level``; None if none is."""
     return next((agree for agree in range(scenes // 2 + 1, scenes + 1) if _sign_p(agree, scenes) <= level), None)
 
 
 def _sign_p(agree: int, count: int) -> float:
-    """Two-sided p of the sign test where ``agree`` of ``count`` have one sign."""
+    """The two-sided p of the sign test if ``agree`` of ``count`` have the same sign."""
     return min(1.0, 2 * float(special.bdtrc(agree - 1, count, 0.5))) if agree else 1.0
 
 
-def _share_interval(found: int, count: int, level: float) -> Interval:
-    low = float(special.betaincinv(found, count - found + 1, level / 2)) if found else 0.0
-    high = float(special.betaincinv(found + 1, count - found, 1 - level / 2)) if found < count else 1.0
+def _share_interval(helped: int, count: int, level: float) -> Interval:
+    low = float(special.betaincinv(helped, count - helped + 1, level / 2)) if helped else 0.0
+    high = float(special.betaincinv(helped + 1, count - helped, 1 - level / 2)) if helped < count else 1.0
     return Interval(low, high)
 
 
 def plan_looks(maximum: int) -> tuple[int, ...]:
-    """The looks of at most ``maximum`` seeds: each seed from the second on, later every fourth."""
+    """The looks up to ``maximum`` seeds: each seed from `FIRST_LOOK` on, after `EACH_UP_TO` every fourth."""
     early = range(FIRST_LOOK, min(maximum, EACH_UP_TO) + 1)
     return tuple(dict.fromkeys([*early, *range(EACH_UP_TO, maximum, 4), maximum]))
 
 
 @cache
 def look_levels(scenes: int, looks: tuple[int, ...], alpha: float) -> tuple[float, ...]:
-    """The error rate of the interval at each look, such that all intervals together err in ``alpha``.
+    """The error rate of the interval at each look, such that all looks together have the error rate ``alpha``.
 
-    Repeated confidence intervals (Jennison and Turnbull 1989): whichever look one stops at, and why, the chance of a
-    false word is at most ``alpha``. How much of it is used up by a look with the share t of all seeds is fixed
-    beforehand, ``alpha t^1.5`` (Lan and DeMets 1983; Kim and DeMets 1987). That the looks share trials is made use of:
-    the rates come from `DRAWS` sequences of trainings in which scenes are equally noisy, and no look has more than has
-    been used up by then, which holds however noisy scenes are.
+    These are repeated confidence intervals (Jennison and Turnbull 1989): at whichever look one stops, and for whatever
+    reason, the chance of a false statement is at most ``alpha``. Looks up to the share t of all seeds may spend
+    ``alpha t^1.5`` of it (Lan and DeMets 1983; Kim and DeMets 1987). Looks share trials, so their errors overlap: the
+    rates come from `DRAWS` simulated sequences of trainings with equally noisy scenes. No rate exceeds what may be
+    spent by its look; this limit does not depend on the noise of scenes.
     """
     rng = np.random.default_rng(0)
-    totals, squares = np.zeros((DRAWS, scenes)), np.zeros((DRAWS, scenes))
-    inside = np.ones(DRAWS, dtype=bool)
-    found: list[float] = []
-    before = 0
+    totals, squares = np.zeros((DRAWS, scenes)), np.zeros((DRAWS, scenes))  # of the differences of each scene
+    error_free = np.ones(DRAWS, dtype=bool)
+    levels: list[float] = []
+    seeds_before = 0
     for seeds in looks:
-        new = seeds - before
+        new = seeds - seeds_before
+        # The sum of the new seeds' differences, and the sum of their squares: drawing each seed would be slower.
         added = rng.normal(0, math.sqrt(new), totals.shape)
         totals += added
         squares += added**2 / new + (rng.chisquare(new - 1, totals.shape) if new > 1 else 0.0)
         error, degrees = error_and_degrees((squares - totals**2 / seeds) / (seeds - 1), seeds)
         p = 2 * special.stdtr(degrees, -np.abs(totals.mean(axis=1) / seeds / error))
-        spent = alpha * (seeds / looks[-1]) ** SPENDING_POWER
-        more = round(spent * DRAWS) - int(np.count_nonzero(~inside))
-        level = min(spent, float(np.partition(p[inside], more)[more])) if more > 0 else 0.0
-        inside &= p >= level
-        found.append(level)
-        before = seeds
-    return tuple(found)
+        spendable = alpha * (seeds / looks[-1]) ** SPENDING_POWER
+        errors_left = round(spendable * DRAWS) - int(np.count_nonzero(~error_free))
+        level = min(spendable, float(np.partition(p[error_free], errors_left)[errors_left])) if errors_left > 0 else 0.0
+        error_free &= p >= level
+        levels.append(level)
+        seeds_before = seeds
+    return tuple(levels)

@@ -13,7 +13,7 @@ its own: then all are one family.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from gsbench.analysis.cells import in_brief
+from gsbench.analysis.cells import short_reason
 from gsbench.analysis.declaration import ActiveDeclaration
 from gsbench.analysis.judgement import Verdict, judge
 from gsbench.analysis.planning import seeds_needed
@@ -86,7 +86,7 @@ def judge_pairs(
                 found.append(answer)
                 notes += [f"{one.name}: {line}" for line in answer.notes]
                 continue
-            reasons = [in_brief(t.unavailable[one.key]) for t in _own(by_arm, pair) if one.key in t.unavailable]
+            reasons = [short_reason(t.unavailable[one.key]) for t in _own(by_arm, pair) if one.key in t.unavailable]
             reason = (*reasons, *answer.notes, f"no trials of {pair[0]} and {pair[1]} can be paired")[0]
             notes.append(f"{one.name}: {reason}")
             missing = reason if one == primary else missing
@@ -285,7 +285,7 @@ def outlying_words(verdict: Verdict) -> str:
     """``far outside the other seeds: garden/sfm-adc/…-seed3; without it: undecided``; "" where none is."""
     if not verdict.outlying:
         return ""
-    labels, word = some_of([trial.label for trial in verdict.outlying]), WORDS[verdict.without or "undecided"]
+    labels, word = some_of([trial.label for trial in verdict.outlying]), WORDS[verdict.outcome_without or "undecided"]
     return f"far outside the other seeds of its scene and arm: {labels}; without it: {word}"
 
 

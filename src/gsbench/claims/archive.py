@@ -30,7 +30,7 @@ from typing import Any
 import yaml
 
 from gsbench import __version__
-from gsbench.analysis.images import FromPixels, textured_error
+from gsbench.analysis.images import PixelMeasures, textured_error
 from gsbench.analysis.quantities import TEXTURED
 from gsbench.analysis.results import Experiment, TrialResult, read_experiment, read_views
 from gsbench.claims.crate import crate_metadata
@@ -112,7 +112,7 @@ def _measured_in_pictures(trials: Sequence[TrialResult]) -> Iterator[dict[str, A
     """A line for each trial whose pictures are there."""
     for trial in trials:
         with suppress(InputError):
-            yield {"folder": _folder(trial), "measures": FromPixels(error_textured=textured_error(trial)).to_json()}
+            yield {"folder": _folder(trial), "measures": PixelMeasures(error_textured=textured_error(trial)).to_json()}
 
 
 def unpack_archive(file: Path, runs: Path) -> Experiment:

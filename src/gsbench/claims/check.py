@@ -56,7 +56,7 @@ class ClaimVerdict:
             return f"it is {claim.direction}{self._by_least()}"
         if verdict.outcome == "refuted":
             return f"it is the opposite of {claim.direction}" if claim.sign else f"it differs by more than {least}"
-        if verdict.hangs and verdict.final:
+        if verdict.rests_on_outlying and verdict.final:
             return "it depends on trials far outside the others"
         if verdict.final:
             return f"all {verdict.pairs.seeds} seeds show neither a difference nor that it is below {least}"

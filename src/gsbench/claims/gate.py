@@ -145,8 +145,8 @@ def deviations(baseline: Sequence[TrialResult], new: Sequence[TrialResult]) -> l
 
 
 def _not_worse(verdict: Verdict) -> bool:
-    """Return whether the interval holds no loss as large as the least that matters, and hangs on no outlying trial."""
-    if verdict.interval is None or verdict.least is None or verdict.hangs:
+    """Return whether the interval excludes a loss that matters, and the verdict does not rest on outlying trials."""
+    if verdict.interval is None or verdict.least is None or verdict.rests_on_outlying:
         return False
     sign = verdict.question.sign
     return min(sign * verdict.interval.low, sign * verdict.interval.high) > -verdict.least

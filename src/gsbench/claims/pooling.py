@@ -16,9 +16,9 @@ import numpy as np
 
 from gsbench.analysis.cells import select_trials, with_variants
 from gsbench.analysis.fairness import budget_words
-from gsbench.analysis.pairing import Pairs, pair
+from gsbench.analysis.pairing import Pairs, find_pairs
 from gsbench.analysis.results import Arm, TrialResult, by_key
-from gsbench.analysis.statistics import Interval, StudentT, student
+from gsbench.analysis.statistics import Interval, StudentT, t_test
 from gsbench.claims.archive import unpack_archive
 from gsbench.errors import InputError
 from gsbench.runs.declaration import Question
@@ -78,7 +78,7 @@ def pool(studies: Sequence[Study]) -> Pooled:
         shown = "; ".join(f"{study.name}: {study.protocol or 'unknown'}" for study in studies)
         refusal = f"the studies differ in protocol ({shown})"
     effects = np.array([[study.effect] for study in studies])  # [k, 1]
-    return Pooled(tuple(studies), refusal, None if refusal else student(effects))
+    return Pooled(tuple(studies), refusal, None if refusal else t_test(effects))
 
 
 def describe(pooled: Pooled) -> list[str]:
@@ -140,13 +140,14 @@ def read_studies(path: Path, wanted: Wanted, name: str) -> Found:
                 told_apart = [protocol] * (len(by_protocol) > 1) + [pairs[0][0].init] * (len(groups) > 1)
                 label = f"{name} ({', '.join(told_apart)})" if told_apart else name
                 found = [
-                    pair(own, Question(metric=wanted.metric, baseline=first, arm=second)) for first, second in pairs
+                    find_pairs(own, Question(metric=wanted.metric, baseline=first, arm=second))
+                    for first, second in pairs
                 ]
                 together = Pairs(tuple(row for one in found for row in one.rows))
                 if not together.rows:
                     reason = next((f" ({line})" for one in found for line in one.left_out), "")
                     raise InputError(f"{path}: no trials can be paired in {wanted.metric}{reason}")
-                test = student(together.differences)
+                test = t_test(together.differences)
                 mean, interval = float(together.differences.mean()), None if test is None else test.interval()
                 studies.append(Study(label, mean, interval, protocol, _budgets(own, pairs)))
                 for (first, second), paired in zip(pairs, found, strict=True):

@@ -12,7 +12,7 @@ from importlib.resources import files
 from pathlib import Path
 
 from gsbench.analysis.cells import swept_settings
-from gsbench.analysis.declaration import standing
+from gsbench.analysis.declaration import active_declaration
 from gsbench.analysis.judgement import Verdict, judge
 from gsbench.analysis.notes import compared_pairs
 from gsbench.analysis.report.build import build_report
@@ -82,7 +82,7 @@ def _part(experiment: Experiment, key: str) -> Part:
     except InputError as error:
         notes.append(f"No table: {error}")
     arms, pairs = compared_pairs(experiment)
-    judged = judge_pairs(arms, pairs, standing(experiment.folder, trials))
+    judged = judge_pairs(arms, pairs, active_declaration(experiment.folder, trials))
     facts = {
         "trials": str(len(trials)),
         "scenes": ", ".join(sorted({trial.scene for trial in trials})),

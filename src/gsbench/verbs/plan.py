@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from gsbench.analysis.cells import with_variants
-from gsbench.analysis.pairing import BASELINE, choose_pairs, pair
-from gsbench.analysis.planning import Components, components, sizes_needed
+from gsbench.analysis.pairing import BASELINE, choose_pairs, find_pairs
+from gsbench.analysis.planning import Components, designs_needed, estimate_components
 from gsbench.analysis.quantities import Quantity, quantity
 from gsbench.analysis.results import load_experiment
 from gsbench.analysis.statistics import MIN_SCENES
@@ -44,28 +44,29 @@ def main(argv: Sequence[str], runs: Path) -> int:
         raise InputError(f"{options.experiment} has one arm, and planning needs pairs of trials of two")
     for one, other in pairs:
         own = [trial for trial in trials if trial.arm in (one, other)]
-        paired = pair(own, Question(metric=shown.key, baseline=one, arm=other))
+        paired = find_pairs(own, Question(metric=shown.key, baseline=one, arm=other))
         if not paired.rows:
             raise InputError(f"no trials of {one} and {other} can be paired in {shown.name}: {paired.left_out[0]}")
-        found = components([row.after - row.before for row in paired.rows])
-        print("\n".join([f"{other} against {one}", *_lines(found, shown, difference)]))
+        components = estimate_components([row.arm - row.baseline for row in paired.rows])
+        print("\n".join([f"{other} against {one}", *_lines(components, shown, difference)]))
     return 0
 
 
-def _lines(found: Components, shown: Quantity, difference: float) -> list[str]:
+def _lines(components: Components, shown: Quantity, difference: float) -> list[str]:
     digits = f".{shown.decimals + 1}f"
-    between = "" if found.between is None else f", between scenes by {found.between:{digits}}"
+    between = "" if components.between is None else f", between scenes by {components.between:{digits}}"
     lines = [
-        f"  differences in {shown.name} vary between seeds by {found.within:{digits}}{between} "
-        f"(from {counted(found.trials, 'pair')} on {counted(found.scenes, 'scene')})"
+        f"  differences in {shown.name} vary between seeds by {components.within:{digits}}{between} "
+        f"(from {counted(components.trials, 'pair')} on {counted(components.scenes, 'scene')})"
     ]
     for like_these in (False, True):
         group = f"scenes like these (from {MIN_SCENES} scenes on)" if like_these else "these scenes"
-        if like_these and found.between is None:
+        if like_these and components.between is None:
             lines.append(f"  for {group}: run pilot trials on a second scene")
             continue
-        sizes = sorted(sizes_needed(difference, found, like_these), key=lambda size: (size.trials, size.scenes))
-        texts = [f"{size.scenes} × {size.seeds} ({size.trials} trials)" for size in sizes[:MOST_SHOWN]]
+        designs = designs_needed(difference, components, like_these)
+        designs.sort(key=lambda design: (design.trials, design.scenes))
+        texts = [f"{one.scenes} × {one.seeds} ({one.trials} trials)" for one in designs[:MOST_SHOWN]]
         lines.append(
             f"  to see {difference:g} on {group}, scenes × seeds: {', '.join(texts) or 'no number that can be run'}"
         )

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 from gsbench.analysis import verdicts
 from gsbench.analysis.cells import with_variants
-from gsbench.analysis.declaration import standing
+from gsbench.analysis.declaration import active_declaration
 from gsbench.analysis.images import png_uri, read_image
 from gsbench.analysis.pairing import BASELINE, choose_pairs, controls_of
 from gsbench.analysis.paper import layout_of, load_paper, paper_tables
@@ -29,7 +29,7 @@ def build_report(experiment: Experiment, baseline: str = BASELINE) -> str:
     """The report as HTML, with every densifier held against ``baseline``; a pure function of the experiment's files."""
     trials = with_variants(experiment.trials)
     arms = sorted({trial.arm for trial in trials})
-    declared = standing(experiment.folder, trials)
+    declared = active_declaration(experiment.folder, trials)
     search = search_part(experiment.folder)
     # Among points of a search, which were chosen by results, no test holds.
     pairs = [] if search else choose_pairs(arms, baseline, controls_of(trials))

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from gsbench.analysis.differences import short_version
 from gsbench.analysis.fairness import caveats, fairness_table
-from gsbench.analysis.images import WholeView, choose_views
+from gsbench.analysis.images import ViewComparison, choose_views
 from gsbench.analysis.judgement import Verdict
 from gsbench.analysis.pairing import pair_trials
 from gsbench.analysis.quantities import COSTS, relative_change
@@ -53,7 +53,7 @@ class Versus:
     fairness: Table
     costs: tuple[str, ...]
     forests: tuple[str, ...]
-    views: tuple[WholeView, ...]
+    views: tuple[ViewComparison, ...]
     notes: tuple[str, ...]
 
     @property
