@@ -34,10 +34,10 @@ def test_the_latest_and_the_mean(late: bool) -> None:
         value = scalars(step)[0].item()
         expected = value if math.isnan(expected) else 0.9 * expected + (1 - 0.9) * value
         if step % 10 == 0:
-            record = losses.settle()
+            record = losses.wait()
             assert record == {"step": step, "loss": value, "l1": 0.5 * step, "ssim": 0.25 * step}
             assert losses.smoothed == expected
-    losses.settle()
+    losses.wait()
     assert losses.smoothed == expected
 
 
@@ -49,14 +49,14 @@ def test_the_first_iteration_that_was_not_finite_is_named(late: bool, bad: float
         losses.add(2, *scalars(2, bad))
         assert late
         losses.add(3, *scalars(3, bad))
-        losses.settle()
+        losses.wait()
 
 
 def test_regularisers_of_another_type_and_graphs_are_taken() -> None:
     losses = LossLog()
     leaf = torch.ones((), requires_grad=True)
     losses.add(1, leaf * 2, torch.tensor(0.5), torch.tensor(0.25), (leaf * 3).double())
-    assert losses.settle() == {"step": 1, "loss": 2.0, "l1": 0.5, "ssim": 0.25}
+    assert losses.wait() == {"step": 1, "loss": 2.0, "l1": 0.5, "ssim": 0.25}
 
 
 def test_volumes_are_counted_by_quarter_decades() -> None:

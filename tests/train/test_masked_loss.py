@@ -105,13 +105,13 @@ def test_densifiers_see_no_error_under_a_mask(picture) -> None:
 
 
 def test_masks_shrink_with_the_pictures(picture) -> None:
-    from gsbench.train.resolution import Pictures
+    from gsbench.train.resolution import ScaledViews
 
     _, target, mask = picture
     camera = Camera(WIDTH, HEIGHT, 50.0, 50.0, WIDTH / 2, HEIGHT / 2, np.eye(3), np.array([0.0, 0.0, 3.0]))
     views = [View("a", camera, target.numpy(), mask.numpy()[..., 0]), View("b", camera, target.numpy())]
     device = torch.device("cpu")
-    pictures = Pictures(views, Targets(views, device), device, None)
+    pictures = ScaledViews(views, Targets(views, device), device, None)
     for scale in (1, 2, 5):
         cameras, targets = pictures.at(scale)
         small = targets.mask(0)

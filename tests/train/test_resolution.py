@@ -21,7 +21,7 @@ from gsbench.raster.base import Rasterizer
 from gsbench.runs.keys import config_hash
 from gsbench.scene.types import Scene, View
 from gsbench.train.options import TrainConfig
-from gsbench.train.resolution import Levels, Pictures, Resolution, levels
+from gsbench.train.resolution import Resolution, ScaledViews, ScaleSchedule, scale_schedule
 from gsbench.train.trainer import Status, Trainer
 from gsbench.train.views import Targets
 from tests.config.test_schema import composed
@@ -80,7 +80,7 @@ def stated_again(pictures: list[NDArray[np.uint8]], until: int) -> list[int]:
 @pytest.mark.parametrize(("height", "width", "until"), [(48, 64, 1000), (90, 60, 15_000), (40, 40, 300)])
 def test_the_schedule_of_sizes(height: int, width: int, until: int) -> None:
     pictures = soft_pictures(3, height, width, height)
-    found = levels(pictures, until)
+    found = scale_schedule(pictures, until)
     expected = stated_again(pictures, until)
     assert [found.at(step) for step in range(until + 1)] == expected
     assert expected[0] > 2  # or else nothing was tested
@@ -90,13 +90,13 @@ def test_the_schedule_of_sizes(height: int, width: int, until: int) -> None:
 
 def test_pictures_of_several_shapes_and_without_content() -> None:
     mixed = [*soft_pictures(2, 47, 63, 1), *soft_pictures(1, 64, 31, 2)]
-    found = levels(mixed, 500)
+    found = scale_schedule(mixed, 500)
     assert found.scales[-1] == 1
     assert list(found.begins) == sorted(set(found.begins))
     assert list(found.scales) == sorted(found.scales, reverse=True)
-    black = levels([*mixed, np.zeros((8, 8, 3), np.uint8)], 500)
+    black = scale_schedule([*mixed, np.zeros((8, 8, 3), np.uint8)], 500)
     assert {black.at(step) for step in range(501)} == {1}
-    grey = levels([np.full((8, 8, 3), 99, np.uint8)], 500)  # all is the mean: any size shows it
+    grey = scale_schedule([np.full((8, 8, 3), 99, np.uint8)], 500)  # all is the mean: any size shows it
     assert grey.at(500) == 1
 
 
@@ -113,7 +113,7 @@ def test_a_small_picture_is_the_filtered_one_from_the_same_place(scale: int, hei
     camera = orbit_camera(0.3)
     (image,) = soft_pictures(1, camera.height, camera.width, 5)
     view = View("a.png", camera, image)
-    cameras, targets = Pictures([view], Targets([view], CPU), CPU, None).at(scale)
+    cameras, targets = ScaledViews([view], Targets([view], CPU), CPU, None).at(scale)
     small = cameras[0]
     assert (small.width, small.height) == (width, height)
     rows, columns = weights(camera.height, height), weights(camera.width, width)
@@ -137,7 +137,7 @@ def test_sizes_change_after_rounds_and_rates_wait_for_them(tiny_scene: Scene) ->
     for i in range(0, 100, 20):
         assert len(set(scales[i : i + 20])) == 1
     assert set(scales[100:]) == {1}
-    wait = resolution.levels.full_from
+    wait = resolution.schedule.full_from
     assert 0 < wait < 100
     assert resolution.position_step(wait) == resolution.position_step(1) == 0
     assert resolution.position_step(120) == 120
@@ -250,8 +250,8 @@ def test_masks_are_as_small_as_their_pictures(
         folder.mkdir()
         settings = options(resolution_schedule="pictures", iterations=30, position_steps=30, **SHORT)
         trainer = Trainer(scene, cloud(truth), small(), rasterizer, settings, 0)
-        trainer.resolution.levels = Levels((0, 100), (2.0, 1.0))  # type: ignore[union-attr]
-        assert trainer.pictures.at(2)[1].mask(0).shape == (16, 20, 1)  # type: ignore[union-attr]
+        trainer.resolution.schedule = ScaleSchedule((0, 100), (2.0, 1.0))  # type: ignore[union-attr]
+        assert trainer.scaled_views.at(2)[1].mask(0).shape == (16, 20, 1)  # type: ignore[union-attr]
         trained.append(trainer.run(folder))
     assert same(*trained)
 
@@ -292,4 +292,4 @@ def test_a_name_that_is_none_is_refused() -> None:
     [((8.0, 4.0, 2.0, 1.0), 200), ((8.0, 2.5, 1.9, 1.0), 100), ((1.9, 1.5, 1.2, 1.0), 0), ((3.0, 1.0, 1.0, 1.0), 0)],
 )
 def test_full_pictures_begin_where_the_last_scale_of_two_or_more_ends(scales: tuple[float, ...], full: int) -> None:
-    assert Levels((0, 100, 200, 300), scales).full_from == full
+    assert ScaleSchedule((0, 100, 200, 300), scales).full_from == full

@@ -18,7 +18,7 @@ from gsbench.raster.base import Rasterizer
 from gsbench.raster.executors import find
 from gsbench.system.isolate import run_isolated
 from gsbench.system.resources import peak_memory_mb, reset_peak_memory
-from gsbench.train.device import keep_float32
+from gsbench.train.device import disable_tf32
 from gsbench.train.options import TrainConfig
 from gsbench.train.trainer import Trainer
 
@@ -50,7 +50,7 @@ class Stepper:
         torch.set_num_threads(self.threads)
         self.device = device_of(raster)
         if self.device.type == "cuda":
-            keep_float32()
+            disable_tf32()
         gaussians, scene = make_scene(setting.scene, setting.width, setting.height, setting.count, setting.ply)
         self.count = len(gaussians)
         self.trainer = Trainer(
@@ -93,7 +93,7 @@ class Stepper:
         begin = self._now()
         for _ in range(steps):
             self.trainer.iterate(NOWHERE)
-        self.trainer.losses.settle()
+        self.trainer.losses.wait()
         return steps / (self._now() - begin)
 
     def frames_per_second(self) -> float:

@@ -1,4 +1,4 @@
-"""First Gaussians of a training, made of a point cloud as 3DGS does it."""
+"""The initial Gaussians of a training, made from a point cloud as in 3DGS."""
 
 import numpy as np
 import torch
@@ -9,17 +9,17 @@ from gsbench.errors import InputError
 from gsbench.gaussians.model import NUM_SH_REST, Gaussians, rgb_to_dc
 
 NEIGHBOURS = 3
-MIN_SQUARED_DISTANCE = 1e-7  # world units^2: the floor of the mean squared distance to the neighbours
+MIN_SQUARED_DISTANCE = 1e-7  # world units^2; lower limit of the mean squared distance to the neighbours, as in 3DGS
 INITIAL_OPACITY = 0.1
 
 
 def gaussians_from_cloud(
     points: NDArray[np.float64], colors: NDArray[np.uint8], device: torch.device | str = "cpu"
 ) -> Gaussians:
-    """One isotropic Gaussian at each of ``points`` [P, 3] with ``colors`` [P, 3] (0 to 255), float32.
+    """Make one isotropic Gaussian at each of ``points`` [P, 3] with ``colors`` [P, 3] (0 to 255), float32.
 
     The standard deviation is the root of the mean *squared* distance to the 3 nearest other points (simple-knn of
-    3DGS). Raises InputError for fewer than 4 points or points that are not finite.
+    3DGS). Raises InputError if there are fewer than 4 points or points that are not finite.
     """
     if len(points) <= NEIGHBOURS:
         raise InputError(f"the initial cloud has {len(points)} points, at least {NEIGHBOURS + 1} are needed")

@@ -1,4 +1,4 @@
-"""The parameters of a set of 3D Gaussians, in the raw form that is optimised, their activations, and their colours."""
+"""A set of 3D Gaussians: raw parameters, activations, and colours by spherical harmonics."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 
 MAX_SH_DEGREE = 3
-NUM_SH_REST = (MAX_SH_DEGREE + 1) ** 2 - 1  # 15 coefficients per channel beyond the constant one
+NUM_SH_REST = (MAX_SH_DEGREE + 1) ** 2 - 1  # 15 coefficients per channel besides the constant one
 
 
 @dataclass
 class Gaussians:
-    """N Gaussians, raw (before activation); all tensors share dtype (float32 or float64) and device.
+    """N Gaussians as raw parameters (before activation), all of one dtype (float32 or float64) and on one device.
 
     | field          | shape      | activation                                   |
     |----------------|------------|----------------------------------------------|
@@ -69,11 +69,11 @@ class Gaussians:
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
     def map(self, function: Callable[[Tensor], Tensor]) -> Gaussians:
-        """``function`` applied to every tensor."""
+        """Apply ``function`` to every tensor."""
         return Gaussians(**{name: function(tensor) for name, tensor in self.tensors().items()})
 
     def select(self, index: Tensor) -> Gaussians:
-        """The Gaussians at a boolean mask [N] or integer index [M]; copies."""
+        """Copy the Gaussians at a boolean mask [N] or integer index [M]."""
         return self.map(lambda tensor: tensor[index])
 
     def detach(self) -> Gaussians:
@@ -86,7 +86,7 @@ class Gaussians:
 
 
 def quaternion_to_matrix(quaternions: Tensor) -> Tensor:
-    """Rotation matrices [N, 3, 3] of quaternions [N, 4] (w, x, y, z), which are normalised first."""
+    """Rotation matrices [N, 3, 3] of quaternions [N, 4] (w, x, y, z), which need not be normalised."""
     w, x, y, z = torch.nn.functional.normalize(quaternions, dim=-1).unbind(-1)  # each [N]
     rows = [
         torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
@@ -117,7 +117,7 @@ C3 = (
 
 
 def basis(directions: Tensor, degree: int) -> Tensor:
-    """The (degree + 1)^2 basis functions at unit ``directions`` [N, 3], as [N, (degree + 1)^2]."""
+    """Real spherical harmonics up to ``degree`` at unit ``directions`` [N, 3], as [N, (degree + 1)^2]."""
     x, y, z = directions.unbind(-1)  # each [N]
     terms = [torch.full_like(x, C0)]
     if degree >= 1:
@@ -144,7 +144,7 @@ def basis(directions: Tensor, degree: int) -> Tensor:
 
 
 def colors(sh_dc: Tensor, sh_rest: Tensor, directions: Tensor, degree: int) -> Tensor:
-    """RGB [N, 3], at least 0, of coefficients [N, 3] and [N, 15, 3] seen along unit ``directions`` [N, 3]."""
+    """RGB [N, 3], at least 0, of coefficients [N, 3] and [N, 15, 3] in view ``directions`` [N, 3] of unit length."""
     values = basis(directions, degree)  # [N, K]
     rgb = values[:, :1] * sh_dc
     if degree > 0:
@@ -154,7 +154,7 @@ def colors(sh_dc: Tensor, sh_rest: Tensor, directions: Tensor, degree: int) -> T
 
 
 def rgb_to_dc(rgb: Tensor) -> Tensor:
-    """The constant coefficient that shows colour ``rgb`` (0 to 1) from every side."""
+    """The constant coefficients that give colour ``rgb`` (0 to 1) in every direction."""
     return (rgb - 0.5) / C0
 
 

@@ -1,4 +1,4 @@
-"""Values that papers and their code give, which several parts of gsbench take as defaults. Loads no torch."""
+"""Values from papers and their code that several packages use as defaults. Does not import torch."""
 
 import math
 from dataclasses import dataclass
@@ -20,6 +20,6 @@ class LearningRates:
     rotation: float = 1e-3
 
     def position(self, step: float) -> float:
-        """The log-linear schedule, without the factor of the scene extent."""
+        """The learning rate of the means at iteration ``step``, before multiplication by the scene extent."""
         t = min(max(step / self.position_steps, 0.0), 1.0)
         return math.exp((1 - t) * math.log(self.position_initial) + t * math.log(self.position_final))

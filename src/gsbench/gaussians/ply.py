@@ -1,4 +1,4 @@
-"""The standard 3DGS point-cloud file, which viewers and other trainers read."""
+"""The PLY file of 3DGS, which viewers and other trainers read."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -27,13 +27,13 @@ COLUMNS = (
 REST = "f_rest_"
 REST_COUNTS = tuple(3 * ((degree + 1) ** 2 - 1) for degree in range(MAX_SH_DEGREE + 1))
 MAX_HEADER = 1 << 16  # bytes
-MIN_TEXT_BYTES = 2  # of a value in an ASCII file: a digit and a space
+MIN_TEXT_BYTES = 2  # bytes of a value in an ASCII file, at least: a digit and a space
 SIZES = {"short": 2, "ushort": 2, "int16": 2, "uint16": 2, "int": 4, "uint": 4, "int32": 4, "uint32": 4}
-SIZES |= {"float": 4, "float32": 4, "double": 8, "float64": 8}  # bytes; all other types have one
+SIZES |= {"float": 4, "float32": 4, "double": 8, "float64": 8}  # bytes; all other types have 1
 
 
 def write_ply(gaussians: Gaussians, path: Path) -> None:
-    """Write raw parameters as float32, binary little-endian, in INRIA's column order (normals are zero); atomic."""
+    """Write raw parameters as binary little-endian float32 in 3DGS's column order, with zero normals; atomic."""
     raw = gaussians.detach().map(lambda tensor: tensor.float().cpu())
     table = torch.cat(
         [
@@ -59,14 +59,14 @@ def _read_vertices(path: Path) -> NDArray[Any]:
 
 
 def check_ply(path: Path) -> None:
-    """Raise InputError where a file cannot be a PLY of Gaussians, judged by its header and its length alone."""
+    """Raise InputError if a file cannot be a PLY of Gaussians, judged only by its header and length."""
     with _reading(path):
         _check_length(path)
 
 
 @contextmanager
 def _reading(path: Path) -> Iterator[None]:
-    """Whatever a damaged file raises becomes an InputError that names it."""
+    """Turn every error that a damaged file can cause into an InputError that names the file."""
     try:
         yield
     except (OSError, LookupError, PlyParseError, ValueError, TypeError, OverflowError, MemoryError) as error:
@@ -74,14 +74,15 @@ def _reading(path: Path) -> Iterator[None]:
 
 
 def _check_length(path: Path) -> None:
-    """Raise ValueError where the header promises more than the file can hold, which would be allocated unread."""
+    """Raise ValueError if the header announces more data than the file can hold."""
+    # plyfile allocates what the header announces before it reads: a false count could fill the memory.
     require_regular(path)
     with path.open("rb") as stream:
-        header, found, _ = stream.read(MAX_HEADER).partition(b"end_header")
-    if not found:
+        header, end, _ = stream.read(MAX_HEADER).partition(b"end_header")
+    if not end:
         raise ValueError("it has no header")
     is_text = b"format ascii" in header
-    promised = count = 0
+    announced = count = 0  # announced: bytes
     for line in header.decode("ascii").splitlines():
         words = line.split()
         if words[:1] == ["element"]:
@@ -89,26 +90,26 @@ def _check_length(path: Path) -> None:
             if count < 0:
                 raise ValueError("it counts below zero")
         elif words[:1] == ["property"] and len(words) > 2:
-            promised += count * (MIN_TEXT_BYTES if is_text else SIZES.get(words[1], 1))
-    if promised > path.stat().st_size:
-        raise ValueError(f"it is cut short: its header promises {promised} bytes or more")
+            announced += count * (MIN_TEXT_BYTES if is_text else SIZES.get(words[1], 1))
+    if announced > path.stat().st_size:
+        raise ValueError(f"it is cut short: its header promises {announced} bytes or more")
 
 
 def read_ply(path: Path, device: torch.device | str = "cpu") -> Gaussians:
-    """Read a 3DGS PLY of SH degree 0 to 3 (missing higher coefficients become zero), float32.
+    """Read a 3DGS PLY of SH degree 0 to 3 as float32; coefficients above its degree become zero.
 
-    Raises InputError where the file is not a PLY, lacks a property, or holds values that are no Gaussians.
+    Raises InputError if the file is not a PLY, lacks a property, or has invalid values.
     """
     vertices = _read_vertices(path)
     present = set(vertices.dtype.names or ())
-    found = {name for name in present if name.startswith(REST)}
-    rest = [f"{REST}{i}" for i in range(len(found))]
+    present_rest = {name for name in present if name.startswith(REST)}
+    rest = [f"{REST}{i}" for i in range(len(present_rest))]
     required = [name for name in COLUMNS if not name.startswith(("f_rest_", "n"))]
     missing = [name for name in required if name not in present]
-    if found != set(rest) or len(rest) not in REST_COUNTS:
+    if present_rest != set(rest) or len(rest) not in REST_COUNTS:
         raise InputError(
             f"{path}: not a 3DGS PLY; its harmonics must be f_rest_0 to 8, to 23 or to 44 (degree 1 to 3), or none; "
-            f"it has {len(found)}" + (f", with {min(found - set(rest))}" if found != set(rest) else "")
+            f"it has {len(rest)}" + (f", with {min(present_rest - set(rest))}" if present_rest != set(rest) else "")
         )
     if missing or len(vertices) == 0:
         odd = ", ".join(missing) or "all, since it is empty"
@@ -122,7 +123,7 @@ def read_ply(path: Path, device: torch.device | str = "cpu") -> Gaussians:
     def columns(names: list[str]) -> torch.Tensor:
         return torch.from_numpy(np.stack([vertices[name].astype(np.float32) for name in names], axis=1)).to(device)
 
-    n, stored = len(vertices), len(rest) // 3
+    n, stored = len(vertices), len(rest) // 3  # coefficients per channel
     sh_rest = torch.zeros(n, NUM_SH_REST, 3, device=device)
     if stored:
         sh_rest[:, :stored] = columns(rest).reshape(n, 3, stored).transpose(1, 2)

@@ -1,4 +1,4 @@
-"""Gaussians together with their Adam optimiser: the one place that edits optimiser state."""
+"""Gaussians with their Adam optimiser. No other module edits optimiser state."""
 
 from __future__ import annotations
 
@@ -13,34 +13,34 @@ from torch.optim.adam import adam
 from gsbench.gaussians.model import MAX_SH_DEGREE, Gaussians
 from gsbench.gaussians.paper_values import LearningRates
 
-ADAM_BETAS = (0.9, 0.999)  # torch's defaults, as 3DGS has them
+ADAM_BETAS = (0.9, 0.999)  # torch's defaults, as in 3DGS
 ADAM_EPSILON = 1e-15  # 3DGS
 
 
 @dataclass
 class AdamState:
-    """Adam's state of one parameter: its learning rate, the steps taken, and both moments in the parameter's shape."""
+    """Adam's state of one parameter: learning rate, number of steps, and both moments in the parameter's shape."""
 
     rate: float
-    step: Tensor  # [], as torch's fused kernel wants it
+    step: Tensor  # [] float32: torch's fused kernel needs a tensor
     first: Tensor
     second: Tensor
 
 
 class TrainableGaussians:
-    """Raw parameters as leaves of the graph, each with its state of Adam.
+    """Raw parameters as leaves of the autograd graph, each with its Adam state.
 
-    Adding, removing or overwriting Gaussians goes through ``edit``: it keeps parameters and moments in step. As in
-    3DGS, an edited parameter is a new leaf without gradient, so the optimiser step of that iteration passes it over.
+    ``edit`` adds and removes Gaussians, and ``overwrite`` sets values; both change parameters and moments together. As
+    in 3DGS, an edited parameter is a new leaf without gradient, so the optimiser step of that iteration skips it.
 
-    `torch.optim.Adam` itself is not used: the first object of that class imports torch's compiler, 1.5 CPU-seconds in
-    each process that trains. Its function `adam` does the same arithmetic, and there are no groups to keep in step.
+    `torch.optim.Adam` is not used, because the first object of that class imports torch's compiler, which takes 1.5
+    CPU-seconds in each process. The function `adam` does the same arithmetic.
     """
 
     def __init__(self, gaussians: Gaussians, rates: LearningRates, spatial_scale: float) -> None:
         self.rates = rates
         self.spatial_scale = spatial_scale
-        # The parameters with their gradients, as they are after the last step, ``edit`` or ``overwrite``.
+        # The present parameters: each ``edit`` and ``overwrite`` replaces the tensors in it.
         self.values = gaussians.map(lambda tensor: tensor.detach().clone().requires_grad_(True))
         initial = {
             "means": rates.position(0) * spatial_scale,
@@ -77,17 +77,17 @@ class TrainableGaussians:
         self.adam["means"].rate = self.rates.position(step) * self.spatial_scale
 
     def set_rate(self, name: str, rate: float) -> None:
-        """Set the learning rate of the parameter ``name``; that of the means is set anew in each iteration."""
+        """Set the learning rate of the parameter ``name``. For the means, `set_step` replaces it in each iteration."""
         self.adam[name].rate = rate
 
     @torch.no_grad()
     def optimizer_step(self, sh_degree: int = MAX_SH_DEGREE, visible: Tensor | None = None) -> None:
-        """Adam on every parameter that has a gradient, then forget the gradients.
+        """Apply Adam to every parameter that has a gradient, then clear the gradients.
 
-        With ``visible`` [N] only those Gaussians move and update their moments, a departure from the baseline (the rest
-        then keep their momentum instead of coasting on it). At ``sh_degree`` 0 the gradient of ``sh_rest`` is zero: its
-        moments stay zero, and only Adam's count advances, which is the same and costs nothing.
+        With the mask ``visible`` [N], only visible Gaussians and their moments are updated. This departs from 3DGS,
+        where momentum also moves the others.
         """
+        # At degree 0 the gradient of sh_rest is zero, so its moments stay zero: Adam would only count the step.
         if sh_degree == 0 and self.values.means.grad is not None:
             self.values.sh_rest.grad = None
             self.adam["sh_rest"].step += 1
@@ -110,7 +110,7 @@ class TrainableGaussians:
 
     @torch.no_grad()
     def overwrite(self, name: str, values: Tensor, where: Tensor | None = None) -> None:
-        """Set parameter ``name`` to ``values`` (same shape) and zero its moments (at the mask ``where`` [N], or
+        """Set the parameter ``name`` to ``values`` of the same shape. Zero its moments at the mask ``where`` [N] (None:
         all)."""
         parameter = getattr(self.values, name)
         if values.shape != parameter.shape:
@@ -124,14 +124,14 @@ class TrainableGaussians:
                 moment[where] = 0
 
     def _replace(self, name: str, values: Tensor, keep: Tensor | None = None, added: Tensor | None = None) -> None:
-        """Make ``values`` the parameter ``name``, and bring its moments to the same rows; Adam's count stays."""
+        """Replace the parameter ``name`` by ``values``, and edit its moments alike; the step count stays."""
         state = self.adam[name]
         zeros = None if added is None else torch.zeros_like(added)
         state.first, state.second = _edited(state.first, keep, zeros), _edited(state.second, keep, zeros)
         setattr(self.values, name, values.contiguous().requires_grad_(True))
 
     def state_dict(self) -> dict[str, object]:
-        """The state that a resumed training needs, sharing memory with this object: save it before the next step."""
+        """Return the state for a checkpoint. It shares memory with this object: save it before the next step."""
         return {
             "gaussians": {name: tensor.detach() for name, tensor in self.values.tensors().items()},
             "adam": {name: vars(state).copy() for name, state in self.adam.items()},
@@ -141,7 +141,7 @@ class TrainableGaussians:
     def load(
         cls, state: dict[str, Any], rates: LearningRates, spatial_scale: float, device: torch.device | None = None
     ) -> TrainableGaussians:
-        """The inverse of ``state_dict``, on ``device`` (None: where the state is); copies."""
+        """Make an object from a copy of ``state_dict``, on ``device`` (None: the device of the state)."""
         gaussians = Gaussians(**state["gaussians"]).map(lambda tensor: tensor.to(device))
         trainable = cls(gaussians, rates, spatial_scale)
         for name, saved in state["adam"].items():
@@ -152,7 +152,7 @@ class TrainableGaussians:
 
 
 def _step_all(parameter: Tensor, state: AdamState) -> None:
-    """Adam (Kingma and Ba 2015) on a whole parameter, by torch's fused kernel where it has one."""
+    """Apply Adam (Kingma and Ba 2015) to a whole parameter, by torch's fused kernel on CPU and CUDA."""
     assert parameter.grad is not None
     adam(
         [parameter],
@@ -173,7 +173,7 @@ def _step_all(parameter: Tensor, state: AdamState) -> None:
 
 
 def _step_rows(parameter: Tensor, state: AdamState, index: Tensor) -> None:
-    """Adam on the rows ``index`` [V] alone; the count of steps is shared by all rows."""
+    """Apply Adam to the rows ``index`` [V] only. All rows share one step count."""
     assert parameter.grad is not None
     beta1, beta2 = ADAM_BETAS
     state.step += 1
@@ -181,8 +181,8 @@ def _step_rows(parameter: Tensor, state: AdamState, index: Tensor) -> None:
     first = state.first[index].lerp_(gradient, 1 - beta1)
     second = state.second[index].mul_(beta2).addcmul_(gradient, gradient, value=1 - beta2)
     state.first[index], state.second[index] = first, second
-    spread = (second / (1 - beta2**step)).sqrt_().add_(ADAM_EPSILON)
-    parameter[index] -= state.rate / (1 - beta1**step) * first / spread
+    denominator = (second / (1 - beta2**step)).sqrt_().add_(ADAM_EPSILON)
+    parameter[index] -= state.rate / (1 - beta1**step) * first / denominator
 
 
 def _edited(old: Tensor, keep: Tensor | None, added: Tensor | None) -> Tensor:

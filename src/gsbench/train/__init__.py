@@ -1,1 +1,1 @@
-"""The trainer and its parts, a library: options, loss, learning rates, checkpoints."""
+"""The trainer and its parts: options, loss, training views, checkpoints, logs."""

@@ -1,6 +1,6 @@
-"""Checkpoints of a training: written so that a kill at any moment leaves a readable one, and damage is noticed.
+"""Checkpoints of a training. A kill at any moment leaves a readable one, and damage is detected.
 
-A checkpoint is what ``torch.save`` writes, which ``torch.load`` reads, and after it the sha256 of that.
+A checkpoint file is the output of ``torch.save`` followed by its sha256; ``torch.load`` reads it as it is.
 """
 
 import hashlib
@@ -15,13 +15,13 @@ from gsbench.files import CHUNK, atomic, file_sha256, sync_to_disk
 
 log = logging.getLogger(__name__)
 
-KEPT = 2  # the newest, and the one before in case the newest is damaged
+KEPT = 2  # the newest, and the previous one in case the newest is damaged
 PATTERN = "checkpoint-*.pt"
 DIGEST_BYTES = hashlib.sha256().digest_size
 
 
 def save_checkpoint(folder: Path, step: int, state: dict[str, Any]) -> None:
-    """Write ``state`` (tensors and plain values) as the checkpoint of ``step``, then drop all but the last two."""
+    """Write ``state`` (tensors and plain values) as the checkpoint of ``step``; delete all but the last two."""
     path = folder / f"checkpoint-{step:08d}.pt"
     with atomic(path) as temporary, temporary.open("wb") as stream:
         torch.save(state, stream)
@@ -33,34 +33,34 @@ def save_checkpoint(folder: Path, step: int, state: dict[str, Any]) -> None:
 
 
 class CheckpointWriter:
-    """Writes checkpoints into ``folder``; the last that was handed over is whole on disk after `finish`.
+    """Writes checkpoints into ``folder``; after `finish`, all of them are completely on disk.
 
-    In the background, the state is copied to the host first, and a thread writes and hashes it while training goes on;
-    a second waits for the first. That is for models on a GPU: where the model is in this machine's memory anyway,
-    another copy would cost more than the wait.
+    With ``background``, `save` copies the state to the CPU, and a thread writes and hashes it while training continues;
+    the next `save` waits for that. This is for models on a GPU. For a model on the CPU, the copy would take longer than
+    the wait.
     """
 
     def __init__(self, folder: Path, background: bool) -> None:
         self.folder = folder
         self._executor = ThreadPoolExecutor(1, thread_name_prefix="gsbench-checkpoint") if background else None
-        self._under_way: Future[None] | None = None
+        self._pending: Future[None] | None = None
 
     def save(self, step: int, state: dict[str, Any]) -> None:
-        """Hand over the state of ``step``. Raises what went wrong with the one before."""
+        """Save the state of ``step``, perhaps in the background. Raises the error of the previous save if it failed."""
         self.finish()
         if self._executor is None:
             save_checkpoint(self.folder, step, state)
         else:
-            self._under_way = self._executor.submit(save_checkpoint, self.folder, step, to_host(state))
+            self._pending = self._executor.submit(save_checkpoint, self.folder, step, to_host(state))
 
     def finish(self) -> None:
-        """Wait until what was handed over is on disk, and raise what went wrong."""
-        under_way, self._under_way = self._under_way, None
-        if under_way is not None:
-            under_way.result()
+        """Wait until the last checkpoint is on disk; raise its error, if it failed."""
+        pending, self._pending = self._pending, None
+        if pending is not None:
+            pending.result()
 
     def close(self) -> None:
-        """Close the writer: `finish`, and end its thread."""
+        """`finish`, then end the thread."""
         try:
             self.finish()
         finally:
@@ -69,7 +69,7 @@ class CheckpointWriter:
 
 
 def to_host(state: Any) -> Any:
-    """A copy of nested ``state`` in which every tensor is in memory of its own on the CPU."""
+    """Copy nested ``state``, with every tensor in new memory on the CPU."""
     if isinstance(state, torch.Tensor):
         return state.detach().to("cpu", copy=True)
     if isinstance(state, dict):
@@ -78,9 +78,9 @@ def to_host(state: Any) -> Any:
 
 
 def load_checkpoint(folder: Path) -> dict[str, Any] | None:
-    """The newest sound checkpoint, all tensors on the CPU, or None.
+    """Load the newest undamaged checkpoint, all tensors on the CPU; None if there is none.
 
-    A damaged one is named and removed; nothing in it is run as code.
+    Damaged checkpoints are deleted, with a warning. Nothing in a checkpoint runs as code.
     """
     for path in sorted(folder.glob(PATTERN), reverse=True):
         try:
@@ -94,7 +94,7 @@ def load_checkpoint(folder: Path) -> dict[str, Any] | None:
 
 
 def _check_digest(path: Path) -> None:
-    """Raise ValueError unless the file ends with the sha256 of what is before."""
+    """Raise ValueError unless the last bytes of the file are the sha256 of the rest."""
     remaining = path.stat().st_size - DIGEST_BYTES
     digest = hashlib.sha256()
     with path.open("rb") as stream:

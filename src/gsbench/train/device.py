@@ -1,4 +1,4 @@
-"""The device of a training: which it is, what it rounds, how much memory is free, and what to say when it is full."""
+"""The device of a training: its choice, its precision and its memory."""
 
 import torch
 
@@ -6,7 +6,7 @@ from gsbench.errors import InputError, TrainingError
 
 
 def select_device(name: str) -> torch.device:
-    """``auto`` is the GPU where torch can use one, else the CPU."""
+    """Return the device called ``name``; ``auto`` is the GPU if torch can use one, else the CPU."""
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     try:
@@ -18,25 +18,26 @@ def select_device(name: str) -> torch.device:
     if device.type == "cuda" and device.index is not None and device.index >= torch.cuda.device_count():
         raise InputError(f"device={name}: there are {torch.cuda.device_count()} CUDA devices, numbered from 0")
     if device.type == "cuda":
-        keep_float32()
+        disable_tf32()
     return device
 
 
-def keep_float32() -> None:
-    """Let GPUs compute float32 as float32 in the whole process, also in backward passes.
+def disable_tf32() -> None:
+    """Make GPUs compute float32 without rounding to TF32 in the whole process, also in backward passes.
 
-    torch lets cuDNN's convolutions round to TF32, 10 bits, by default. SSIM takes differences of nearly equal moments:
-    with TF32 its map was off by up to 350 and its gradient was noise.
+    By default torch lets cuDNN's convolutions round to TF32, which has 10 bits. SSIM subtracts nearly equal moments:
+    with TF32 its map had errors of up to 350, and its gradient was noise.
     """
     torch.backends.cudnn.allow_tf32 = False
     torch.backends.cuda.matmul.allow_tf32 = False
 
 
 def free_bytes(device: torch.device) -> int | None:
-    """The bytes that torch can still take of a GPU's memory; None for a CPU, whose memory others give back."""
+    """The bytes of a GPU's memory that torch can still use; None for a CPU."""
     if device.type != "cuda":
         return None
     free, _ = torch.cuda.mem_get_info(device)
+    # torch's cache counts as used for the driver, but torch itself can still use it.
     return free + torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
 
 
@@ -46,8 +47,8 @@ ADVICE = (
 )
 
 
-def explain_full(step: int, gaussians: int, device: torch.device, last_state: str) -> TrainingError:
-    """The error for a device whose memory is full at iteration ``step``."""
+def out_of_memory_error(step: int, gaussians: int, device: torch.device, last_state: str) -> TrainingError:
+    """The error to raise when the device's memory is full at iteration ``step``."""
     return TrainingError(
         f"iteration {step}: {device} has no memory left at {gaussians:,} Gaussians; {last_state}; {ADVICE}"
     )

@@ -1,7 +1,7 @@
-"""The photometric loss of 3DGS, ``(1 - w) L1 + w (1 - SSIM)`` with w = 0.2: its definition in plain torch, and the
-quickest executor for a device.
+"""The photometric loss of 3DGS, ``(1 - w) L1 + w (1 - SSIM)`` with w = 0.2: its definition in torch, and the choice of
+the fastest implementation for a device.
 
-SSIM is that of `gsbench.eval.ssim`, padded with zeros, the mean of the full map, as in the reference code of 3DGS.
+SSIM is that of `gsbench.eval.ssim`: padded with zeros, the mean over the whole map, as in the reference code of 3DGS.
 """
 
 from collections.abc import Callable
@@ -22,7 +22,7 @@ Loss = Callable[[Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]
 def torch_photometric_loss(
     image: Tensor, target: Tensor, ssim_weight: float = SSIM_WEIGHT
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """``photometric_loss`` in plain torch, for any device and floating dtype: the definition."""
+    """The definition of ``photometric_loss`` in torch, for any device and floating dtype."""
     target = as_unit_range(target, image.dtype)
     l1 = (image - target).abs().mean()
     similarity = ssim_map(image, target).mean()
@@ -31,19 +31,19 @@ def torch_photometric_loss(
 
 
 def photometric_loss(image: Tensor, target: Tensor, ssim_weight: float = SSIM_WEIGHT) -> tuple[Tensor, Tensor, Tensor]:
-    """The loss, L1 and SSIM of ``image`` [H, W, 3] against ``target`` [H, W, 3] (uint8, taken as /255, or floating).
+    """The loss, L1 and SSIM of ``image`` [H, W, 3] against ``target`` [H, W, 3] (floating, or uint8 divided by 255).
 
-    Three scalars; only the loss carries a gradient, to ``image``. On the CPU in float32 this is a compiled kernel; a
-    caller with many images keeps a ``PhotometricLoss`` instead, which has threads and keeps its memory.
+    Three scalars; only the loss has a gradient, by ``image``. For many images, a ``PhotometricLoss`` is faster: it has
+    threads and reuses memory.
     """
     return PhotometricLoss(ssim_weight, threads=1)(image, target)
 
 
 class PhotometricLoss:
-    """``photometric_loss`` as an object: float32 images go through compiled kernels.
+    """``photometric_loss`` as an object that reuses compiled kernels for float32 images.
 
-    On a CPU these run on ``threads`` threads, with the same bits for any number of them; on a GPU where Triton is
-    installed they read nothing back. Any other device or dtype goes through torch.
+    On a CPU, kernels run on ``threads`` threads and give the same bits for any number of threads. On a GPU with Triton,
+    they never wait for the device. Other devices and dtypes use torch.
     """
 
     def __init__(self, ssim_weight: float = SSIM_WEIGHT, threads: int | None = None) -> None:
@@ -66,7 +66,7 @@ class PhotometricLoss:
         return self._compiled[kind](image, target)
 
     def _compile(self, device_type: str) -> Loss:
-        """Loads the packages that this type of device needs, and no others."""
+        """Return the loss for a type of device. Imports only the packages that it needs."""
         if device_type == "cpu":
             from gsbench.train.loss_cpu import CompiledLoss
 

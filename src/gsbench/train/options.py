@@ -1,4 +1,4 @@
-"""The settings of a training: iterations, learning rates, the window of the densifiers, checkpoints."""
+"""The settings of a training: iterations, learning rates, densification window, checkpoints."""
 
 from dataclasses import dataclass, field
 from typing import Literal
@@ -14,11 +14,11 @@ WITHOUT_EFFECT_ON_MODEL = ("name", "log_every", "checkpoint_every", "checkpoint_
 @dataclass
 class TrainConfig:
     name: str = MISSING
-    iterations: NonNegativeInt = 30_000  # 0: what the initialiser gives is evaluated as it is
-    sh_interval: PositiveInt = 1000  # spherical harmonics gain a degree so often
+    iterations: NonNegativeInt = 30_000  # 0: the initial Gaussians are evaluated without training
+    sh_interval: PositiveInt = 1000  # iterations after which spherical harmonics gain a degree
     ssim_weight: Fraction = 0.2  # loss = 0.8 L1 + 0.2 (1 - SSIM)
     background: tuple[Fraction, Fraction, Fraction] = (0.0, 0.0, 0.0)
-    position_initial: PositiveFloat = LearningRates.position_initial  # learning rates; positions times the scene extent
+    position_initial: PositiveFloat = LearningRates.position_initial  # learning rates; positions: times scene extent
     position_final: PositiveFloat = LearningRates.position_final
     position_steps: PositiveInt = LearningRates.position_steps
     sh_dc: PositiveFloat = LearningRates.sh_dc
@@ -26,21 +26,21 @@ class TrainConfig:
     opacity: PositiveFloat = LearningRates.opacity
     scale: PositiveFloat = LearningRates.scale
     rotation: PositiveFloat = LearningRates.rotation
-    densify_start: NonNegativeInt = 500  # the window of the densifiers, which read it from here
+    densify_start: NonNegativeInt = 500  # the densification window; densifiers read it from here
     densify_stop: NonNegativeInt = 15_000
     densify_interval: PositiveInt = 100
     opacity_reset_interval: PositiveInt = 3000
-    mcmc_stop: NonNegativeInt = 25_000  # 3DGS-MCMC refines for longer
-    step_after_refine: bool = False  # True: gsplat's order, the optimiser steps before a refinement and loses no step
+    mcmc_stop: NonNegativeInt = 25_000  # end of the longer window of 3DGS-MCMC
+    step_after_refine: bool = False  # True: the optimiser steps before a refinement, as in gsplat, so no step is lost
     resolution_schedule: Literal["none", "pictures", "pictures_and_count"] = (
         "none"  # DashGaussian: small pictures first
     )
     visible_adam: bool = False  # update visible Gaussians only; a departure from the baseline
-    max_seconds: PositiveFloat | None = None  # a budget of training time; the run ends at the first iteration past it
+    max_seconds: PositiveFloat | None = None  # time budget; training ends with the first iteration that exceeds it
     volume_histogram: list[NonNegativeInt] = field(default_factory=lambda: [4000, 8000, 12_000])  # iterations (Fig. 5)
     log_every: PositiveInt = 10
-    checkpoint_every: PositiveInt = 1000  # iterations; a killed trial goes on from the last one
-    checkpoint_minutes: PositiveFloat = 10.0  # and after so many minutes, whichever is first
+    checkpoint_every: PositiveInt = 1000  # iterations; a killed trial resumes from its last checkpoint
+    checkpoint_minutes: PositiveFloat = 10.0  # also so many minutes after the last checkpoint
 
     def __post_init__(self) -> None:
         check_settings(self, "train")

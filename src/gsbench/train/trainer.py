@@ -1,4 +1,4 @@
-"""The training loop: the schedule of 3DGS, any rasterizer, any densifier."""
+"""The training loop: the schedule of 3DGS, with any rasterizer and any densifier."""
 
 import logging
 import time
@@ -25,21 +25,21 @@ from gsbench.runs.layout import CURVES, EVENTS, HISTOGRAMS
 from gsbench.scene.types import Scene
 from gsbench.system.stopping import deferred, requested
 from gsbench.train.checkpoint import CheckpointWriter, load_checkpoint
-from gsbench.train.device import explain_full, free_bytes
+from gsbench.train.device import free_bytes, out_of_memory_error
 from gsbench.train.journal import LossLog, append, drop_after, volume_histogram
 from gsbench.train.loss import PhotometricLoss
 from gsbench.train.options import TrainConfig
-from gsbench.train.resolution import Pictures, Resolution
+from gsbench.train.resolution import Resolution, ScaledViews
 from gsbench.train.views import CameraOrder, SceneViews, Targets, generators
 
 log = logging.getLogger(__name__)
 
-SHARE_FOR_IMAGES = 0.5  # of the free memory of a GPU; the model and its renders take the rest
+SHARE_FOR_IMAGES = 0.5  # of a GPU's free memory; the rest is for the model and its renders
 
 
 @dataclass(frozen=True)
 class Status:
-    """Values that a progress bar shows."""
+    """What a progress bar shows."""
 
     step: int
     loss: float
@@ -50,10 +50,10 @@ class Status:
 class Trainer:
     """Trains Gaussians on the training views of a scene.
 
-    All randomness comes from generators made of ``seed``. ``run`` writes metrics, events and checkpoints into a
-    folder, and goes on from the newest checkpoint that it finds there: on the CPU, to the same bits as an undisturbed
-    run. A signal to stop (see `gsbench.system.stopping`) ends it after the iteration, with a checkpoint. At the
-    iterations ``snapshot_at`` the model is kept as well (see `snapshot_file`).
+    All random numbers come from generators seeded by ``seed``. ``run`` writes metrics, events and checkpoints into a
+    folder and resumes from the newest checkpoint there. On the CPU, a resumed run gives the same bits as an
+    uninterrupted one. A signal to stop (see `gsbench.system.stopping`) ends the run after the current iteration, with
+    a checkpoint. At the iterations ``snapshot_at`` the model is saved, too (see `snapshot_file`).
     """
 
     def __init__(
@@ -79,12 +79,12 @@ class Trainer:
         self.seconds = 0.0
         self.losses = LossLog()
         free = free_bytes(self.device)
-        room = None if free is None else int(SHARE_FOR_IMAGES * free)
-        self.targets = Targets(scene.train, self.device, room)
+        image_budget = None if free is None else int(SHARE_FOR_IMAGES * free)
+        self.targets = Targets(scene.train, self.device, image_budget)
         views = SceneViews(
             scene.train, self.targets, rasterizer, self.background, self.loss, partial(sh_degree_at, options)
         )
-        self.pictures = Pictures(scene.train, self.targets, self.device, room)
+        self.scaled_views = ScaledViews(scene.train, self.targets, self.device, image_budget)
         scheduled = options.resolution_schedule != "none"
         self.resolution = Resolution(options, scene.train, len(initial)) if scheduled else None
         limit = self.resolution.limit if self.resolution is not None and self.resolution.limits_count else None
@@ -93,7 +93,7 @@ class Trainer:
         densifier.begin(initial, self.context)
 
     def run(self, folder: Path, on_status: Callable[[Status], None] = lambda status: None) -> Gaussians:
-        """Train to the last iteration, or to the end of the time budget; returns the Gaussians, detached."""
+        """Train to the last iteration or the end of the time budget; return the Gaussians, detached."""
         self._resume(folder)
         if self.snapshot_at:
             (folder / snapshot_file(0)).parent.mkdir(exist_ok=True)
@@ -111,15 +111,15 @@ class Trainer:
         return self.gaussians.values.detach()
 
     def _loop(self, folder: Path, writer: CheckpointWriter, on_status: Callable[[Status], None]) -> None:
-        """Iterate to the end, a signal to stop or the end of the time budget; write down what happens."""
+        """Iterate until the end, a signal to stop or the end of the time budget; write metrics, events, checkpoints."""
         options = self.options
-        first_step, started, before = self.step, time.perf_counter(), self.seconds
+        first_step, started, earlier_seconds = self.step, time.perf_counter(), self.seconds
         last_checkpoint = time.monotonic()
         with (folder / CURVES).open("a") as metrics, (folder / EVENTS).open("a") as events:
             while self.step < options.iterations:
                 counts = {"num_gaussians": len(self.gaussians)}
                 event = self.iterate(folder)
-                self.seconds = before + time.perf_counter() - started
+                self.seconds = earlier_seconds + time.perf_counter() - started
                 out_of_time = options.max_seconds is not None and self.seconds >= options.max_seconds
                 last = self.step == options.iterations or out_of_time
                 if event is not None:
@@ -128,11 +128,12 @@ class Trainer:
                     with (folder / HISTOGRAMS).open("a") as stream:
                         append(stream, volume_histogram(self.step, self.gaussians.values.log_scales.detach()))
                 if self.step % options.log_every == 0 or last:
-                    record = self.losses.settle() | counts | {"sh_degree": self.sh_degree}
+                    record = self.losses.wait() | counts | {"sh_degree": self.sh_degree}
                     if self.resolution is not None:
                         record["scale"] = self.scale
-                    self.seconds = before + time.perf_counter() - started
-                    rate = (self.step - first_step) / max(self.seconds - before, 1e-9)
+                    # Measured again: on a GPU, `wait` waited for the work that was still queued.
+                    self.seconds = earlier_seconds + time.perf_counter() - started
+                    rate = (self.step - first_step) / max(self.seconds - earlier_seconds, 1e-9)
                     append(metrics, record | {"seconds": round(self.seconds, 3)})
                     on_status(Status(self.step, self.losses.smoothed, len(self.gaussians), rate))
                 minutes = (time.monotonic() - last_checkpoint) / 60
@@ -150,25 +151,25 @@ class Trainer:
     def iterate(self, folder: Path) -> RefineEvent | None:
         """Run one iteration in 3DGS's order: rates, SH degree, render, backward, statistics, refinement, Adam.
 
-        Its losses go to ``losses``, perhaps later; ``folder`` takes the snapshots. Raises TrainingError where a
-        parameter is out of range or no Gaussian is left.
+        Its losses reach ``losses``, on a GPU with a delay. Snapshots are written below ``folder``. Raises TrainingError
+        if a parameter is out of range or no Gaussian is left.
         """
         self.step += 1
         step, options = self.step, self.options
         self.gaussians.set_step(step if self.resolution is None else self.resolution.position_step(step))
         index = self.order.next()
-        _, targets = self.pictures.at(self.scale)
+        _, targets = self.scaled_views.at(self.scale)
         target = targets.get(index)
         try:
             render = self.render(index)
-        except ValueError as error:  # the optimiser has driven a parameter out of range
+        except ValueError as error:  # the rasterizer rejects a parameter that is out of range
             raise TrainingError(f"iteration {step}: {error}; {_last_state(folder)}") from error
         loss, l1, ssim = self.loss(where_counted(render.image, target, targets.mask(index)), target)
         regularizer = self.densifier.regularizer(self.gaussians.values)
         total = loss if regularizer is None else loss + regularizer
         self.losses.add(step, loss, l1, ssim, total)
         total.backward()
-        if step == options.iterations:  # 3DGS saves before it would refine or step
+        if step == options.iterations:  # as in 3DGS, which saves its model before it refines and steps
             return None
         if step in self.snapshot_at:
             write_ply(self.gaussians.values, folder / snapshot_file(step))
@@ -188,28 +189,28 @@ class Trainer:
         return event
 
     def render(self, index: int) -> RenderOutput:
-        """The training view ``index`` as the present iteration draws it, with a graph."""
-        camera = self.pictures.at(self.scale)[0][index]
-        # Only where it is wanted: a rasterizer of a user's own may not know this argument.
-        beyond: dict[str, Any] = {"splitting_matrix": True} if self.densifier.needs_splitting_matrix else {}
+        """Render the training view ``index`` as in the present iteration, with gradients."""
+        camera = self.scaled_views.at(self.scale)[0][index]
+        # Passed only if needed: a user's rasterizer may not have this argument.
+        extra: dict[str, Any] = {"splitting_matrix": True} if self.densifier.needs_splitting_matrix else {}
         return self.rasterizer.render(
             self.gaussians.values,
             camera,
             self.sh_degree,
             self.background,
             self.densifier.needs_absolute_gradient,
-            **beyond,
+            **extra,
         )
 
     @contextmanager
     def _explained(self, folder: Path) -> Iterator[None]:
-        """Name the last good state where the loss stopped being finite or the device's memory is full."""
+        """Raise TrainingError, with the last good state, if the loss is not finite or the device's memory is full."""
         try:
             yield
         except FloatingPointError as error:
             raise TrainingError(f"{error}; {_last_state(folder)}") from error
         except torch.OutOfMemoryError as error:
-            raise explain_full(self.step, len(self.gaussians), self.device, _last_state(folder)) from error
+            raise out_of_memory_error(self.step, len(self.gaussians), self.device, _last_state(folder)) from error
 
     @property
     def sh_degree(self) -> int:
@@ -217,14 +218,14 @@ class Trainer:
 
     @property
     def scale(self) -> int:
-        """The number by which the sides of the pictures are divided in the present iteration."""
+        """The number by which the sides of pictures are divided in the present iteration."""
         return 1 if self.resolution is None else self.resolution.scale(self.step)
 
     def _optimize(self, visible: torch.Tensor) -> None:
         self.gaussians.optimizer_step(self.sh_degree, visible if self.options.visible_adam else None)
 
     def _state(self) -> dict[str, Any]:
-        self.losses.settle()  # no state is saved that a loss would have condemned
+        self.losses.wait()  # raises if a loss was not finite: such a state must not be saved
         return {
             "step": self.step,
             "seconds": self.seconds,
@@ -259,15 +260,15 @@ def _last_state(folder: Path) -> str:
 
 
 def snapshot_file(step: int) -> str:
-    """The file, below a training's folder, of the model as 3DGS saves it at iteration ``step``: before it refines."""
+    """The path, below a training's folder, of the model at iteration ``step``, before it refines (as 3DGS saves it)."""
     return f"snapshots/iteration_{step}.ply"
 
 
 def sh_degree_at(options: TrainConfig, step: int) -> int:
-    """The degree of harmonics that iteration ``step`` renders with."""
+    """The degree of spherical harmonics at iteration ``step``."""
     return min(MAX_SH_DEGREE, step // options.sh_interval)
 
 
 def learning_rates(options: TrainConfig) -> LearningRates:
-    """The learning rates among the settings of a training."""
+    """The learning rates in the settings of a training."""
     return LearningRates(**{field.name: getattr(options, field.name) for field in fields(LearningRates)})

@@ -1,4 +1,4 @@
-"""The training views: their random order, their images on the device, and what densifiers see of them."""
+"""The training views: their random order, their images on the device, and renders of them for densifiers."""
 
 import logging
 from collections.abc import Callable, Sequence
@@ -16,22 +16,22 @@ from gsbench.scene.types import View
 from gsbench.train.loss import PhotometricLoss
 from gsbench.words import readable_bytes
 
-STREAMS = ("cameras", "densify")  # every random draw of a training belongs to one
+STREAMS = ("cameras", "densify")  # every random number of a training comes from one of these streams
 
 
 def generators(seed: int) -> dict[str, torch.Generator]:
-    """A CPU generator for each of `STREAMS`; streams of all seeds are independent."""
+    """A CPU generator for each of `STREAMS`. Streams, also of different seeds, are independent."""
     return {name: generator(seed, stream) for stream, name in enumerate(STREAMS)}
 
 
 def generator(seed: int, stream: int) -> torch.Generator:
-    """A CPU generator for one stream of a trial's randomness; streams of all seeds are independent."""
+    """A CPU generator for one random stream. Streams, also of different seeds, are independent."""
     state = np.random.SeedSequence([seed, stream]).generate_state(1, np.uint64)[0]
-    return torch.Generator().manual_seed(int(state >> np.uint64(1)))
+    return torch.Generator().manual_seed(int(state >> np.uint64(1)))  # 63 bits: torch takes seeds below 2^63
 
 
 class CameraOrder:
-    """Training views in random order without replacement, drawn anew when all were used."""
+    """Training views in random order without replacement; a new order when all were used."""
 
     def __init__(self, num_views: int, rng: torch.Generator) -> None:
         self.num_views = num_views
@@ -50,9 +50,8 @@ log = logging.getLogger(__name__)
 class Targets:
     """The images of ``views`` on ``device``, [H, W, 3] uint8 each.
 
-    They stay on the device where all of them fit into ``budget`` bytes (None: no limit). Else each is copied there when
-    it is asked for. On a CPU they are the arrays of the views themselves. Masks, a third of that where there are any,
-    are always there.
+    If all images fit into ``budget`` bytes (None: no limit), they stay on the device; otherwise `get` copies each. On a
+    CPU they share memory with the views. Masks, which need a third of the memory, always stay on the device.
     """
 
     def __init__(self, views: Sequence[View], device: torch.device, budget: int | None = None) -> None:
@@ -72,22 +71,23 @@ class Targets:
             )  # fmt: skip
 
     def mask(self, index: int) -> Tensor | None:
-        """The mask of view ``index``, True where a pixel counts, [H, W, 1] on the device; None where all do."""
+        """The mask of view ``index``, True where a pixel counts, [H, W, 1] on the device; None if all pixels count."""
         return self._masks[index]
 
     def get(self, index: int) -> Tensor:
-        """The image of view ``index``, for work that is queued from here on."""
+        """The image of view ``index``, perhaps still being copied: use it only in work queued after this call."""
         image = self._images[index]
         if self.resident or self._device.type != "cuda":
             return image
-        return image.pin_memory().to(self._device, non_blocking=True)  # page-locked, so that the host need not wait
+        # Only from page-locked memory is a copy asynchronous.
+        return image.pin_memory().to(self._device, non_blocking=True)
 
 
 class SceneViews:
-    """The views of a scene, rendered and measured as the training does it; see `gsbench.densify.scores.TrainingViews`.
+    """Training views for densifiers, rendered and measured as in training (`gsbench.densify.scores.TrainingViews`).
 
-    ``sh_degree`` says which degree of harmonics an iteration renders with. Pixels that a mask ignores are rendered as
-    the photograph has them, without error or gradient.
+    ``sh_degree`` maps an iteration to its degree of spherical harmonics. Pixels that a mask ignores are replaced by
+    those of the photograph, so that they have no error and no gradient.
     """
 
     def __init__(
