@@ -11,7 +11,7 @@ from PIL import Image
 
 from gsbench.errors import InputError
 from gsbench.scene.camera import Camera
-from gsbench.scene.colmap import points_of, read_model, read_reference, write_model
+from gsbench.scene.colmap import model_points, read_model, read_reference, write_model
 from gsbench.scene.colmap_files import ModelChecks, check_model
 from gsbench.scene.options import SplitRule
 from gsbench.scene.readers import read_colmap, read_photos
@@ -61,7 +61,7 @@ def test_subset_drops_images_and_their_observations(make_scene, tmp_path: Path):
     fitted.write_binary(tmp_path / "out")
     again = read_model(tmp_path / "out")
     assert again.num_reg_images() == 3
-    np.testing.assert_array_equal(points_of(again)[0], points_of(fitted)[0])
+    np.testing.assert_array_equal(model_points(again)[0], model_points(fitted)[0])
 
 
 def test_points_of_fewer_than_two_kept_images_go(make_scene):

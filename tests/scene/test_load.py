@@ -14,7 +14,7 @@ from PIL import Image
 from gsbench.errors import InputError
 from gsbench.scene.camera import CameraModel
 from gsbench.scene.colmap import read_model
-from gsbench.scene.load import Job, load_scene, prepare_all, undistort
+from gsbench.scene.load import ImageToPrepare, load_scene, prepare_all, undistort
 from gsbench.scene.options import SplitRule
 from gsbench.scene.readers import read_colmap
 
@@ -75,7 +75,7 @@ def test_panoramas_are_refused(tmp_path: Path):
         undistort(np.zeros((HEIGHT, WIDTH, 3), dtype=np.uint8), camera)
     Image.new("RGB", (WIDTH, HEIGHT)).save(tmp_path / "a.png")
     with pytest.raises(InputError, match="EQUIRECTANGULAR"):  # and so from the isolated process
-        prepare_all([Job(tmp_path / "a.png", camera, tmp_path / "b.png")])
+        prepare_all([ImageToPrepare(tmp_path / "a.png", camera, tmp_path / "b.png")])
 
 
 def test_untouched_views_are_the_files(make_scene, tmp_path: Path):

@@ -15,7 +15,7 @@ from PIL import Image
 from gsbench.errors import InputError
 from gsbench.pipeline.steps.scene import masked_step
 from gsbench.scene.load import load_scene
-from gsbench.scene.masks import fill, find_masks, prepare, prepared_mask, read_mask, resize_mask
+from gsbench.scene.masks import fill_ignored, find_masks, prepare_photograph, prepared_mask, read_mask, resize_mask
 from gsbench.scene.options import SceneConfig
 from gsbench.scene.readers import read_colmap, read_photos
 from gsbench.scene.types import Capture
@@ -157,8 +157,8 @@ def test_what_is_filled_in_owes_nothing_to_what_was_there(height: int, width: in
     counts[rng.integers(height), rng.integers(width)] = True
     one, other = rng.integers(0, 256, (2, height, width, 3), dtype=np.uint8)
     other[counts] = one[counts]
-    filled = fill(one, counts)
-    np.testing.assert_array_equal(filled, fill(other, counts))
+    filled = fill_ignored(one, counts)
+    np.testing.assert_array_equal(filled, fill_ignored(other, counts))
     np.testing.assert_array_equal(filled[counts], one[counts])
     low, high = one[counts].min(axis=0), one[counts].max(axis=0)
     assert ((filled >= low) & (filled <= high)).all(), "means of what counts"
@@ -168,9 +168,9 @@ def test_a_plane_is_filled_with_its_own_colour_and_a_ramp_without_a_step() -> No
     plain = np.full((50, 60, 3), (10, 200, 90), dtype=np.uint8)
     counts = np.ones((50, 60), bool)
     counts[10:40, 15:45] = False
-    np.testing.assert_array_equal(fill(np.where(counts[..., None], plain, 0).astype(np.uint8), counts), plain)
+    np.testing.assert_array_equal(fill_ignored(np.where(counts[..., None], plain, 0).astype(np.uint8), counts), plain)
     ramp = np.repeat(np.repeat(np.linspace(0, 240, 60)[None, :, None], 50, 0), 3, 2).astype(np.uint8)
-    filled = fill(ramp, counts).astype(int)
+    filled = fill_ignored(ramp, counts).astype(int)
     assert np.abs(np.diff(filled[25, :, 0])).max() < 60, "black in its place would make a step of 180"
 
 
@@ -197,7 +197,7 @@ def prepared(root: Path, folder: Path, **options: object) -> Capture:
     """The capture as the pipeline hands it on: `prepare` has been over it."""
     capture = read_colmap("toy", root, masks="masks", **options)  # type: ignore[arg-type]
     for name in capture.image_names:
-        prepare(folder, capture.images, capture.masks, name)
+        prepare_photograph(folder, capture.images, capture.masks, name)
     masks = {name: prepared_mask(folder, name) for name in capture.masks}
     return Capture(**(vars(capture) | {"images": folder / "images", "masks": masks}))
 
@@ -256,7 +256,7 @@ def test_what_is_prepared_keeps_exif_and_is_a_photograph_to_colmap(tmp_path: Pat
     (tmp_path / "in").mkdir()
     image.save(tmp_path / "in" / "a.jpg", exif=exif.tobytes())
     save(tmp_path / "m.png", half(45, 30))
-    prepare(tmp_path / "out", tmp_path / "in", {"a.jpg": tmp_path / "m.png"}, "a.jpg")
+    prepare_photograph(tmp_path / "out", tmp_path / "in", {"a.jpg": tmp_path / "m.png"}, "a.jpg")
     cameras = [pycolmap.infer_camera_from_image(tmp_path / place / "a.jpg") for place in ("in", "out/images")]
     assert cameras[0].has_prior_focal_length
     assert cameras[1].has_prior_focal_length

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gsbench.scene.camera import ANGLE, DISTANCE, Camera, nearness
+from gsbench.scene.camera import ANGLE, DISTANCE, Camera, nearest_training_cameras
 from gsbench.scene.courtyard.render import ring_camera
-from gsbench.scene.hold_out import arrange, sector_of
+from gsbench.scene.hold_out import arrange_cameras, sector_range
 from tests.scene import cameras
 
 looking = partial(cameras.looking, size=(40, 30), focal=50.0)
@@ -47,25 +47,25 @@ def test_a_ring_is_cut_by_azimuth_whatever_its_names_and_gauge(seed: int, sector
     degrees = list(rng.permutation(np.arange(24) * 15.0))
     rotation, shift = some_rotation(seed), np.array([5.0, -3.0, 2.0]) * (100 if far else 1)
     cameras = [turned(camera, rotation, shift, 0.3) for camera in ring(degrees)]
-    found = arrange(cameras)
+    found = arrange_cameras(cameras)
     assert "surround" in found.description
     assert found.order[0] == 0, "a closed ring begins at the first camera"
     around = [int(index) for index in np.argsort(degrees)]
-    parts = [{found.order[place] for place in sector_of(24, part, sectors)} for part in range(sectors)]
+    parts = [{found.order[place] for place in sector_range(24, part, sectors)} for part in range(sectors)]
     assert sorted(index for part in parts for index in part) == list(range(24))
     assert all(is_cyclic_run(part, around) for part in parts)
 
 
 def test_an_open_ring_begins_after_its_gap() -> None:
     cameras = ring([100.0, 60.0, 20.0, 140.0, 180.0, 220.0, 260.0])  # nothing from 260 to 380
-    assert [round(np.degrees(np.arctan2(*cameras[k].center[1::-1])) % 360) for k in arrange(cameras).order] == [
+    assert [round(np.degrees(np.arctan2(*cameras[k].center[1::-1])) % 360) for k in arrange_cameras(cameras).order] == [
         20, 60, 100, 140, 180, 220, 260,
     ]  # fmt: skip
 
 
 def test_cameras_on_one_side_are_cut_by_planes_in_order() -> None:
     arc = ring([0.0, 20.0, 40.0, 60.0, 80.0, 100.0])
-    found = arrange(arc)
+    found = arrange_cameras(arc)
     assert "one side" in found.description
     assert found.order == (0, 1, 2, 3, 4, 5)
 
@@ -73,12 +73,12 @@ def test_cameras_on_one_side_are_cut_by_planes_in_order() -> None:
 def test_parallel_and_outward_looking_cameras_are_cut_by_planes() -> None:
     places = [np.array([x, 0.0, 0.0]) for x in (0.0, 3.0, 1.0, 2.0)]
     row = [looking(place, place + np.array([0.0, 5.0, 0.0])) for place in places]
-    assert "one direction" in arrange(row).description
-    assert arrange(row).order == (0, 2, 3, 1)
+    assert "one direction" in arrange_cameras(row).description
+    assert arrange_cameras(row).order == (0, 2, 3, 1)
     outward = [
         looking(camera.center, 2 * camera.center - [0, 0, 1.5]) for camera in ring([0.0, 90.0, 180.0, 270.0, 45.0])
     ]
-    assert "do not look at one place" in arrange(outward).description
+    assert "do not look at one place" in arrange_cameras(outward).description
 
 
 def test_nine_of_ten_cameras_must_look_towards_the_centre() -> None:
@@ -87,7 +87,7 @@ def test_nine_of_ten_cameras_must_look_towards_the_centre() -> None:
         around = ring([36.0 * k for k in range(10)])
         for k in range(away):
             around[k] = looking(around[k].center, 2 * around[k].center)
-        assert ("surround" in arrange(around).description) == surrounds
+        assert ("surround" in arrange_cameras(around).description) == surrounds
 
 
 def test_a_first_camera_straight_above_has_no_azimuth_to_count_from() -> None:
@@ -96,7 +96,7 @@ def test_a_first_camera_straight_above_has_no_azimuth_to_count_from() -> None:
     level = [looking(place, np.zeros(3)) for place in around]
     above = np.array([[[1.0, 0, 0], [0, -1, 0], [0, 0, -1]], [[-1.0, 0, 0], [0, 1, 0], [0, 0, -1]]])
     top = [Camera(40, 30, 50.0, 50.0, 20.0, 15.0, turn, -turn @ [0, 0, 3.0]) for turn in above]
-    found = arrange([*top, *level])
+    found = arrange_cameras([*top, *level])
     assert "none in 360 degrees around its centre" in found.description
     assert sorted(found.order) == list(range(6))
 
@@ -107,28 +107,28 @@ def test_an_exact_ring_is_cut_alike_whatever_the_last_digits_are() -> None:
     shaken = [
         Camera(40, 30, 50, 50, 20, 15, c.rotation, c.translation + d) for c, d in zip(cameras, noise, strict=True)
     ]
-    assert arrange(cameras).order == arrange(shaken).order == tuple(range(48))
+    assert arrange_cameras(cameras).order == arrange_cameras(shaken).order == tuple(range(48))
 
 
 @given(st.integers(3, 60), st.integers(2, 9))
 def test_parts_differ_by_one_at_most_and_matched_ones_by_none(count: int, sectors: int) -> None:
-    sizes = [len(sector_of(count, part, sectors)) for part in range(sectors)]
+    sizes = [len(sector_range(count, part, sectors)) for part in range(sectors)]
     assert sum(sizes) == count
     assert max(sizes) - min(sizes) <= 1
     exactly = count // sectors
-    matched = [sector_of(count, part, sectors, exactly) for part in range(sectors)]
+    matched = [sector_range(count, part, sectors, exactly) for part in range(sectors)]
     assert {len(part) for part in matched} == {exactly}
     assert all(set(part) <= set(range(count)) for part in matched)
 
 
 def test_nearness_is_the_least_angle_and_the_least_distance() -> None:
     training, test = ring([0.0, 40.0, 90.0]), ring([10.0, 75.0])
-    found = nearness(test, training, 2.0)
+    found = nearest_training_cameras(test, training, 2.0)
     for camera, entry in zip(test, found, strict=True):
         cosines = [float(camera.rotation[2] @ other.rotation[2]) for other in training]
         assert entry[ANGLE] == pytest.approx(np.degrees(np.arccos(max(cosines))), abs=1e-9)
         places = [float(np.linalg.norm(camera.center - other.center)) for other in training]
         assert entry[DISTANCE] == pytest.approx(min(places) / 2.0)
-    assert nearness(training, training, 2.0) == [{ANGLE: 0.0, DISTANCE: 0.0}] * 3
-    assert nearness(test, training[:1], 0.0)[0].keys() == {ANGLE}
-    assert nearness([], training, 1.0) == []
+    assert nearest_training_cameras(training, training, 2.0) == [{ANGLE: 0.0, DISTANCE: 0.0}] * 3
+    assert nearest_training_cameras(test, training[:1], 0.0)[0].keys() == {ANGLE}
+    assert nearest_training_cameras([], training, 1.0) == []

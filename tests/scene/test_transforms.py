@@ -124,14 +124,14 @@ def test_what_was_applied_is_undone_for_cameras_and_points(tmp_path: Path) -> No
     ],
 )
 def test_intrinsics_of_the_file_or_of_each_frame(tmp_path: Path, said, model, params) -> None:
-    shared = read_transforms(write(tmp_path / "shared", **said)).frames["images/3.png"].camera
+    shared = read_transforms(write(tmp_path / "shared", **said)).images["images/3.png"].camera
     folder = write(tmp_path / "own")
     document = json.loads((folder / "transforms.json").read_text())
     own = {key: document.pop(key) for key in SHARED} | said
     document["frames"] = [frame | own for frame in document["frames"]]
     document["frames"][2]["fl_x"] = 60.0
     (folder / "transforms.json").write_text(json.dumps(document))
-    frames = read_transforms(folder).frames
+    frames = read_transforms(folder).images
     for camera in (shared, frames["images/3.png"].camera):
         assert (camera.name, camera.width, camera.height) == (model, 40, 30)
         assert list(camera.params) == params
@@ -156,7 +156,7 @@ def test_blenders_angle_its_missing_extension_its_parts_and_its_alpha(tmp_path: 
     capture = capture_of(tmp_path, tmp_path / "made", split="list")
     assert capture.test_names == tuple(f"test/r_{k}.png" for k in range(3))
     assert capture.train_names == tuple(f"train/r_{k}.png" for k in range(5))
-    camera = read_transforms(tmp_path).frames["train/r_0.png"].camera
+    camera = read_transforms(tmp_path).images["train/r_0.png"].camera
     assert camera.params == pytest.approx((0.5 * 40 / math.tan(0.5 * angle),) * 2 + (20, 20))
     from gsbench.pipeline.steps.scene import masked, masked_step
 
@@ -250,7 +250,7 @@ def test_no_file_and_a_name_without_a_decision(tmp_path: Path) -> None:
 def test_images_without_a_file_are_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     folder = write(tmp_path / "in")
     (folder / "images" / "4.png").unlink()
-    assert len(read_transforms(folder).frames) == 5
+    assert len(read_transforms(folder).images) == 5
     assert "1 of 6 images have no file: ./images/4.png" in caplog.text
 
 

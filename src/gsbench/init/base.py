@@ -68,9 +68,9 @@ def read_cloud(model_dir: Path) -> PointCloud:
 
     Raises ``InputError`` where the folder holds no readable model.
     """
-    from gsbench.scene.colmap import points_of, read_model
+    from gsbench.scene.colmap import model_points, read_model
 
-    return PointCloud(*points_of(read_model(model_dir)))
+    return PointCloud(*model_points(read_model(model_dir)))
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from gsbench.gaussians.paper_values import VOLUME_THRESHOLD
 from gsbench.init.base import MODEL_FOLDER, PICTURE_FILE, REPORT_FILE, Gauge, InitReport, PoseErrors, TrainingPoints
 from gsbench.init.colmap.alignment import Array, Similarity, rotation_angles, transformed_rotations
 from gsbench.init.colmap.reconstruct import common_poses, poses_by_name, save_reconstruction
-from gsbench.scene.colmap import points_of
+from gsbench.scene.colmap import model_points
 from gsbench.scene.types import EXTENT_MARGIN, Capture
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ CAMERA_COLOR = (214, 39, 40)
 
 def draw_cloud(model: pycolmap.Reconstruction, path: Path, title: str) -> None:
     """Draw a model from above into the PNG ``path``: points in their colours, cameras in red with lines of sight."""
-    points, colors = points_of(model)
+    points, colors = model_points(model)
     if len(points) > MAX_POINTS:
         chosen = np.random.default_rng(0).permutation(len(points))[:MAX_POINTS]
         points, colors = points[chosen], colors[chosen]

@@ -1,4 +1,4 @@
-"""A pinhole camera with a pose, and how far cameras are from those that a model was trained on."""
+"""A pinhole camera with a pose, and the distance of test cameras from the training cameras."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ class Camera:
     """A pinhole camera in OpenCV axes (x right, y down, z forward).
 
     ``fx, fy, cx, cy`` are in pixels, in COLMAP's convention: the centre of the first pixel is (0.5, 0.5), so a centred
-    principal point is ``cx = width / 2``. ``rotation`` [3, 3] and ``translation`` [3] take a world point to the camera:
-    ``x_camera = rotation @ x_world + translation`` (float64).
+    principal point is ``cx = width / 2``. ``rotation`` [3, 3] and ``translation`` [3] map a world point to camera
+    coordinates: ``x_camera = rotation @ x_world + translation`` (float64).
     """
 
     width: int
@@ -51,7 +51,7 @@ class Camera:
         return -self.rotation.T @ self.translation
 
     def resized(self, width: int, height: int) -> Camera:
-        """The same camera for the same picture at another size in pixels."""
+        """The same camera for the same image at another size in pixels."""
         sx, sy = width / self.width, height / self.height
         return replace(
             self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy
@@ -72,41 +72,46 @@ class CameraModel:
         return self.name not in PINHOLE_NAMES
 
 
-def pinhole_of(camera: CameraModel) -> Camera:
-    """An undistorted COLMAP camera as a `Camera` at the origin."""
+def to_pinhole(camera: CameraModel) -> Camera:
+    """Convert an undistorted COLMAP camera to a `Camera` at the origin."""
     fx, fy, cx, cy = camera.params if camera.name == "PINHOLE" else (camera.params[0], *camera.params)
     return Camera(camera.width, camera.height, fx, fy, cx, cy, np.eye(3), np.zeros(3))
 
 
 ANGLE, DISTANCE = "angle_to_nearest", "distance_to_nearest"
-COUNTED = "counted"  # the share of a view's pixels that its mask does not ignore; where there are masks
+COUNTED = "counted"  # the share of a view's pixels that its mask does not ignore; only for views with masks
 
 
 Array = NDArray[np.float64]
 
 
-def axis_angles(axes: Array, others: Array) -> Array:
+def angles_between(directions: Array, references: Array) -> Array:
     """Angles [V, W] in degrees between unit vectors [V, 3] and [W, 3]."""
-    chords = np.linalg.norm(axes[:, None] - others[None], axis=-1)  # accurate near 0, where a cosine is not
+    # The chord is accurate near an angle of 0, the arc cosine is not.
+    chords = np.linalg.norm(directions[:, None] - references[None], axis=-1)
     return 2 * np.degrees(np.arcsin(np.clip(chords / 2, 0.0, 1.0)))
 
 
-def nearness(cameras: Sequence[Camera], training: Sequence[Camera], extent: float) -> list[dict[str, float]]:
-    """Measure how far each of ``cameras`` is from the training cameras: the nearest in angle and the nearest in place.
+def nearest_training_cameras(
+    cameras: Sequence[Camera], training: Sequence[Camera], extent: float
+) -> list[dict[str, float]]:
+    """Measure how far each camera is from the training camera nearest in angle, and from the one nearest in position.
 
-    ``angle_to_nearest`` is the least angle between its viewing direction and that of a training camera, in degrees;
-    ``distance_to_nearest`` the least distance between their centres, in scene extents (not given where that is 0).
+    ``angle_to_nearest`` is the smallest angle between the viewing directions, in degrees. ``distance_to_nearest`` is
+    the smallest distance between the centres, in scene extents; it is left out if the extent is 0.
     """
     if not cameras or not training:
         return [{} for _ in cameras]
-    axes, others = (np.array([camera.rotation[2] for camera in group]) for group in (cameras, training))
-    places, theirs = (np.array([camera.center for camera in group]) for group in (cameras, training))
-    angles = axis_angles(axes, others).min(axis=1)  # [V]
-    distances = np.linalg.norm(places[:, None] - theirs[None], axis=-1).min(axis=1)  # [V]
-    found = []
+    directions, training_directions = (
+        np.array([camera.rotation[2] for camera in group]) for group in (cameras, training)
+    )
+    centers, training_centers = (np.array([camera.center for camera in group]) for group in (cameras, training))
+    angles = angles_between(directions, training_directions).min(axis=1)  # [V]
+    distances = np.linalg.norm(centers[:, None] - training_centers[None], axis=-1).min(axis=1)  # [V]
+    measured = []
     for angle, distance in zip(angles, distances, strict=True):
-        entry = {ANGLE: float(angle)}
+        values = {ANGLE: float(angle)}
         if extent > 0:
-            entry[DISTANCE] = float(distance) / extent
-        found.append(entry)
-    return found
+            values[DISTANCE] = float(distance) / extent
+        measured.append(values)
+    return measured

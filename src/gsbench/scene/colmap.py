@@ -1,4 +1,4 @@
-"""COLMAP models: reading them safely, fitting them to the files at hand, and taking plain cameras out of them."""
+"""Reading COLMAP models safely, fitting them to the image files, converting their cameras, and writing models."""
 
 import zlib  # noqa: F401  must be loaded before pycolmap, whose own zlib otherwise crashes Pillow's PNG code
 from collections.abc import Iterable, Mapping
@@ -16,8 +16,8 @@ from gsbench.scene.names import match_names
 from gsbench.scene.types import Capture
 
 PINHOLE_MODELS = (pycolmap.CameraModelId.SIMPLE_PINHOLE, pycolmap.CameraModelId.PINHOLE)
-UNIT_TOLERANCE = 1e-9  # of the length of a quaternion that stays as it is
-MIN_TRACK = 2  # a 3D point of COLMAP is seen by at least two images
+UNIT_TOLERANCE = 1e-9  # a quaternion whose length differs from 1 by no more is not normalised again
+MIN_TRACK = 2  # images that must see a 3D point, as in COLMAP
 
 
 def read_model(folder: Path) -> pycolmap.Reconstruction:
@@ -28,7 +28,7 @@ def read_model(folder: Path) -> pycolmap.Reconstruction:
     check_model(folder)
     try:
         model = pycolmap.Reconstruction(folder)
-        _normalize(model)
+        _normalize_quaternions(model)
         for image in model.images.values():
             if image.has_pose and not np.isfinite(image.cam_from_world().matrix()).all():
                 raise ValueError(f"image {image.name} has no finite pose")
@@ -41,18 +41,18 @@ def read_model(folder: Path) -> pycolmap.Reconstruction:
     return model
 
 
-def _normalize(model: pycolmap.Reconstruction) -> None:
-    """Make the quaternions of rigs and frames unit ones, as COLMAP does with those of images alone."""
+def _normalize_quaternions(model: pycolmap.Reconstruction) -> None:
+    """Give the quaternions of rigs and frames unit length. COLMAP normalises only those of images."""
     for rig in model.rigs.values():
         for sensor, pose in rig.non_ref_sensors.items():
             if pose is not None and abs(pose.rotation.norm() - 1) > UNIT_TOLERANCE:
-                rig.set_sensor_from_rig(sensor, _unit(pose))
+                rig.set_sensor_from_rig(sensor, _with_unit_quaternion(pose))
     for frame in model.frames.values():
         if frame.has_pose() and abs(frame.rig_from_world.rotation.norm() - 1) > UNIT_TOLERANCE:
-            frame.rig_from_world = _unit(frame.rig_from_world)
+            frame.rig_from_world = _with_unit_quaternion(frame.rig_from_world)
 
 
-def _unit(pose: pycolmap.Rigid3d) -> pycolmap.Rigid3d:
+def _with_unit_quaternion(pose: pycolmap.Rigid3d) -> pycolmap.Rigid3d:
     quaternion = np.asarray(pose.rotation.quat)
     return pycolmap.Rigid3d(pycolmap.Rotation3d(quaternion / np.linalg.norm(quaternion)), pose.translation)
 
@@ -63,13 +63,14 @@ def registered_names(model: pycolmap.Reconstruction) -> list[str]:
 
 
 def read_reference(capture: Capture) -> pycolmap.Reconstruction:
-    """The capture's reference model, fitted to its files.
+    """The capture's reference model, fitted to its image files.
 
-    Only the images in ``capture.image_names`` remain, under those names; cameras (and 2D points) are rescaled to the
-    sizes of the files, so a model of the full size serves ``images_4``; 3D points that fewer than two of the images see
-    are dropped, unless the model says of no point who sees it. Images that the model has no pose for are left out.
+    Only images in ``capture.image_names`` that have a pose remain, under those names. Cameras and 2D points are
+    rescaled to the sizes of the files, so a model of the full size serves ``images_4``. 3D points that fewer than two
+    of the images see are dropped, unless no point of the model has a track.
 
-    Raises `InputError` if there is no model, or an image and its camera differ in aspect by more than rounding.
+    Raises `InputError` if there is no model, or if the aspect ratios of an image and its camera differ by more than
+    rounding.
     """
     if capture.model is None:
         raise InputError(f"scene {capture.name}: no COLMAP model came with these photos: use init=sfm init.poses=own")
@@ -87,8 +88,8 @@ def fit_model(
 ) -> pycolmap.Reconstruction:
     """A new model of the images ``names`` (old -> new name), for files of ``sizes`` (new name -> (width, height) px).
 
-    Camera, image and point ids are kept; where files of one camera have different sizes, each further size gets a
-    camera of its own. ``folder`` is only for error messages.
+    The ids of cameras, images and points are kept. If the files of one camera have different sizes, each further size
+    gets a new camera. ``folder`` is only for error messages.
     """
     fitted = pycolmap.Reconstruction()
     next_camera_id = max(model.cameras, default=0) + 1
@@ -117,10 +118,10 @@ def fit_model(
 
 
 def rescaled_camera(camera: pycolmap.Camera, width: int, height: int, camera_id: int) -> pycolmap.Camera:
-    """The same camera for the same picture at another size in px.
+    """The same camera for the same image at another size in px.
 
-    A single focal length that would become two (a side was rounded) turns SIMPLE_PINHOLE into PINHOLE; the other models
-    of one focal length take the mean of both scales, as COLMAP does.
+    SIMPLE_PINHOLE becomes PINHOLE, because rounded sides scale the focal length differently in x and y. Other models
+    with one focal length scale it by the mean of both scales, as COLMAP does.
     """
     if camera.model == pycolmap.CameraModelId.SIMPLE_PINHOLE:
         focal, cx, cy = camera.params
@@ -130,7 +131,7 @@ def rescaled_camera(camera: pycolmap.Camera, width: int, height: int, camera_id:
             height=camera.height,
             params=[focal, focal, cx, cy],
         )
-    # a copy: Camera objects taken from a Reconstruction are views into it
+    # Copied because a Camera object taken from a Reconstruction is a view into it.
     copy = pycolmap.Camera(
         camera_id=camera_id, model=camera.model, width=camera.width, height=camera.height, params=list(camera.params)
     )
@@ -141,7 +142,7 @@ def rescaled_camera(camera: pycolmap.Camera, width: int, height: int, camera_id:
 
 
 def pinhole_camera(camera: pycolmap.Camera, cam_from_world: pycolmap.Rigid3d) -> Camera:
-    """A COLMAP camera and pose as a `Camera`; `InputError` if the camera is not an undistorted pinhole."""
+    """Convert a COLMAP camera and pose to a `Camera`; raises `InputError` if the camera is distorted."""
     if camera.model not in PINHOLE_MODELS:
         raise InputError(f"a camera of the model {camera.model_name} is distorted: undistort the images first")
     return Camera(
@@ -157,21 +158,21 @@ def pinhole_camera(camera: pycolmap.Camera, cam_from_world: pycolmap.Rigid3d) ->
 
 
 def reference_cameras(model: pycolmap.Reconstruction, names: Iterable[str]) -> list[Camera]:
-    """The poses of the registered images ``names``, with the focal lengths of their cameras, distorted or not.
+    """Cameras with the poses of the registered images ``names``; distortion and principal points are ignored.
 
-    They are for asking where cameras stand and look, not for rendering.
+    They tell where cameras stand and look. They are not for rendering.
     """
-    found = []
+    cameras = []
     for name in names:
         image = model.find_image_with_name(name)
         camera, pose = model.cameras[image.camera_id], image.cam_from_world()
         size, focal = (camera.width, camera.height), camera.mean_focal_length()
-        places = (focal, focal, camera.width / 2, camera.height / 2)
-        found.append(Camera(*size, *places, pose.rotation.matrix(), np.array(pose.translation)))
-    return found
+        intrinsics = (focal, focal, camera.width / 2, camera.height / 2)
+        cameras.append(Camera(*size, *intrinsics, pose.rotation.matrix(), np.array(pose.translation)))
+    return cameras
 
 
-def points_of(model: pycolmap.Reconstruction) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+def model_points(model: pycolmap.Reconstruction) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
     """The 3D points, sorted by id: positions [P, 3] in world units and colours [P, 3] uint8."""
     points = [point for _, point in sorted(model.points3D.items())]
     xyz = np.array([point.xyz for point in points], dtype=np.float64).reshape(-1, 3)
@@ -184,10 +185,10 @@ def write_model(
     text: bool = False,
     cloud: tuple[NDArray[np.float64], NDArray[np.uint8]] | None = None,
 ) -> None:
-    """Write PINHOLE cameras with their poses as a COLMAP model; equal intrinsics share one camera.
+    """Write PINHOLE cameras with their poses as a COLMAP model; images with equal intrinsics share one camera.
 
-    ``cloud``, positions [P, 3] and colours [P, 3], becomes its points, which no image observes; without it there are
-    none.
+    ``cloud``, positions [P, 3] and colours [P, 3], becomes the model's points, without tracks. By default the model
+    has no points.
     """
     frames = {}
     for name, camera in cameras.items():
@@ -202,9 +203,9 @@ def write_frames(
     text: bool = False,
     cloud: tuple[NDArray[np.float64], NDArray[np.uint8]] | None = None,
 ) -> None:
-    """Write cameras of any model with their rotations [3, 3] and translations [3] from the world as a COLMAP model.
+    """Write cameras of any camera model with their world-to-camera rotations [3, 3] and translations [3].
 
-    Equal cameras are one; ``cloud`` is that of `write_model`.
+    Images with equal intrinsics share one camera. ``cloud`` is as in `write_model`.
     """
     model = pycolmap.Reconstruction()
     ids: dict[CameraModel, int] = {}
@@ -225,6 +226,7 @@ def write_frames(
 
 
 def _copy_points(model: pycolmap.Reconstruction, target: pycolmap.Reconstruction, image_ids: set[int]) -> None:
+    # A model without any track, such as one that `write_model` wrote, keeps all its points.
     observed = any(point.track.elements for point in model.points3D.values())
     for point_id, point in sorted(model.points3D.items()):
         elements = [element for element in point.track.elements if element.image_id in image_ids]

@@ -1,8 +1,8 @@
-"""The files of a COLMAP model: which there are, and whether what they hold makes sense.
+"""Finding the files of a COLMAP model and checking their records before pycolmap reads them.
 
-pycolmap trusts its files: on a truncated or foreign one it may loop for minutes or read nonsense, and it takes a zero
-quaternion or a NaN without a word. Walking the records first costs little and finds that at once. Layouts: COLMAP's
-``src/colmap/scene/reconstruction_io_binary.cc`` and ``reconstruction_io_text.cc``.
+pycolmap trusts its files: on a truncated or foreign file it may loop for minutes or read nonsense, and it accepts a
+zero quaternion or a NaN without an error. Checking the records first costs little and finds such files at once.
+Layouts: COLMAP's ``src/colmap/scene/reconstruction_io_binary.cc`` and ``reconstruction_io_text.cc``.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ OPTIONAL = ("rigs", "frames")  # since COLMAP 3.12
 _COUNT = struct.Struct("<Q")
 _CAMERA = struct.Struct("<IiQQ")  # id, model, width, height; then the parameters as doubles
 _IMAGE = struct.Struct("<I7dI")  # id, quaternion, translation, camera id; then the name, zero-terminated
-_RIG = struct.Struct("<II")  # id, number of its sensors
+_RIG = struct.Struct("<II")  # id, number of sensors
 _SENSOR = struct.Struct("<iI")  # type, id
 _POSE = struct.Struct("<7d")
-_FRAME = struct.Struct("<II7dI")  # id, rig id, pose; then the number of its images
+_FRAME = struct.Struct("<II7dI")  # id, rig id, pose, number of images
 _FRAME_DATA_BYTES = 16  # sensor type, sensor id, image id
 _POINT2D_BYTES = 24  # x, y, id of the 3D point
-_POINT3D = struct.Struct("<Q3d3Bd")  # id, position, colour, error; then the length of its track
+_POINT3D = struct.Struct("<Q3d3Bd")  # id, position, colour, error; then the length of the track
 _TRACK_ELEMENT = struct.Struct("<II")  # image id, index of the 2D point
-# names and numbers of parameters of the camera models by their ids: COLMAP's src/colmap/sensor/models.h
+# Id of each camera model: its name and number of parameters. Source: COLMAP's src/colmap/sensor/models.h.
 _MODELS = {
     0: ("SIMPLE_PINHOLE", 3), 1: ("PINHOLE", 4), 2: ("SIMPLE_RADIAL", 4), 3: ("RADIAL", 5), 4: ("OPENCV", 8),
     5: ("OPENCV_FISHEYE", 8), 6: ("FULL_OPENCV", 12), 7: ("FOV", 5), 8: ("SIMPLE_RADIAL_FISHEYE", 4),
@@ -37,7 +37,7 @@ _MODELS = {
 
 
 def model_files(folder: Path) -> list[Path]:
-    """The files that make up the model in ``folder``: the binary ones if complete, else the text ones.
+    """The files of the model in ``folder``: the binary files if complete, else the text files.
 
     Raises `InputError` if neither set is complete.
     """
@@ -49,7 +49,7 @@ def model_files(folder: Path) -> list[Path]:
 
 
 def check_model(folder: Path) -> None:
-    """Raise `InputError`, one line, if a file of the model is truncated, has bytes left over, or holds nonsense."""
+    """Raise `InputError`, one line, if a file of the model is truncated, has extra bytes, or has impossible values."""
     files = {file.stem: file for file in model_files(folder)}
     walks = _BINARY_WALKS if files["cameras"].suffix == ".bin" else _TEXT_WALKS
     checks = ModelChecks()
@@ -60,7 +60,7 @@ def check_model(folder: Path) -> None:
         try:
             walk(file, checks)
         except (struct.error, ValueError, IndexError, OverflowError) as error:
-            if isinstance(error, InputError):
+            if isinstance(error, InputError):  # a ValueError that already says what is wrong
                 raise InputError(f"{file}: {error}: copy or export it again") from error
             raise InputError(f"{file}: the file is truncated or damaged: copy or export it again") from error
         except OSError as error:
@@ -131,7 +131,7 @@ def _binary_rigs(data: bytes, count: int, checks: ModelChecks) -> int:
     offset = _COUNT.size
     for _ in range(count):
         rig_id, sensors = _RIG.unpack_from(data, offset)
-        offset += _RIG.size + (_SENSOR.size if sensors else 0)  # the first is the reference, which has no pose
+        offset += _RIG.size + (_SENSOR.size if sensors else 0)  # the first sensor is the reference, without a pose
         for _ in range(1, sensors):
             (has_pose,) = struct.unpack_from("<B", data, offset + _SENSOR.size)
             offset += _SENSOR.size + 1
@@ -142,7 +142,7 @@ def _binary_rigs(data: bytes, count: int, checks: ModelChecks) -> int:
 
 
 def _lines(file: Path) -> Iterator[list[str]]:
-    """The words of every line that is no comment; empty lines give no words."""
+    """Split every line into words, without comment lines. An empty line gives an empty list."""
     for line in file.read_text(encoding="utf-8").split("\n"):
         if not line.lstrip().startswith("#"):
             yield line.split()
@@ -165,7 +165,7 @@ def _text_images(file: Path, checks: ModelChecks) -> None:
     for words in lines:
         if not words:
             continue
-        points = next(lines, [])
+        points = next(lines, [])  # the line after an image holds its 2D points, and may be empty
         if len(words) < 10 or len(points) % 3 or not all(map(math.isfinite, _numbers(points))):
             raise InputError(f"image {words[0]} lacks numbers")
         checks.image(int(words[0]), _numbers(words[1:8]), int(words[8]), words[9], len(points) // 3)
@@ -195,7 +195,7 @@ def _text_frames(file: Path, checks: ModelChecks) -> None:
         checks.pose(f"frame {words[0]}", _numbers(words[2:9]))
 
 
-# in the order in which what a record refers to comes before it
+# The order matters: images refer to cameras, points to images.
 _BINARY_WALKS = {
     "cameras": _walk_binary(_binary_cameras),
     "images": _walk_binary(_binary_images),
@@ -209,20 +209,21 @@ _TEXT_WALKS = {
 }  # fmt: skip
 
 
-MAX_LENGTH = 1e6  # of a quaternion, and of its inverse: COLMAP takes those of any length, which stand for rotations
+MAX_LENGTH = 1e6  # of a quaternion, and 1 / MAX_LENGTH is the minimum: COLMAP normalises quaternions of any length
 MAX_SIDE = 1_000_000  # px
-MAX_ID = 2**32 - 2  # COLMAP's ids of cameras and images are unsigned, and the last stands for none
+MAX_ID = 2**32 - 2  # ids of cameras and images are 32-bit; the largest number means "no id" in COLMAP
+MAX_POINT_ID = 2**64 - 2  # ids of 3D points are 64-bit
 TWO_FOCAL_LENGTHS = (
     "PINHOLE", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE",
 )  # fmt: skip
 
 
 class ModelChecks:
-    """Sees the records of a model one by one, cameras first; raises `InputError` for the first that is nonsense."""
+    """Checks the records of a model one by one, cameras first; raises `InputError` for the first impossible one."""
 
     def __init__(self) -> None:
         self._cameras: set[int] = set()
-        self._points2d: dict[int, int] = {}  # of each image
+        self._points2d: dict[int, int] = {}  # number of 2D points by image id
         self._names: set[str] = set()
         self._points: set[int] = set()
 
@@ -233,12 +234,12 @@ class ModelChecks:
             raise InputError(
                 f"camera {camera_id} is damaged ({width}x{height} px, parameters {', '.join(f'{p:g}' for p in params)})"
             )
-        _once(camera_id, self._cameras, "camera", MAX_ID)
+        _check_id(camera_id, self._cameras, "camera", MAX_ID)
         self._cameras.add(camera_id)
 
     def image(self, image_id: int, pose: Sequence[float], camera_id: int, name: str, num_points: int) -> None:
         self.pose(f"image {image_id} ({name!r})", pose)
-        _once(image_id, self._points2d, "image", MAX_ID)
+        _check_id(image_id, self._points2d, "image", MAX_ID)
         if camera_id not in self._cameras:
             raise InputError(f"image {image_id} names camera {camera_id}, which the model lacks")
         if not name or name in self._names:
@@ -247,7 +248,7 @@ class ModelChecks:
         self._names.add(name)
 
     def pose(self, owner: str, pose: Sequence[float]) -> None:
-        """``pose``: quaternion (w, x, y, z) and translation."""
+        """Check a pose: quaternion (w, x, y, z) and translation."""
         sound = len(pose) == 7 and all(map(math.isfinite, pose))
         if not sound or not 1 / MAX_LENGTH < math.hypot(*pose[:4]) < MAX_LENGTH:
             raise InputError(f"{owner} has no pose that can be used ({', '.join(f'{value:g}' for value in pose)})")
@@ -255,7 +256,7 @@ class ModelChecks:
     def point(self, point_id: int, position: Sequence[float], track: Iterable[Sequence[int]]) -> None:
         if not all(map(math.isfinite, position)):
             raise InputError(f"point {point_id} lies nowhere ({', '.join(f'{value:g}' for value in position)})")
-        _once(point_id, self._points, "point", 2**64 - 2)
+        _check_id(point_id, self._points, "point", MAX_POINT_ID)
         self._points.add(point_id)
         for image_id, index in track:
             if not 0 <= index < self._points2d.get(image_id, 0):
@@ -264,6 +265,6 @@ class ModelChecks:
                 )
 
 
-def _once(number: int, known: Collection[int], what: str, largest: int) -> None:
-    if number in known or not 0 <= number <= largest:
+def _check_id(number: int, earlier: Collection[int], what: str, largest: int) -> None:
+    if number in earlier or not 0 <= number <= largest:
         raise InputError(f"{what} {number} is there twice, or has no number")

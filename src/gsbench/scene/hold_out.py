@@ -1,8 +1,8 @@
-"""Dividing photographs into training and test views: by a rule, by lists, and for a search once more among the rest.
+"""Dividing photographs into training and test views by a rule or by lists, and the rest again for validation.
 
-Sectors need cameras in an order in which neighbours stand beside each other. Where cameras surround the scene, that is
-their azimuth around its up and centre; where they do not, their places along the principal axis of their centres, so
-that planes across it cut them into parts.
+Sectors need an order of cameras in which neighbours stand beside each other. Cameras that surround the scene are
+ordered by azimuth around its centre and up direction. Other cameras are ordered along the principal axis of their
+centres, so that planes across the axis separate the sectors.
 """
 
 from collections.abc import Callable, Sequence
@@ -17,25 +17,28 @@ from gsbench.scene.names import select_images, split_names
 from gsbench.scene.options import SplitRule
 from gsbench.words import counted
 
-SURROUNDED = 180.0  # degrees: with a wider gap in their azimuths, cameras stand on one side of the scene
-OPEN_RING = 30.0  # degrees: a wider gap is where a ring begins; else it begins at the first camera
+SURROUNDED = 180.0  # degrees: cameras with a wider gap between azimuths stand on one side of the scene
+OPEN_RING = 30.0  # degrees: the order begins after a gap wider than this, else at the first camera
 FACING = 0.9  # share of the cameras that must look towards the centre
-PARALLEL = 1e-3  # least eigenvalue of the axes' normal matrix, at most 2/3: below it, they meet nowhere
-SAME_AZIMUTH = 6  # decimals of a degree: what differs by less is the same place, whatever the processor rounds
+PARALLEL = 1e-3  # smallest eigenvalue of the axes' normal matrix (at most 2/3) below which axes count as parallel
+AZIMUTH_DECIMALS = 6  # azimuths are rounded to so many decimals of a degree, so that all processors agree on ties
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Arrangement:
-    """Cameras in order: ``order`` are their indices; ``description`` says by what, and why."""
+    """An order of cameras, as indices; ``description`` says what they are ordered by, and why."""
 
     order: tuple[int, ...]
     description: str
 
 
-def arrange(cameras: Sequence[Camera]) -> Arrangement:
-    """The order of cameras around the scene, from the first one or from after the widest gap, else along an axis."""
+def arrange_cameras(cameras: Sequence[Camera]) -> Arrangement:
+    """Order cameras by azimuth around the scene if they surround it, else along the principal axis of their centres.
+
+    The azimuths start at the first camera, or after a gap of more than 30 degrees.
+    """
     centers = np.array([camera.center for camera in cameras])  # [V, 3]
     azimuths, fault = _azimuths(cameras, centers)
     if azimuths is not None:
@@ -47,7 +50,7 @@ def arrange(cameras: Sequence[Camera]) -> Arrangement:
             fault = f"the cameras stand on one side of the scene, with none in {gap:.0f} degrees around its centre"
     if fault:
         description = f"by planes across the principal axis of the cameras' centres, since {fault}"
-        return Arrangement(_sorted(along_axis(centers)), description)
+        return Arrangement(_sorted(along_principal_axis(centers)), description)
     if gap > OPEN_RING:
         order = np.roll(order, -(widest + 1))
     return Arrangement(
@@ -56,30 +59,31 @@ def arrange(cameras: Sequence[Camera]) -> Arrangement:
     )
 
 
-def sector_of(count: int, sector: int, sectors: int, exactly: int | None = None) -> range:
-    """The places, among ``count`` in order, of part ``sector`` of ``sectors``; ``exactly`` so many from its first.
+def sector_range(count: int, sector: int, sectors: int, exactly: int | None = None) -> range:
+    """The positions of sector number ``sector`` when ``count`` ordered views are cut into ``sectors`` contiguous ones.
 
-    Parts are contiguous, leave nothing out, and differ by at most one in size.
+    The sizes of sectors differ by at most one. With ``exactly``, only so many positions from the sector's start.
 
     Examples:
-        >>> [list(sector_of(7, part, 3)) for part in range(3)]
+        >>> [list(sector_range(7, sector, 3)) for sector in range(3)]
         [[0, 1], [2, 3], [4, 5, 6]]
     """
     start, stop = sector * count // sectors, (sector + 1) * count // sectors
     return range(start, stop if exactly is None else start + exactly)
 
 
-def along_axis(centers: Array) -> Array:
-    """Places [V] of camera centres [V, 3] on their principal axis, which points away from the first camera."""
+def along_principal_axis(centers: Array) -> Array:
+    """Coordinates [V] of camera centres [V, 3] on their principal axis, which points away from the first camera."""
     offsets = centers - centers.mean(axis=0)
     _, _, axes = np.linalg.svd(offsets, full_matrices=False)
-    places: Array = offsets @ axes[0]
-    sign = places[np.argmax(np.abs(places) > 1e-9 * (np.abs(places).max() + 1e-300))]  # of the first that is off centre
-    return -places if sign > 0 else places
+    coordinates: Array = offsets @ axes[0]
+    # The SVD leaves the sign of the axis open: the first camera that is not at the mean fixes it.
+    off_center = np.abs(coordinates) > 1e-9 * (np.abs(coordinates).max() + 1e-300)
+    return -coordinates if coordinates[np.argmax(off_center)] > 0 else coordinates
 
 
-def looked_at(cameras: Sequence[Camera], centers: Array) -> Array | None:
-    """The point [3] nearest to all viewing axes, in least squares; None where the axes are parallel."""
+def point_looked_at(cameras: Sequence[Camera], centers: Array) -> Array | None:
+    """The point [3] nearest to all viewing axes, in least squares; None if the axes are parallel."""
     forwards = np.array([camera.rotation[2] for camera in cameras])  # [V, 3]
     across = np.eye(3) - forwards[:, :, None] * forwards[:, None, :]  # [V, 3, 3]
     normal = across.mean(axis=0)
@@ -90,7 +94,7 @@ def looked_at(cameras: Sequence[Camera], centers: Array) -> Array | None:
 
 
 def scene_up(cameras: Sequence[Camera], centers: Array) -> Array:
-    """The mean of the cameras' up [3]; where they have none in common, the normal of the plane of their centres."""
+    """The mean of the cameras' up directions [3] or, if they cancel out, the normal of the plane of the centres."""
     mean = -np.array([camera.rotation[1] for camera in cameras]).mean(axis=0)
     length = float(np.linalg.norm(mean))
     if length > 0.5:
@@ -102,8 +106,8 @@ def scene_up(cameras: Sequence[Camera], centers: Array) -> Array:
 
 
 def _azimuths(cameras: Sequence[Camera], centers: Array) -> tuple[Array | None, str]:
-    """Azimuths [V] in [0, 360) degrees from the first camera's, counter-clockwise from above; None, and why."""
-    center = looked_at(cameras, centers)
+    """Azimuths [V] in [0, 360) degrees from the first camera, counter-clockwise from above; or None and the reason."""
+    center = point_looked_at(cameras, centers)
     if center is None:
         return None, "the cameras look in one direction"
     forwards = np.array([camera.rotation[2] for camera in cameras])  # [V, 3]
@@ -115,20 +119,20 @@ def _azimuths(cameras: Sequence[Camera], centers: Array) -> tuple[Array | None, 
     first = flat[0] / np.linalg.norm(flat[0]) if np.linalg.norm(flat[0]) > 0 else np.zeros(3)
     aside = np.cross(up, first)
     degrees = np.degrees(np.arctan2(flat @ aside, flat @ first))  # [V]
-    return np.round(degrees, SAME_AZIMUTH).astype(np.float64) % 360.0, ""
+    return np.round(degrees, AZIMUTH_DECIMALS).astype(np.float64) % 360.0, ""
 
 
-def _sorted(places: Array) -> tuple[int, ...]:
-    return tuple(int(index) for index in np.argsort(places, kind="stable"))
+def _sorted(coordinates: Array) -> tuple[int, ...]:
+    return tuple(int(index) for index in np.argsort(coordinates, kind="stable"))
 
 
-Lists = tuple[Sequence[str] | None, Sequence[str] | None]
-Cameras = Callable[[Sequence[str]], Sequence[Camera]]
+SplitLists = tuple[Sequence[str] | None, Sequence[str] | None]  # names for training, names for testing
+CamerasByName = Callable[[Sequence[str]], Sequence[Camera]]
 
 
 @dataclass(frozen=True)
-class HeldOut:
-    """Result of a rule on sorted names; ``description`` says how."""
+class Split:
+    """Names of training and test views; ``description`` says how they were divided."""
 
     train: tuple[str, ...]
     test: tuple[str, ...]
@@ -136,30 +140,29 @@ class HeldOut:
 
 
 def hold_out(
-    names: Sequence[str], rule: SplitRule, lists: Lists = (None, None), cameras: Cameras | None = None
-) -> HeldOut:
-    """Divide sorted ``names`` as ``rule`` says.
+    names: Sequence[str], rule: SplitRule, lists: SplitLists = (None, None), cameras: CamerasByName | None = None
+) -> Split:
+    """Divide sorted ``names`` by ``rule``.
 
-    ``lists`` are the resolved names of the training and the test list; ``cameras`` gives the cameras of names, None
-    where they came without. Raises InputError where nothing is left for training or for testing.
+    ``lists`` are the resolved names of the training and the test list. ``cameras`` returns the cameras of names; it is
+    None for photographs without cameras. With ``rule.validation``, the test views are dropped and the training views
+    are divided again. Raises InputError if no view is left for training or for testing.
     """
     rule.check()
-    train, test, description = _divide(names, rule, lists, cameras)
+    split = _divide(names, rule, lists, cameras)
     if not rule.validation:
-        return HeldOut(train, test, description)
+        return split
     again = replace(rule, split="every_nth", train_list=None, test_list=None) if rule.by_lists else rule
-    learned, judged, how = _divide(train, again, (None, None), cameras)
-    away = f"the {counted(len(test), 'test view')} ({description}) put away unseen"
-    return HeldOut(learned, judged, f"for validation {how}, with {away}")
+    validation = _divide(split.train, again, (None, None), cameras)
+    away = f"the {counted(len(split.test), 'test view')} ({split.description}) put away unseen"
+    return replace(validation, description=f"for validation {validation.description}, with {away}")
 
 
-def _divide(
-    names: Sequence[str], rule: SplitRule, lists: Lists, cameras: Cameras | None
-) -> tuple[tuple[str, ...], tuple[str, ...], str]:
+def _divide(names: Sequence[str], rule: SplitRule, lists: SplitLists, cameras: CamerasByName | None) -> Split:
     matched = max(1, len(names) // rule.sectors) if rule.match_views else None
     if rule.by_lists:
         train, test = split_names(names, rule.test_every, *lists)
-        return tuple(train), tuple(test), "by lists"
+        return Split(tuple(train), tuple(test), "by lists")
     if rule.split == "sector":
         test, description = _sector(names, rule, matched, cameras)
     elif matched is not None:
@@ -167,13 +170,13 @@ def _divide(
         description = f"{matched} evenly spread over the sorted names, as many as in a sector of {rule.sectors}"
     else:
         train, test = split_names(names, rule.test_every)
-        return tuple(train), tuple(test), f"every {rule.test_every}th image" if rule.test_every else "none"
+        return Split(tuple(train), tuple(test), f"every {rule.test_every}th image" if rule.test_every else "none")
     train, test = split_names(names, test=test)
-    return tuple(train), tuple(test), description
+    return Split(tuple(train), tuple(test), description)
 
 
 def _sector(
-    names: Sequence[str], rule: SplitRule, exactly: int | None, cameras: Cameras | None
+    names: Sequence[str], rule: SplitRule, exactly: int | None, cameras: CamerasByName | None
 ) -> tuple[list[str], str]:
     if cameras is None:
         raise InputError(
@@ -182,7 +185,7 @@ def _sector(
         )
     if len(names) < rule.sectors:
         raise InputError(f"scene.sectors={rule.sectors} are more than the {len(names)} images: give fewer")
-    found = arrange(cameras(names))
-    places = sector_of(len(names), rule.sector, rule.sectors, exactly)
-    test = [names[found.order[place]] for place in places]
-    return test, f"part {rule.sector} of {rule.sectors} {found.description}"
+    arrangement = arrange_cameras(cameras(names))
+    positions = sector_range(len(names), rule.sector, rule.sectors, exactly)
+    test = [names[arrangement.order[position]] for position in positions]
+    return test, f"part {rule.sector} of {rule.sectors} {arrangement.description}"

@@ -1,11 +1,12 @@
-"""Loading of a `Scene` from a capture and the COLMAP model of its initialisation: pinhole cameras, final size.
+"""Loading a `Scene` with pinhole cameras and images at their final size, from a capture and a COLMAP model.
 
-Prepared images are kept below ``cache_dir`` as PNG files, each set in a folder named after all that it depends on and
-published by one rename, so a set is either whole or absent. Images that need no change are read from where they lie.
+Prepared images are cached below ``cache_dir`` as PNG files, one folder for each set. The folder's name is a digest of
+everything that the pixels depend on. A folder appears by one rename, so a set is either complete or absent. Images that
+need no change are read from the capture.
 
-Undistortion is COLMAP's own with the defaults of its ``image_undistorter``, which INRIA's ``convert.py`` uses too: the
-largest pinhole image without blank pixels, at the focal length of the original. It runs on pixels in memory, so nothing
-passes through JPEG again.
+Undistortion is COLMAP's, with the defaults of its ``image_undistorter``, which INRIA's ``convert.py`` uses too: the
+largest pinhole image without blank pixels, at the original focal length. It runs on pixels in memory, so images are not
+compressed as JPEG again.
 """
 
 import hashlib
@@ -28,7 +29,7 @@ from PIL import Image
 
 from gsbench.errors import InputError
 from gsbench.logs import Progress, no_progress
-from gsbench.scene.camera import Camera, CameraModel, pinhole_of
+from gsbench.scene.camera import Camera, CameraModel, to_pinhole
 from gsbench.scene.colmap_files import model_files
 from gsbench.scene.images import Resample, check_size, image_size, read_image, resize_image
 from gsbench.scene.masks import WHITE, Mask, read_mask, resize_mask, write_mask
@@ -41,23 +42,23 @@ from gsbench.words import some_of
 log = logging.getLogger(__name__)
 
 PrincipalPoint = Literal["used", "centred"]
-CACHE_VERSION = 1  # raise when prepared pixels or the file below change
+CACHE_VERSION = 1  # to be raised when prepared pixels or the form of cameras.json change
 CAMERAS_FILE = "cameras.json"
 INTRINSICS = ("width", "height", "fx", "fy", "cx", "cy")
 _PNG_COMPRESSION = 1  # zlib level: lossless at any level, and this one writes about five times as fast as the default
-_CHUNK = 16  # images per isolated process: bounds what a crash loses, and lets progress be reported
+_CHUNK = 16  # images per isolated process: limits what a crash loses, and progress is reported after each chunk
 
 
 @dataclass(frozen=True)
-class Size:
-    """Settings of shrinking images: see `downscaled_size`."""
+class Downscaling:
+    """Settings of shrinking images (see `downscaled_size`)."""
 
     downscale: int = 1
     max_size: int | None = None
     resample: Resample = "lanczos"
 
-    def of(self, width: int, height: int) -> tuple[int, int]:
-        """The size of an image of ``width`` x ``height`` px when it is shrunk."""
+    def final_size(self, width: int, height: int) -> tuple[int, int]:
+        """The final size in px of an image of ``width`` x ``height`` px."""
         return downscaled_size(width, height, self.downscale, self.max_size)
 
 
@@ -75,19 +76,20 @@ def load_scene(
 ) -> Scene:
     """Load the views of a capture with the cameras of the COLMAP model in ``model_dir``.
 
-    Images of a distorted camera are undistorted, then all are shrunk by ``downscale`` and to a longest side of
-    ``max_size`` px (see `downscaled_size`). ``centred`` moves principal points to the image centre, as 3DGS assumes.
-    Views without a pose in the model are left out with a warning. ``progress`` counts images. ``made_by`` names the
-    versions of code and packages that prepare images, so that those of others are not taken from the cache.
+    Images of a distorted camera are undistorted. Then all images are shrunk by ``downscale`` and to a longest side of
+    ``max_size`` px (see `downscaled_size`). ``principal_point="centred"`` moves principal points to the image centre,
+    as 3DGS assumes. Views without a pose in the model are left out with a warning. ``made_by`` are the versions of code
+    and packages that prepare images: the cache does not return images that other versions made. ``progress`` counts
+    images.
 
     Raises `InputError` if fewer than three views or no training view have a pose, or an image does not fit its camera.
     """
     if principal_point not in ("used", "centred"):
         raise InputError(f"scene.principal_point must be used or centred, got {principal_point!r}")
-    size = Size(downscale, max_size, resample)
-    folder = Path(cache_dir) / _cache_key(capture, Path(model_dir), size, made_by)
+    downscaling = Downscaling(downscale, max_size, resample)
+    folder = Path(cache_dir) / _cache_key(capture, Path(model_dir), downscaling, made_by)
     if not (folder / CAMERAS_FILE).is_file():
-        _build(folder, capture, Path(model_dir), size, threads, progress)
+        _prepare_views(folder, capture, Path(model_dir), downscaling, threads, progress)
     entries = json.loads((folder / CAMERAS_FILE).read_text(encoding="utf-8"))["views"]
     _report_unregistered(capture, set(entries))
 
@@ -95,8 +97,8 @@ def load_scene(
         if name not in capture.masks:
             return None
         file = entries[name]["file"]
-        counts = read_mask(folder / mask_file(file) if file else capture.masks[name])
-        return None if counts.all() else counts
+        mask = read_mask(folder / mask_file(file) if file else capture.masks[name])
+        return None if mask.all() else mask
 
     def view(name: str) -> View:
         entry = entries[name]
@@ -119,25 +121,28 @@ def load_scene(
     )
 
 
-def _build(folder: Path, capture: Capture, model_dir: Path, size: Size, threads: int, progress: Progress) -> None:
+def _prepare_views(
+    folder: Path, capture: Capture, model_dir: Path, downscaling: Downscaling, threads: int, progress: Progress
+) -> None:
     """Prepare all registered images of the capture and publish them as ``folder``."""
     cameras = _model_cameras(capture, model_dir)
     folder.parent.mkdir(parents=True, exist_ok=True)
     work = folder.parent / f".{folder.name}-{secrets.token_hex(4)}"
-    work.mkdir()  # not mkdtemp, whose folders nobody else may read: a cache may be shared
+    work.mkdir()  # not mkdtemp, whose folders only their owner can read: a cache may be shared
     try:
         entries: dict[str, dict[str, object]] = {}
-        jobs: dict[str, Job] = {}
+        changes: dict[str, ImageToPrepare] = {}
         for index, (name, (model, pose)) in enumerate(cameras.items()):
-            changed = model.distorted or size.of(model.width, model.height) != (model.width, model.height)
+            size = (model.width, model.height)
+            changed = model.distorted or downscaling.final_size(*size) != size
             file = f"{index:05d}.png" if changed else ""
             entries[name] = {"file": file, "pose": pose}
             if changed:
                 mask = capture.masks.get(name)
-                jobs[name] = Job(capture.images / name, model, work / file, size, mask)
+                changes[name] = ImageToPrepare(capture.images / name, model, work / file, downscaling, mask)
             else:
-                entries[name] |= _intrinsics(pinhole_of(model))
-        for name, camera in zip(jobs, prepare_all(list(jobs.values()), threads, progress), strict=True):
+                entries[name] |= _intrinsics(to_pinhole(model))
+        for name, camera in zip(changes, prepare_all(list(changes.values()), threads, progress), strict=True):
             entries[name] |= _intrinsics(camera)
         document = {"version": CACHE_VERSION, "scene": capture.name, "views": entries}
         (work / CAMERAS_FILE).write_text(json.dumps(document, indent=1), encoding="utf-8")
@@ -151,14 +156,14 @@ def _publish(work: Path, folder: Path) -> None:
         os.rename(work, folder)
     except OSError:
         if (folder / CAMERAS_FILE).is_file():
-            return  # another process was first, with the same content
-        shutil.rmtree(folder)  # what is there has lost its cameras file, so it is not a whole set
+            return  # another process published the same content first
+        shutil.rmtree(folder)  # the existing folder has lost its cameras file, so it is incomplete
         os.rename(work, folder)
 
 
 def _model_cameras(capture: Capture, model_dir: Path) -> dict[str, tuple[CameraModel, list[list[float]]]]:
-    """For every image of the capture with a pose: its COLMAP camera at the file's size, and its 3x4 pose."""
-    from gsbench.scene.colmap import read_model, rescaled_camera  # not needed when the cache answers
+    """The COLMAP camera at the file's size and the 3x4 pose of every image of the capture that has a pose."""
+    from gsbench.scene.colmap import read_model, rescaled_camera  # not needed if the views are cached
 
     model = read_model(model_dir)
     wanted = set(capture.image_names)
@@ -204,99 +209,99 @@ def _camera(entry: dict[str, object]) -> Camera:
     return Camera(**intrinsics, rotation=pose[:, :3], translation=pose[:, 3])
 
 
-def _cache_key(capture: Capture, model_dir: Path, size: Size, made_by: Mapping[str, str | None]) -> str:
-    """A digest of the images, the model's cameras and poses, the options, and what prepares the images."""
+def _cache_key(capture: Capture, model_dir: Path, downscaling: Downscaling, made_by: Mapping[str, str | None]) -> str:
+    """A digest of the images, the model's cameras and poses, the settings, and the versions that prepare the images."""
     digest = hashlib.sha256()
     for file in sorted(model_files(model_dir)):
         if file.stem != "points3D":
             digest.update(f"{file.name}\0{hashlib.sha256(file.read_bytes()).hexdigest()}\n".encode())
-    options = [CACHE_VERSION, capture.fingerprint, capture.image_names, *vars(size).values(), sorted(made_by.items())]
-    digest.update(json.dumps(options).encode())
+    settings = [*vars(downscaling).values(), sorted(made_by.items())]
+    digest.update(json.dumps([CACHE_VERSION, capture.fingerprint, capture.image_names, *settings]).encode())
     return digest.hexdigest()[:32]
 
 
 @dataclass(frozen=True)
-class Job:
-    """One image to prepare: where it is, its camera (of the file's size), and the PNG to write.
+class ImageToPrepare:
+    """An image file, its camera at the file's size, and the PNG file to write.
 
-    The ``mask``, where there is one, is prepared with it, into `mask_file` beside the target.
+    The ``mask``, if any, is prepared too, and written as `mask_file` beside the target.
     """
 
     source: Path
     camera: CameraModel
     target: Path
-    size: Size = Size()
+    downscaling: Downscaling = Downscaling()
     mask: Path | None = None
 
 
 def mask_file(image_file: str) -> str:
-    """The name of the prepared mask of a prepared image."""
+    """The file name of a prepared image's mask."""
     return Path(image_file).with_suffix(".mask.png").name
 
 
-def prepare_all(jobs: Sequence[Job], threads: int = 2, progress: Progress = no_progress) -> list[Camera]:
-    """Prepare all images and return their final cameras, at the origin, in the order of ``jobs``.
+def prepare_all(images: Sequence[ImageToPrepare], threads: int = 2, progress: Progress = no_progress) -> list[Camera]:
+    """Prepare all images and return their final cameras, at the origin, in the order of ``images``.
 
-    Distorted images go through child processes, because COLMAP's native code can abort the process it runs in; such an
-    abort, like an unreadable image, raises `InputError`. ``progress`` counts images.
+    Distorted images are undistorted in child processes, because COLMAP's native code can abort its process. Such an
+    abort raises `InputError`, as an unreadable image does. ``progress`` counts images.
     """
-    results: list[Camera] = []
-    for start in range(0, len(jobs), _CHUNK):
-        chunk = jobs[start : start + _CHUNK]
-        if any(job.camera.distorted for job in chunk):
+    cameras: list[Camera] = []
+    for start in range(0, len(images), _CHUNK):
+        chunk = images[start : start + _CHUNK]
+        if any(image.camera.distorted for image in chunk):
             try:
-                results += run_isolated(prepare_chunk, chunk, threads, what="undistortion")
+                cameras += run_isolated(prepare_chunk, chunk, threads, what="undistortion")
             except CrashError as error:
                 names = f"{chunk[0].source} to {chunk[-1].source.name}"
                 raise InputError(f"{error} ({names}): check these images and their cameras") from error
         else:
-            results += prepare_chunk(chunk, threads)
-        progress("views", len(results), len(jobs))
-    return results
+            cameras += prepare_chunk(chunk, threads)
+        progress("views", len(cameras), len(images))
+    return cameras
 
 
-def prepare_chunk(jobs: Sequence[Job], threads: int) -> list[Camera]:
+def prepare_chunk(images: Sequence[ImageToPrepare], threads: int) -> list[Camera]:
     """Prepare some images in this process."""
     with ThreadPoolExecutor(max_workers=max(1, threads)) as pool:
-        return list(pool.map(prepare_image, jobs))
+        return list(pool.map(prepare_image, images))
 
 
-def prepare_image(job: Job) -> Camera:
+def prepare_image(image: ImageToPrepare) -> Camera:
     """Read, undistort if needed, downscale, and write one image as PNG; returns its final camera, at the origin."""
-    image = read_image(job.source)  # [H, W, 3]
-    if image.shape[:2] != (job.camera.height, job.camera.width):
-        raise InputError(f"{job.source}: the image changed its size while it was read: run again")
-    if job.camera.distorted:
-        image, camera = undistort(image, job.camera)
+    pixels = read_image(image.source)  # [H, W, 3]
+    if pixels.shape[:2] != (image.camera.height, image.camera.width):
+        raise InputError(f"{image.source}: the image changed its size while it was read: run again")
+    if image.camera.distorted:
+        pixels, camera = undistort(pixels, image.camera)
     else:
-        camera = pinhole_of(job.camera)
-    width, height = job.size.of(camera.width, camera.height)
-    image = resize_image(image, width, height, job.size.resample)
-    job.target.parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(image).save(job.target, format="PNG", compress_level=_PNG_COMPRESSION)
-    if job.mask is not None:
-        _prepare_mask(job.mask, job, width, height)
+        camera = to_pinhole(image.camera)
+    width, height = image.downscaling.final_size(camera.width, camera.height)
+    pixels = resize_image(pixels, width, height, image.downscaling.resample)
+    image.target.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(pixels).save(image.target, format="PNG", compress_level=_PNG_COMPRESSION)
+    if image.mask is not None:
+        _prepare_mask(image.mask, image, width, height)
     return camera.resized(width, height)
 
 
-def _prepare_mask(source: Path, job: Job, width: int, height: int) -> None:
-    """Write the mask as the image is: a pixel counts where nothing ignored is mixed into its own area."""
-    counts = read_mask(source)
-    if job.camera.distorted:
-        levels = np.repeat(counts[..., None].astype(np.uint8) * WHITE, 3, axis=2)  # [H, W, 3]
-        counts = undistort(levels, job.camera)[0][..., 0] == WHITE
-    counts = resize_mask(counts, width, height)
-    if not counts.any():
+def _prepare_mask(source: Path, image: ImageToPrepare, width: int, height: int) -> None:
+    """Undistort and shrink the mask as the image: a pixel counts if no ignored pixel contributes to its area."""
+    mask = read_mask(source)
+    if image.camera.distorted:
+        levels = np.repeat(mask[..., None].astype(np.uint8) * WHITE, 3, axis=2)  # [H, W, 3]
+        mask = undistort(levels, image.camera)[0][..., 0] == WHITE
+    mask = resize_mask(mask, width, height)
+    if not mask.any():
         raise InputError(f"{source}: no pixel is left that counts at {width}x{height} px: leave its image out")
-    write_mask(counts, job.target.with_name(mask_file(job.target.name)))
+    write_mask(mask, image.target.with_name(mask_file(image.target.name)))
 
 
 def undistort(image: NDArray[np.uint8], camera: CameraModel) -> tuple[NDArray[np.uint8], Camera]:
     """Undistort one image [H, W, 3] of any perspective COLMAP camera model; its size changes.
 
-    Raises `InputError` for a camera that has no pinhole image (a full panorama) or nonsensical parameters.
+    Raises `InputError` for a camera without a pinhole image (a full panorama) or with impossible parameters.
     """
-    import pycolmap  # here, because pinhole images need none of it
+    import pycolmap  # slow to load, and not needed for pinhole images
 
     source = pycolmap.Camera(
         camera_id=1, model=camera.name, width=camera.width, height=camera.height, params=list(camera.params)
@@ -313,4 +318,4 @@ def undistort(image: NDArray[np.uint8], camera: CameraModel) -> tuple[NDArray[np
     except (ValueError, RuntimeError) as error:
         raise InputError(refusal) from error
     params = tuple(float(value) for value in pinhole.params)
-    return np.array(flat.to_array()), pinhole_of(CameraModel("PINHOLE", pinhole.width, pinhole.height, params))
+    return np.array(flat.to_array()), to_pinhole(CameraModel("PINHOLE", pinhole.width, pinhole.height, params))

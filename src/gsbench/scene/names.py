@@ -1,4 +1,4 @@
-"""Names of images: the files that they mean, and the choice of images to keep and to hold out."""
+"""Names of images: finding their files, selecting the images to keep, and splitting them by name."""
 
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
@@ -11,14 +11,15 @@ from gsbench.words import some_of
 
 MAX_IMAGES = 200  # the paper's limit per scene
 MIN_IMAGES = 3
-MAX_NAME_BYTES = 220  # of a picture's name; file systems end at 255, and a file that is being written has a longer one
+# Of a picture's file name. File systems allow 255, but the temporary name of a file that is being written is longer.
+MAX_NAME_BYTES = 220
 
 
 def match_names(wanted: Iterable[str], files: Iterable[str]) -> dict[str, str]:
-    """Find the file that each wanted image name means, for those that have one.
+    """Map each wanted image name to its file; names without a file are left out.
 
-    The same name wins; else the one file with the same path but for its extension (``images_4/a.png`` for ``a.JPG``). A
-    name that several files fit, or a file that several names claim, stays without a match.
+    A file of the same name comes first, then the only file whose path differs in the extension alone (``a.png`` for
+    ``a.JPG``). There is no match if several such files fit a name, or if several names fit such a file.
     """
     files = set(files)
     by_stem: dict[str, list[str]] = defaultdict(list)
@@ -31,15 +32,15 @@ def match_names(wanted: Iterable[str], files: Iterable[str]) -> dict[str, str]:
             matches[name] = name
         elif len(by_stem[stem_of(name)]) == 1:
             claims[by_stem[stem_of(name)][0]].append(name)
-    taken = set(matches.values())
-    matches.update({names[0]: file for file, names in claims.items() if len(names) == 1 and file not in taken})
+    exact = set(matches.values())
+    matches.update({names[0]: file for file, names in claims.items() if len(names) == 1 and file not in exact})
     return matches
 
 
 def select_images(names: Sequence[str], max_images: int, least: int = MIN_IMAGES) -> list[str]:
-    """Select at most ``max_images`` of the names, evenly spaced: the k-th of m is the one at index ``k * n // m``.
+    """Select at most ``max_images`` of n names, evenly spaced: the k-th of m selected names has index ``k * n // m``.
 
-    The first is always kept, and a closed ring of views stays evenly spaced. This comes before the split.
+    The first name is always kept, and views on a closed ring stay evenly spaced. Images are selected before the split.
 
     Examples:
         >>> select_images(["a", "b", "c", "d", "e"], 3)
@@ -60,24 +61,25 @@ def split_names(
 ) -> tuple[list[str], list[str]]:
     """Split sorted names into (training, test).
 
-    Every ``test_every``-th name from the first is a test view; ``test_every=0`` holds out none. Explicit lists win:
-    with one of them the other is the rest; with both, names in neither are left out.
+    Every ``test_every``-th name from the first is a test view; ``test_every=0`` holds out none. Explicit lists replace
+    this rule. If only one list is given, the other side gets all other names. If both are given, names in neither list
+    are dropped.
 
-    Raises `InputError` if no training view is left, or no test view although ``test_every`` is not 0.
+    Raises `InputError` if there is no training view, or no test view although ``test_every`` is not 0.
     """
     if test_every < 0:
         raise InputError(f"scene.test_every must be 0 (no test views) or positive, got {test_every}")
     if train is None and test is None:
-        chosen = set(names[::test_every]) if test_every else set()
+        held_out = set(names[::test_every]) if test_every else set()
     elif test is None:
-        chosen = set(names) - set(train or ())
+        held_out = set(names) - set(train or ())
     else:
-        chosen = set(test)
-        if both := sorted(chosen & set(train or ())):
+        held_out = set(test)
+        if both := sorted(held_out & set(train or ())):
             raise InputError(f"the split lists hold {some_of(both)} for training and for testing: name each image once")
-    wanted = set(names if train is None else train)
-    training = [name for name in names if name in wanted and name not in chosen]
-    testing = [name for name in names if name in chosen]
+    kept = set(names if train is None else train)
+    training = [name for name in names if name in kept and name not in held_out]
+    testing = [name for name in names if name in held_out]
     if not training:
         raise InputError(
             f"the split leaves no training view of {len(names)}: raise scene.test_every or correct the lists"
@@ -96,21 +98,21 @@ def stem_of(name: str) -> str:
 
 
 def check_picture_names(names: Iterable[str], folder: Path) -> None:
-    """Raise `InputError` where the pictures of two views would have one name, or a name that no file can have."""
-    taken: dict[str, str] = {}
+    """Raise `InputError` if a view's picture would have a too long name, or the same name as another view's."""
+    view_of: dict[str, str] = {}
     for name in names:
         picture = png_name(name)
         if len(picture.encode()) > MAX_NAME_BYTES:
             raise InputError(
                 f"{folder / name}: a name of more than {MAX_NAME_BYTES} bytes, folders included: shorten it"
             )
-        if picture in taken:
+        if picture in view_of:
             raise InputError(
-                f"{folder}: the pictures of {taken[picture]} and {name} would both be {picture}: rename one"
+                f"{folder}: the pictures of {view_of[picture]} and {name} would both be {picture}: rename one"
             )
-        taken[picture] = name
+        view_of[picture] = name
 
 
 def png_name(view_name: str) -> str:
-    """File name for the picture of a view; sub-folders become part of the name."""
+    """The file name of a view's picture; sub-folders become part of the name."""
     return Path(view_name).with_suffix(".png").as_posix().replace("/", "__")

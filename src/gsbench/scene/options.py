@@ -11,13 +11,13 @@ from pydantic import NonNegativeInt, PositiveInt
 from gsbench.errors import InputError
 from gsbench.settings import MISSING, FolderName, PathName, check_settings, is_folder_name
 
-MIN_SIZE = 16  # px: the least side of an image that is worth training on
+MIN_SIZE = 16  # px: the smallest side of an image that is trained on
 
 
 def downscaled_size(width: int, height: int, downscale: int = 1, max_size: int | None = None) -> tuple[int, int]:
-    """The size after dividing by ``downscale`` and then, if need be, shrinking the longest side to ``max_size``.
+    """The size after dividing by ``downscale``, and then shrinking the longest side to ``max_size`` if it is longer.
 
-    Sides are rounded half up, and never below 1; the size never grows.
+    Sides are rounded half up to at least 1. The size never grows.
 
     Examples:
         >>> downscaled_size(4946, 3286, downscale=4)
@@ -30,13 +30,13 @@ def downscaled_size(width: int, height: int, downscale: int = 1, max_size: int |
     if max_size is not None and max_size < 1:
         raise InputError(f"scene.max_size must be at least 1 px, got {max_size}")
     longest = max(width, height)
-    # one fraction, so that the longest side comes out as exactly max_size
+    # One fraction for both sides, so that the longest side becomes exactly max_size.
     numerator, denominator = (max_size, longest) if max_size and max_size * downscale < longest else (1, downscale)
     return tuple(max(1, math.floor(side * numerator / denominator + 0.5)) for side in (width, height))  # type: ignore[return-value]
 
 
 def check_final_size(size: tuple[int, int], downscale: int, max_size: int | None, what: str) -> None:
-    """Raise InputError where ``what``, of ``size`` (width, height) px, would be trained on with a side below 16 px."""
+    """Raise InputError if ``what``, of ``size`` (width, height) px, would have a side below 16 px in training."""
     width, height = downscaled_size(*size, downscale, max_size)
     if min(width, height) < MIN_SIZE:
         cause = f"scene.downscale={downscale}" + ("" if max_size is None else f" with scene.max_size={max_size}")
@@ -47,18 +47,18 @@ def check_final_size(size: tuple[int, int], downscale: int, max_size: int | None
 
 SplitName = Literal["every_nth", "sector", "matched", "list"]
 TEST_EVERY = 8  # Mip-NeRF 360 and 3DGS hold out every 8th image, from the first
-SECTORS = 8  # as many views in each as every eighth
-TRAIN_LIST, TEST_LIST = "train_list.txt", "test_list.txt"  # the names that nerfbaselines gives them
+SECTORS = 8  # a sector then has as many views as every_nth holds out by default
+TRAIN_LIST, TEST_LIST = "train_list.txt", "test_list.txt"  # as nerfbaselines names them
 
 
 @dataclass(frozen=True)
 class SplitRule:
-    """Settings of holding views out; the fields are those of `gsbench.scene.options.SceneConfig`.
+    """Settings that say which views are held out; the fields are those of `gsbench.scene.options.SceneConfig`.
 
-    ``every_nth``: every ``test_every``-th name, from the first. ``sector``: part ``sector`` of ``sectors`` contiguous
-    ones (`gsbench.scene.hold_out.arrange`). ``list``: as the lists say. With ``match_views`` the first two hold out
-    equally many, those of a sector, so that equally many are left for training. ``validation``: the held-out views are
-    put away, and the rule is applied to the rest once more.
+    ``every_nth`` holds out every ``test_every``-th name, from the first. ``sector`` holds out sector number ``sector``
+    of ``sectors`` contiguous ones (`gsbench.scene.hold_out.arrange_cameras`). ``list`` follows the lists. With
+    ``match_views``, ``every_nth`` holds out as many views as a sector has, so both leave equally many for training.
+    With ``validation``, the held-out views are dropped, and the rule is applied again to the rest.
     """
 
     split: SplitName = "every_nth"
@@ -76,7 +76,7 @@ class SplitRule:
 
     @property
     def asks_the_capture(self) -> bool:
-        """Return whether a capture that says itself what it holds out is to be followed."""
+        """Return whether the capture's own list of test views applies."""
         return self.split == "list" and self.train_list is None and self.test_list is None
 
     def check(self) -> None:
@@ -100,38 +100,38 @@ class SplitRule:
 EVERY_NTH = SplitRule()
 
 
-Behind = Literal["black", "white"]
-MAX_SIZE = 16_384  # px, of a picture of the courtyard
+Backdrop = Literal["black", "white"]  # the colour under transparent pixels
+MAX_SIZE = 16_384  # px, a side of a view of the courtyard
 
 
 def folder_name(path: str | None) -> str:
-    """The name of the scene in the folder ``path``; ``scene`` where that cannot name a folder of results."""
+    """The last part of ``path`` as the scene's name, or ``scene`` if it cannot name a folder of results."""
     name = Path(path or "").expanduser().absolute().name
     return name if is_folder_name(name) else "scene"
 
 
 @dataclass
 class SceneConfig:
-    name: FolderName | None = MISSING  # null: that of the folder `path`
+    name: FolderName | None = MISSING  # null: the name of the folder `path`
     kind: Literal["colmap", "photos", "transforms", "courtyard"] = MISSING
     path: PathName | None = None  # folder of the capture
     images: PathName | None = None  # image folder below path; null: images
     sparse: PathName | None = None  # model folder below path; null: sparse/0 or sparse
-    transparent: Behind = "black"  # what transparent pixels are laid over
-    masks: PathName | None = None  # folder below path of a mask for each image: black is ignored; null: all counts
-    downscale: PositiveInt = 1  # divide both sides by it
+    transparent: Backdrop = "black"  # colour under transparent pixels
+    masks: PathName | None = None  # folder below path with a mask for each image, black where ignored; null: no masks
+    downscale: PositiveInt = 1  # divides both sides
     max_size: Annotated[int, Ge(MIN_SIZE)] | None = None  # longest side, px; never enlarges
     resample: Literal["lanczos", "area", "bicubic"] = "lanczos"
     max_images: Annotated[int, Ge(3)] = 200  # evenly spaced over the sorted names
-    test_every: Annotated[int, Ge(2)] = TEST_EVERY  # every 8th sorted name is held out
+    test_every: Annotated[int, Ge(2)] = TEST_EVERY  # every_nth: hold out every so-many-th sorted name
     split: SplitName = "every_nth"  # what is held out: every test_every-th image, a sector, lists; matched: see `check`
     train_list: PathName | None = None  # file of names, one a line; null with split=list: train_list.txt
     test_list: PathName | None = None  # the same; null with split=list: test_list.txt
-    sector: NonNegativeInt = 0  # which of them is held out
+    sector: NonNegativeInt = 0  # number of the sector that is held out
     sectors: Annotated[int, Ge(2)] = SECTORS  # contiguous parts of the cameras
-    match_views: bool = False  # every_nth and sector hold out equally many
-    validation: bool = False  # put the test views away, and judge by views that are held out of the rest
-    principal_point: Literal["used", "centred"] = "used"  # 3DGS ignores it
+    match_views: bool = False  # every_nth and sector hold out equally many views
+    validation: bool = False  # drop the test views, and measure on views held out of the rest
+    principal_point: Literal["used", "centred"] = "used"  # centred: moved to the image centre, as 3DGS assumes
     views: Annotated[int, Interval(ge=3, le=9999)] = 48  # courtyard only, as are the next three
     width: Annotated[int, Interval(ge=MIN_SIZE, le=MAX_SIZE)] = 400
     height: Annotated[int, Interval(ge=MIN_SIZE, le=MAX_SIZE)] = 300
@@ -161,5 +161,5 @@ class SceneConfig:
 
     @property
     def split_rule(self) -> SplitRule:
-        """The split: the settings of what is held out."""
+        """The settings that say which views are held out."""
         return SplitRule(**{entry.name: getattr(self, entry.name) for entry in fields(SplitRule)})

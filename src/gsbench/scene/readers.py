@@ -1,4 +1,4 @@
-"""Readers: a folder on disk becomes a `Capture`."""
+"""Readers that turn a folder on disk into a `Capture`."""
 
 import hashlib
 import logging
@@ -12,9 +12,9 @@ from gsbench.datasets.catalog import how_to_get
 from gsbench.errors import InputError
 from gsbench.files import require_regular
 from gsbench.scene.colmap_files import model_files
-from gsbench.scene.hold_out import Cameras, hold_out
+from gsbench.scene.hold_out import CamerasByName, hold_out
 from gsbench.scene.images import IMAGE_SUFFIXES
-from gsbench.scene.masks import check_sizes, find_masks
+from gsbench.scene.masks import check_mask_sizes, find_masks
 from gsbench.scene.names import MAX_IMAGES, MIN_IMAGES, check_picture_names, match_names, select_images
 from gsbench.scene.options import EVERY_NTH, TEST_LIST, TRAIN_LIST, SplitRule
 from gsbench.scene.transforms import Transforms
@@ -23,7 +23,7 @@ from gsbench.words import counted, some_of
 
 log = logging.getLogger(__name__)
 
-HEIC_SUFFIXES = frozenset({".heic", ".heif"})  # of telephones; neither Pillow nor COLMAP reads them
+HEIC_SUFFIXES = frozenset({".heic", ".heif"})  # photographs of telephones; neither Pillow nor COLMAP reads them
 SPARSE_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0")
 
 
@@ -39,11 +39,11 @@ def read_colmap(
 ) -> Capture:
     """Read a COLMAP folder: ``path/<images>`` (else "images") and ``path/<sparse>`` (else "sparse/0" or "sparse").
 
-    The photos are those that the model has a pose for and that are in the folder; a file may have another extension
-    than the model says. See `select_images` for which are kept and `SplitRule` for which are held out. ``masks`` is the
-    folder of their masks below ``path`` (see `gsbench.scene.masks.find_masks`).
+    The photographs are the files in the folder that have a pose in the model; their extensions may differ from the
+    model's names. `select_images` chooses the ones that are kept, `SplitRule` the ones that are held out. ``masks`` is
+    the folder of the masks below ``path`` (see `gsbench.scene.masks.find_masks`).
 
-    Raises `InputError` if a folder is missing, the model is damaged, or fewer than three photos are usable.
+    Raises `InputError` if a folder is missing, the model is damaged, or fewer than three photographs are usable.
     """
     from gsbench.scene.colmap import read_model, reference_cameras, registered_names  # photos alone need no pycolmap
 
@@ -52,25 +52,25 @@ def read_colmap(
     folder = _subfolder(root, images or "images", "scene.images")
     model = read_model(model_folder)
     wanted = registered_names(model)
-    mask_folder, there = _beside_masks(root, folder, masks)
-    matches = match_names(wanted, there)
+    mask_folder, files = _masks_and_images(root, folder, masks)
+    matches = match_names(wanted, files)
     missing = [image for image in wanted if image not in matches]
     if missing:
         log.warning(
             "%s: %d of %d images of the model have no file: %s", folder, len(missing), len(wanted), some_of(missing)
         )
     _require_enough(len(matches), folder, f"that the model {model_folder} has a pose for")
-    files = {file: image for image, file in matches.items()}
-    return _capture(
+    model_names = {file: image for image, file in matches.items()}
+    return _make_capture(
         name, folder, sorted(matches.values()), model_folder, exact_poses, max_images, split, root,
-        lambda names: reference_cameras(model, [files[file] for file in names]), mask_folder,
+        lambda chosen: reference_cameras(model, [model_names[file] for file in chosen]), mask_folder,
     )  # fmt: skip
 
 
 def read_transforms(
     name: str,
     path: Path | str,
-    said: Transforms,
+    transforms: Transforms,
     model: Path,
     max_images: int = MAX_IMAGES,
     split: SplitRule = EVERY_NTH,
@@ -78,23 +78,23 @@ def read_transforms(
 ) -> Capture:
     """Read the photographs that ``transforms.json`` in ``path`` names, with the cameras in the COLMAP folder ``model``.
 
-    ``said`` is what `gsbench.scene.transforms.read_transforms` reads of the file, ``model`` what
-    `gsbench.scene.colmap.write_frames` makes of that. ``split=list`` takes the views of Blender's file of test views.
-    ``masks`` is the folder of their masks. Raises InputError where the file names masks and no folder was given.
+    ``transforms`` is the content of the file (`gsbench.scene.transforms.read_transforms`), and ``model`` was written
+    from it (`gsbench.scene.colmap.write_frames`). ``split=list`` holds out the views of Blender's file of test views.
+    ``masks`` is the folder of the masks. Raises InputError if the file names masks and no folder was given.
     """
     from gsbench.scene.colmap import read_model, reference_cameras
 
     root = existing_folder(name, path)
-    names = list(said.frames)
+    names = list(transforms.images)
     _require_enough(len(names), root, "that its transforms.json names are")
-    if said.names_masks and masks is None:
-        raise InputError(f"{said.files[0]}: mask_path is not read: give the folder of the masks as scene.masks")
-    capture = _capture(
+    if transforms.has_mask_paths and masks is None:
+        raise InputError(f"{transforms.files[0]}: mask_path is not read: give the folder of the masks as scene.masks")
+    capture = _make_capture(
         name, root, names, model, False, max_images, split, root,
         lambda chosen: reference_cameras(read_model(model), chosen),
-        None if masks is None else _subfolder(root, masks, "scene.masks"), said.split,
+        None if masks is None else _subfolder(root, masks, "scene.masks"), transforms.split,
     )  # fmt: skip
-    return replace(capture, read_from=said.sources)
+    return replace(capture, read_from=transforms.sources)
 
 
 def read_photos(
@@ -107,8 +107,8 @@ def read_photos(
 ) -> Capture:
     """Read bare photographs: all images in ``path/<images>``, or ``path/images`` if there is one, or ``path``.
 
-    Sub-folders are read too, but for ``masks``, the folder of their masks below ``path``. Any COLMAP model beside them
-    is left alone.
+    Sub-folders are read too, except ``masks``, the folder of the masks below ``path``. A COLMAP model beside the
+    photographs is ignored.
 
     Raises `InputError` if the folder is missing or holds fewer than three images.
     """
@@ -117,23 +117,25 @@ def read_photos(
         folder = _subfolder(root, images, "scene.images")
     else:
         folder = root / "images" if (root / "images").is_dir() else root
-    mask_folder, names = _beside_masks(root, folder, masks)
-    _require_enough(len(names), folder, f"({', '.join(sorted(s[1:] for s in IMAGE_SUFFIXES))})")
-    return _capture(name, folder, names, None, False, max_images, split, root, None, mask_folder)
+    mask_folder, names = _masks_and_images(root, folder, masks)
+    _require_enough(len(names), folder, f"({', '.join(sorted(suffix[1:] for suffix in IMAGE_SUFFIXES))})")
+    return _make_capture(name, folder, names, None, False, max_images, split, root, None, mask_folder)
 
 
-def _beside_masks(root: Path, folder: Path, masks: str | None) -> tuple[Path | None, list[str]]:
-    """The folder of masks, and the images in ``folder`` that are none."""
+def _masks_and_images(root: Path, folder: Path, masks: str | None) -> tuple[Path | None, list[str]]:
+    """The folder of the masks, if any, and the images in ``folder`` outside it."""
     if masks is None:
         return None, list_images(folder)
-    home = _subfolder(root, masks, "scene.masks")
-    if home.resolve() == folder.resolve():
-        raise InputError(f"scene.masks: {home} is the folder of the images: put the masks into one of their own")
-    return home, [name for name in list_images(folder) if not (folder / name).resolve().is_relative_to(home.resolve())]
+    mask_folder = _subfolder(root, masks, "scene.masks")
+    resolved = mask_folder.resolve()
+    if resolved == folder.resolve():
+        raise InputError(f"scene.masks: {mask_folder} is the folder of the images: put the masks into one of their own")
+    images = [name for name in list_images(folder) if not (folder / name).resolve().is_relative_to(resolved)]
+    return mask_folder, images
 
 
 def existing_folder(name: str, path: Path | str) -> Path:
-    """The folder ``path`` of the scene ``name``; raises `InputError` where it is not set or there is none."""
+    """The folder ``path`` of the scene ``name``; raises `InputError` if it is not set or does not exist."""
     if path is None or str(path) == "":
         raise InputError(f"scene {name}: scene.path is not set: give the folder of the photos")
     root = Path(path).expanduser()
@@ -143,12 +145,12 @@ def existing_folder(name: str, path: Path | str) -> Path:
 
 
 def missing_folder(name: str, root: Path) -> str:
-    """Explain that the folder ``root`` of the scene ``name`` is not there, and what to do about it."""
+    """The message that the folder ``root`` of the scene ``name`` does not exist."""
     return f"scene {name}: the folder {root} {'is a file' if root.exists() else 'does not exist'}"
 
 
 def missing_model(name: str, root: Path, sparse: str | None) -> str:
-    """The reason why the folder ``root`` of the scene ``name`` has no COLMAP model, "" where it has one."""
+    """The reason why the folder ``root`` of the scene ``name`` has no COLMAP model, or "" if it has one."""
     try:
         _find_sparse(root, sparse)
     except InputError as error:
@@ -157,23 +159,24 @@ def missing_model(name: str, root: Path, sparse: str | None) -> str:
 
 
 def list_images(folder: Path) -> list[str]:
-    """The sorted image files in a folder and its sub-folders, relative, with "/" as separator; hidden ones left out.
+    """The sorted image files in a folder and its sub-folders, relative, with "/" as separator, without hidden files.
 
     Links to folders are followed, and no folder is read twice.
     """
     names: list[str] = []
     unread = 0
-    waiting, links, seen = [folder], list[Path](), set[tuple[int, int]]()
-    while waiting or links:
-        parent = waiting.pop() if waiting else links.pop(0)  # a folder goes by its own name rather than by a link's
-        if (place := _identity(parent)) in seen:
+    folders, links, seen = [folder], list[Path](), set[tuple[int, int]]()
+    while folders or links:
+        # Links come last, so that images are listed under their real folder rather than under a link to it.
+        parent = folders.pop() if folders else links.pop(0)
+        if (identity := _identity(parent)) in seen:  # also ends circles of links
             continue
-        seen.add(place)
+        seen.add(identity)
         for entry in sorted(_entries(parent), key=lambda entry: entry.name):
             if entry.name.startswith("."):
                 continue
             if entry.is_dir():
-                (links if entry.is_symlink() else waiting).append(Path(entry.path))
+                (links if entry.is_symlink() else folders).append(Path(entry.path))
             elif Path(entry.name).suffix.lower() in IMAGE_SUFFIXES:
                 names.append(Path(entry.path).relative_to(folder).as_posix())
             elif Path(entry.name).suffix.lower() in HEIC_SUFFIXES:
@@ -186,15 +189,15 @@ def list_images(folder: Path) -> list[str]:
 
 
 def _identity(folder: Path) -> tuple[int, int]:
-    found = folder.stat()
-    return found.st_dev, found.st_ino
+    status = folder.stat()
+    return status.st_dev, status.st_ino
 
 
 def _entries(folder: Path) -> list[os.DirEntry[str]]:
     try:
         with os.scandir(folder) as entries:
             return list(entries)
-    except PermissionError:  # as if it were not there
+    except PermissionError:  # treated as an empty folder
         return []
 
 
@@ -204,10 +207,7 @@ def fingerprint(
     model_files: Iterable[Path] = (),
     masks: Mapping[str, Path] = MappingProxyType({}),
 ) -> str:
-    """sha256 over names and contents of the images, sorted, of the model's files and of ``masks`` by image.
-
-    It is independent of where they lie.
-    """
+    """sha256 over the names and contents of images, model files and masks, independent of their folders."""
     digest = hashlib.sha256()
     entries = [(f"image/{name}", folder / name) for name in sorted(names)]
     entries += [(f"model/{file.name}", file) for file in sorted(model_files)]
@@ -223,7 +223,7 @@ def fingerprint(
     return digest.hexdigest()
 
 
-def _capture(
+def _make_capture(
     name: str,
     folder: Path,
     names: list[str],
@@ -232,7 +232,7 @@ def _capture(
     max_images: int,
     split: SplitRule,
     root: Path,
-    cameras: Cameras | None = None,
+    cameras: CamerasByName | None = None,
     mask_folder: Path | None = None,
     own_split: tuple[list[str], list[str]] | None = None,
 ) -> Capture:
@@ -245,7 +245,7 @@ def _capture(
     check_picture_names(held_out.test, folder)
     _require_enough(len(kept), folder, "in the split lists" if split.by_lists else "left by the split")
     masks = {} if mask_folder is None else find_masks(mask_folder, kept)
-    check_sizes(folder, masks)
+    check_mask_sizes(folder, masks)
     return Capture(
         name=name,
         images=folder,
@@ -260,9 +260,9 @@ def _capture(
 
 
 def _resolve(wanted: Sequence[str], names: Sequence[str], folder: Path) -> list[str]:
-    """The files that the names in a split list mean; their extension may be left out or differ."""
+    """The image files that the names in a split list mean; names may lack an extension or have another one."""
     matches = match_names(wanted, names)
-    if unknown := [entry for entry in wanted if entry not in matches]:
+    if unknown := [name for name in wanted if name not in matches]:
         raise InputError(
             f"the split lists name {some_of(unknown)}, not among the usable images of {folder}: correct the lists"
         )
@@ -270,7 +270,7 @@ def _resolve(wanted: Sequence[str], names: Sequence[str], folder: Path) -> list[
 
 
 def _read_lists(root: Path, split: SplitRule) -> tuple[list[str] | None, list[str] | None]:
-    """The training and the test list; ``split=list`` without names finds those that nerfbaselines writes."""
+    """The training and the test list; ``split=list`` without file names reads the lists that nerfbaselines writes."""
     train, test = split.train_list, split.test_list
     if split.split == "list" and train is None and test is None:
         train, test = (name if (root / name).is_file() else None for name in (TRAIN_LIST, TEST_LIST))
@@ -296,11 +296,13 @@ def _read_list(root: Path, file: str | None, key: str) -> list[str] | None:
 
 
 def _subfolder(root: Path, folder: str, key: str) -> Path:
-    found = root / folder
-    if not found.is_dir():
-        near = sorted(entry.name for entry in root.iterdir() if entry.is_dir())
-        raise InputError(f"{found}: no such folder; set {key} to one of: {', '.join(near) or '(there is no folder)'}")
-    return found
+    path = root / folder
+    if not path.is_dir():
+        existing = sorted(entry.name for entry in root.iterdir() if entry.is_dir())
+        raise InputError(
+            f"{path}: no such folder; set {key} to one of: {', '.join(existing) or '(there is no folder)'}"
+        )
+    return path
 
 
 def _find_sparse(root: Path, sparse: str | None) -> Path:

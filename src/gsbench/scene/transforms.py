@@ -1,9 +1,9 @@
-"""Cameras in nerfstudio's, instant-ngp's and Blender's ``transforms.json``, as COLMAP's.
+"""Reading ``transforms.json`` of nerfstudio, instant-ngp and Blender, and converting its cameras to COLMAP's form.
 
-A ``transform_matrix`` takes camera coordinates to the world's, in OpenGL's axes (x right, y up, looking along -z);
-intrinsics have COLMAP's meaning. ``applied_transform`` and ``applied_scale`` say what was done to the coordinates of
-the original data, ``saved = applied_scale * applied_transform(original)``; both are undone, for cameras and points, so
-that a length means what it meant there. Sources: nerfstudio's page "Data conventions" and its reader of this format
+A ``transform_matrix`` maps camera coordinates to world coordinates, in OpenGL axes (x right, y up, looking along -z).
+Intrinsics have COLMAP's meaning. ``applied_transform`` and ``applied_scale`` were applied to the original data:
+``saved = applied_scale * applied_transform(original)``. Both are undone for cameras and points, so that lengths are
+those of the original data. Sources: nerfstudio's page "Data conventions" and its reader of this format
 (nerfstudio_dataparser.py), the Blender scenes of NeRF (Mildenhall et al. 2020).
 """
 
@@ -30,28 +30,28 @@ log = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 Row = Annotated[list[Number], Len(4, 4)]
-Matrix = Annotated[list[Row], Len(3, 4)]  # the last row of four says nothing
+Matrix = Annotated[list[Row], Len(3, 4)]  # a fourth row is ignored
 
 ONE_FILE = "transforms.json"
 SPLIT_FILES = {"train": "transforms_train.json", "test": "transforms_test.json", "val": "transforms_val.json"}
-OPENGL = np.diag([1.0, -1.0, -1.0])  # OpenCV's camera axes in OpenGL's, and back
-ROTATION_TOLERANCE = 1e-3  # of a matrix that was written with few digits
+OPENGL = np.diag([1.0, -1.0, -1.0])  # from OpenCV's camera axes to OpenGL's, and back
+ROTATION_TOLERANCE = 1e-3  # largest error of an entry, for matrices written with few digits
 PERSPECTIVE, FISHEYE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"), "OPENCV_FISHEYE"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Intrinsics(Record):
-    """Intrinsics that a file gives all its cameras, or a frame its own."""
+    """Intrinsics, of all cameras of a file or of one frame."""
 
     camera_model: str | None = None
-    is_fisheye: bool | None = None  # instant-ngp's word for OPENCV_FISHEYE
+    is_fisheye: bool | None = None  # instant-ngp's key for OPENCV_FISHEYE
     w: Number | None = None
     h: Number | None = None
     fl_x: Number | None = None
     fl_y: Number | None = None
     cx: Number | None = None
     cy: Number | None = None
-    camera_angle_x: Number | None = None  # of the whole picture, radians
+    camera_angle_x: Number | None = None  # horizontal field of view, radians
     k1: Number | None = None
     k2: Number | None = None
     k3: Number | None = None
@@ -62,7 +62,7 @@ class Intrinsics(Record):
 
 @dataclass(frozen=True, kw_only=True)
 class FrameRecord(Intrinsics):
-    """A photograph with its pose."""
+    """A frame of the file: a photograph with its pose."""
 
     file_path: Text
     transform_matrix: Matrix
@@ -71,7 +71,7 @@ class FrameRecord(Intrinsics):
 
 @dataclass(frozen=True, kw_only=True)
 class TransformsRecord(Intrinsics):
-    """``transforms.json``."""
+    """The content of ``transforms.json`` as it is written."""
 
     frames: list[FrameRecord]
     applied_transform: Matrix | None = None
@@ -80,8 +80,8 @@ class TransformsRecord(Intrinsics):
 
 
 @dataclass(frozen=True, eq=False)
-class Frame:
-    """A photograph: its name below the folder, its camera, the rotation [3, 3] and translation [3] from world to it."""
+class PosedImage:
+    """An image's name below the folder, camera, and world-to-camera rotation [3, 3] and translation [3]."""
 
     name: str
     camera: CameraModel
@@ -91,123 +91,128 @@ class Frame:
 
 @dataclass(frozen=True)
 class Transforms:
-    """Content of a folder's files: ``frames`` by name, the views that they hold out, and their points.
+    """Converted content of a folder's files: images by name, their split, and their points.
 
-    ``split`` are the names for training and for testing, None where one file has all. ``points`` is a PLY file, whose
-    coordinates ``undo`` takes to those of the cameras. ``names_masks``: some image has a mask of its own there.
+    ``split`` are the names for training and for testing, or None if one file holds all images. ``points`` is a PLY
+    file; ``applied.undo`` converts its coordinates to those of the cameras. ``has_mask_paths`` says that at least one
+    image names a mask.
     """
 
     files: tuple[Path, ...]
-    frames: dict[str, Frame]
+    images: dict[str, PosedImage]
     split: tuple[list[str], list[str]] | None
     points: Path | None
-    undo: Undo
-    names_masks: bool
+    applied: AppliedTransform
+    has_mask_paths: bool
 
     @property
     def sources(self) -> tuple[Path, ...]:
-        """The files that cameras and points are made from."""
+        """The files that cameras and points are read from."""
         return (*self.files, *(() if self.points is None else (self.points,)))
 
 
 @dataclass(frozen=True, eq=False)
-class Undo:
-    """The way back from a file's coordinates to those of the original data."""
+class AppliedTransform:
+    """The transform and scale that were applied to the original data before it was saved."""
 
-    rotation: Array = field(default_factory=lambda: np.eye(3))  # [3, 3] of the applied transform
+    rotation: Array = field(default_factory=lambda: np.eye(3))  # [3, 3]
     translation: Array = field(default_factory=lambda: np.zeros(3))  # [3]
     scale: float = 1.0
 
-    def points(self, saved: Array) -> Array:
-        """The points [P, 3] in the coordinates of the original data."""
+    def undo(self, saved: Array) -> Array:
+        """Convert saved points [P, 3] to the coordinates of the original data."""
         original: Array = (saved / self.scale - self.translation) @ self.rotation
         return original
 
 
 def find_files(folder: Path) -> dict[str, Path]:
-    """The file of a folder, under "", or those of a Blender scene by their part; raises InputError where is none."""
+    """The one file of a folder, under the key "", or the files of a Blender scene by their split.
+
+    Raises InputError if the folder has neither.
+    """
     if (folder / ONE_FILE).is_file():
         return {"": folder / ONE_FILE}
-    parts = {part: folder / name for part, name in SPLIT_FILES.items() if (folder / name).is_file()}
-    if "train" not in parts:
+    files = {split: folder / name for split, name in SPLIT_FILES.items() if (folder / name).is_file()}
+    if "train" not in files:
         raise InputError(
             f"{folder}: neither {ONE_FILE} nor {SPLIT_FILES['train']} is here: give the folder that holds it, or take "
             "scene=colmap or scene=photos"
         )
-    if "test" in parts:
-        parts.pop("val", None)  # as those who report on these scenes leave it out
-    return parts
+    if "test" in files:
+        files.pop("val", None)  # reports on Blender's scenes use the training and test views alone
+    return files
 
 
 def read_transforms(folder: Path) -> Transforms:
-    """Read the cameras in ``folder``; raises InputError, one line, for what cannot be understood."""
+    """Read the cameras in ``folder``; raises InputError, one line, for a file that cannot be understood."""
     files = find_files(folder)
-    records = {part: read_typed(resolved(path), TransformsRecord) for part, path in files.items()}
-    frames: dict[str, Frame] = {}
-    by_part: dict[str, list[str]] = {part: [] for part in files}
-    points, undo = None, Undo()
-    for part, record in records.items():
-        path, missing = files[part], []
-        undo = _undo(path, record)
-        for entry in record.frames:
-            name = _image_name(folder, path, entry.file_path)
+    records = {split: read_typed(resolved(path), TransformsRecord) for split, path in files.items()}
+    images: dict[str, PosedImage] = {}
+    names: dict[str, list[str]] = {split: [] for split in files}
+    points, applied = None, AppliedTransform()
+    for split, record in records.items():
+        path, missing = files[split], []
+        applied = _applied_transform(path, record)
+        for frame in record.frames:
+            name = _image_name(folder, path, frame.file_path)
             if name is None:
-                missing.append(entry.file_path)
+                missing.append(frame.file_path)
                 continue
-            if name in frames:
+            if name in images:
                 raise InputError(f"{path}: {name} is there twice: name each image once")
-            frames[name] = Frame(name, _camera(folder / name, path, record, entry), *_pose(path, entry, undo))
-            by_part[part].append(name)
+            images[name] = PosedImage(name, _camera(folder / name, path, record, frame), *_pose(path, frame, applied))
+            names[split].append(name)
         if missing:
             log.warning(
                 "%s: %d of %d images have no file: %s", path, len(missing), len(record.frames), some_of(missing)
             )
         if record.ply_file_path is not None:
-            points = folder / _inside(path, record.ply_file_path)
+            points = folder / _relative_path(path, record.ply_file_path)
             if not points.is_file():
                 raise InputError(f"{path} names {record.ply_file_path}, which is not there")
-    held_out = next((sorted(by_part[part]) for part in ("test", "val") if part in files), None)
+    held_out = next((sorted(names[split]) for split in ("test", "val") if split in files), None)
     return Transforms(
         tuple(files.values()),
-        dict(sorted(frames.items())),
-        None if held_out is None else (sorted(by_part["train"]), held_out),
+        dict(sorted(images.items())),
+        None if held_out is None else (sorted(names["train"]), held_out),
         points,
-        undo,
-        any(entry.mask_path for record in records.values() for entry in record.frames),
+        applied,
+        any(frame.mask_path for record in records.values() for frame in record.frames),
     )
 
 
-def _inside(path: Path, named: str) -> PurePosixPath:
-    """The place that the file ``path`` names, below its folder."""
-    place = PurePosixPath(named.replace("\\", "/"))
-    if place.is_absolute() or ".." in place.parts or PureWindowsPath(named).drive:
-        raise InputError(f"{path}: {named} lies outside the folder of the file: name images relative to it")
-    return place
+def _relative_path(path: Path, written: str) -> PurePosixPath:
+    """The path ``written`` in the file ``path``; raises InputError if it leads out of the file's folder."""
+    relative = PurePosixPath(written.replace("\\", "/"))
+    if relative.is_absolute() or ".." in relative.parts or PureWindowsPath(written).drive:
+        raise InputError(f"{path}: {written} lies outside the folder of the file: name images relative to it")
+    return relative
 
 
-def _image_name(folder: Path, path: Path, named: str) -> str | None:
-    """The image that ``file_path`` means, whose extension Blender's files leave out; None where it is not there."""
-    place = _inside(path, named)
-    if place.suffix.lower() in IMAGE_SUFFIXES and (folder / place).is_file():
-        return place.as_posix()
-    there = [f"{place}{suffix}" for suffix in sorted(IMAGE_SUFFIXES) if (folder / f"{place}{suffix}").is_file()]
-    if len(there) > 1:
-        raise InputError(f"{path}: {named} may be {' or '.join(there)}: add the extension")
-    return there[0] if there else None
+def _image_name(folder: Path, path: Path, written: str) -> str | None:
+    """The image file that ``file_path`` means, or None if there is none. Blender's files leave out the extension."""
+    relative = _relative_path(path, written)
+    if relative.suffix.lower() in IMAGE_SUFFIXES and (folder / relative).is_file():
+        return relative.as_posix()
+    candidates = (f"{relative}{suffix}" for suffix in sorted(IMAGE_SUFFIXES))
+    existing = [name for name in candidates if (folder / name).is_file()]
+    if len(existing) > 1:
+        raise InputError(f"{path}: {written} may be {' or '.join(existing)}: add the extension")
+    return existing[0] if existing else None
 
 
-def _undo(path: Path, record: TransformsRecord) -> Undo:
+def _applied_transform(path: Path, record: TransformsRecord) -> AppliedTransform:
     scale = 1.0 if record.applied_scale is None else record.applied_scale
     if not scale > 0:
         raise InputError(f"{path}: applied_scale must be positive, got {scale}")
     if record.applied_transform is None:
-        return Undo(scale=scale)
+        return AppliedTransform(scale=scale)
     matrix = np.array(record.applied_transform[:3])  # [3, 4]
-    return Undo(rotation_of(matrix[:, :3], f"{path}: applied_transform"), matrix[:, 3], scale)
+    return AppliedTransform(nearest_rotation(matrix[:, :3], f"{path}: applied_transform"), matrix[:, 3], scale)
 
 
-def rotation_of(matrix: Array, what: str) -> Array:
-    """The rotation nearest to ``matrix`` [3, 3]; raises InputError where it is far from one."""
+def nearest_rotation(matrix: Array, what: str) -> Array:
+    """The rotation nearest to ``matrix`` [3, 3]; raises InputError if ``matrix`` is far from a rotation."""
     left, _, right = np.linalg.svd(matrix)
     nearest: Array = left @ right
     if np.abs(nearest - matrix).max() > ROTATION_TOLERANCE or np.linalg.det(matrix) < 0:
@@ -215,43 +220,45 @@ def rotation_of(matrix: Array, what: str) -> Array:
     return nearest
 
 
-def _pose(path: Path, frame: FrameRecord, undo: Undo) -> tuple[Array, Array]:
+def _pose(path: Path, frame: FrameRecord, applied: AppliedTransform) -> tuple[Array, Array]:
     matrix = np.array(frame.transform_matrix[:3])  # [3, 4]
-    saved = rotation_of(matrix[:, :3], f"{path}: transform_matrix of {frame.file_path}")
-    world_from_camera = undo.rotation.T @ saved @ OPENGL
-    center = undo.points(matrix[None, :, 3])[0]
+    saved = nearest_rotation(matrix[:, :3], f"{path}: transform_matrix of {frame.file_path}")
+    world_from_camera = applied.rotation.T @ saved @ OPENGL
+    center = applied.undo(matrix[None, :, 3])[0]
     rotation = world_from_camera.T
     return rotation, -rotation @ center
 
 
 def _camera(image: Path, path: Path, record: TransformsRecord, frame: FrameRecord) -> CameraModel:
-    """The camera of a frame: what it says itself, else what its file says of all."""
+    """The camera of a frame, by the frame's own intrinsics, else by those of the file."""
 
     def value(name: str) -> float | None:
         own = getattr(frame, name)
-        said: float | None = getattr(record, name) if own is None else own
-        return said
+        intrinsic: float | None = getattr(record, name) if own is None else own
+        return intrinsic
 
-    whose = f"{path}: {frame.file_path}"
+    where = f"{path}: {frame.file_path}"
     width, height = value("w"), value("h")
     if width is None or height is None:
         width, height = image_size(image)
     if width != int(width) or height != int(height) or min(width, height) < 1:
-        raise InputError(f"{whose}: w and h must be whole numbers of px, got {width} and {height}")
+        raise InputError(f"{where}: w and h must be whole numbers of px, got {width} and {height}")
     focal_x, angle = value("fl_x"), value("camera_angle_x")
     if focal_x is None and angle is not None and 0 < angle < math.pi:
         focal_x = width / (2 * math.tan(angle / 2))
     focal_y = value("fl_y") or focal_x
     if focal_x is None or focal_y is None or min(focal_x, focal_y) <= 0:
-        raise InputError(f"{whose}: no focal length: fl_x, or camera_angle_x between 0 and pi, must be given")
-    center = [half if said is None else said for said, half in ((value("cx"), width / 2), (value("cy"), height / 2))]
-    model, distortion = _distortion(whose, record, frame)
+        raise InputError(f"{where}: no focal length: fl_x, or camera_angle_x between 0 and pi, must be given")
+    cx, cy = value("cx"), value("cy")
+    center = (width / 2 if cx is None else cx, height / 2 if cy is None else cy)
+    model, distortion = _distortion(where, record, frame)
     return CameraModel(model, int(width), int(height), (focal_x, focal_y, *center, *distortion))
 
 
-def _distortion(whose: str, record: TransformsRecord, frame: FrameRecord) -> tuple[str, tuple[float, ...]]:
-    """COLMAP's name of the model and what follows the principal point among its parameters."""
+def _distortion(where: str, record: TransformsRecord, frame: FrameRecord) -> tuple[str, tuple[float, ...]]:
+    """COLMAP's name of the camera model, and its parameters after the principal point."""
     names = ("k1", "k2", "k3", "k4", "p1", "p2")
+    # A frame with a coefficient of its own uses none of the file's.
     own = any(getattr(frame, name) is not None for name in names)
     k1, k2, k3, k4, p1, p2 = (getattr(frame if own else record, name) or 0.0 for name in names)
     fisheye = record.is_fisheye if frame.is_fisheye is None else frame.is_fisheye
@@ -259,7 +266,7 @@ def _distortion(whose: str, record: TransformsRecord, frame: FrameRecord) -> tup
     if model == FISHEYE:
         return model, (k1, k2, k3, k4)
     if model not in PERSPECTIVE:
-        raise InputError(f"{whose}: camera_model {model} is not known here ({', '.join((*PERSPECTIVE, FISHEYE))})")
+        raise InputError(f"{where}: camera_model {model} is not known here ({', '.join((*PERSPECTIVE, FISHEYE))})")
     if k3 or k4:
-        raise InputError(f"{whose}: k3 and k4 are read of {FISHEYE} alone: leave them out, or make a COLMAP model")
+        raise InputError(f"{where}: k3 and k4 are read of {FISHEYE} alone: leave them out, or make a COLMAP model")
     return ("OPENCV", (k1, k2, p1, p2)) if any((k1, k2, p1, p2)) else ("PINHOLE", ())

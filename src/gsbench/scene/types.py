@@ -1,4 +1,4 @@
-"""Types of a scene: photographs on disk before initialisation, views with cameras after it."""
+"""Types of a scene: a `Capture` of photographs on disk before initialisation, a `Scene` of views with cameras after."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -17,12 +17,12 @@ EXTENT_MARGIN = 1.1  # 3DGS: cameras_extent = 1.1 x the largest distance of a tr
 class Capture:
     """Photographs on disk, and the cameras that came with them, if any.
 
-    ``images`` is the folder; ``image_names`` are the selected files in it (relative, sorted) and ``test_names`` those
-    of them held out. ``model`` is a COLMAP sparse folder with reference cameras, or None for bare photographs;
-    ``exact_poses`` says that its poses are the truth (a procedural scene), not an estimate. ``fingerprint`` is a sha256
-    over names and contents of all that was selected. ``held_out`` says in words which views are the test views.
-    ``masks`` are the files of the images' masks by name; none where every pixel counts. ``read_from`` are further files
-    of the user's that say which cameras there are.
+    ``images`` is the folder, ``image_names`` are the selected files in it (relative, sorted), and ``test_names`` are
+    the held-out ones. ``held_out`` describes in words how they were chosen. ``model`` is a COLMAP sparse folder with
+    reference cameras, or None for bare photographs; ``exact_poses`` says that its poses are the truth (a procedural
+    scene), not an estimate. ``masks`` are mask files by image name; it is empty if every pixel counts. ``fingerprint``
+    is a sha256 over names and contents of the selected images, their masks and the model. ``read_from`` are further
+    files of the user that the cameras were read from.
     """
 
     name: str
@@ -46,8 +46,8 @@ class Capture:
 class View:
     """One photograph with its camera; ``image`` is [H, W, 3] uint8, sRGB.
 
-    ``mask`` [H, W] is True where a pixel counts, None where all do; the others hold what `gsbench.scene.masks.fill`
-    made.
+    ``mask`` [H, W] is True where a pixel counts, or None if all pixels count. Ignored pixels hold the colours made by
+    `gsbench.scene.masks.fill_ignored`.
     """
 
     name: str
@@ -76,6 +76,6 @@ class Scene:
 
 
 def scene_extent(cameras: Sequence[Camera]) -> float:
-    """1.1 x the largest distance of a camera centre to the mean of the centres (3DGS's getNerfppNorm), world units."""
+    """1.1 x the largest distance of a camera centre from their mean (3DGS's getNerfppNorm), in world units."""
     centers = np.stack([camera.center for camera in cameras])  # [V, 3]
     return float(EXTENT_MARGIN * np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())

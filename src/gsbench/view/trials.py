@@ -21,8 +21,8 @@ from gsbench.runs.store import Store
 from gsbench.scene.camera import Camera
 from gsbench.scene.colmap import (
     PINHOLE_MODELS,
+    model_points,
     pinhole_camera,
-    points_of,
     read_model,
 )
 from gsbench.scene.images import read_image
@@ -104,7 +104,7 @@ def load_viewed(trial: TrialResult, device: torch.device) -> ViewedTrial:
         gaussians=gaussians,
         causes=read_causes(trial.path / LINEAGE, len(gaussians)),
         log10_volumes=(log_volume(gaussians.log_scales).double() / np.log(10)).cpu().numpy(),
-        cloud=PointCloud(*points_of(read_model(model_dir))),
+        cloud=PointCloud(*model_points(read_model(model_dir))),
         views=read_test_views(trial, model_dir),
         background=tuple(background),
     )

@@ -29,7 +29,7 @@ from gsbench.raster import Rasterizer
 from gsbench.runs.keys import EVALUATE, Step
 from gsbench.runs.layout import ELLIPSOIDS, FIGURES, LINEAGE, METRICS, PER_VIEW, POINT_CLOUD, RENDERS
 from gsbench.runs.trial_record import Earlier, Evaluation
-from gsbench.scene.camera import COUNTED, nearness
+from gsbench.scene.camera import COUNTED, nearest_training_cameras
 from gsbench.scene.images import read_image
 from gsbench.scene.names import png_name
 from gsbench.scene.types import Scene
@@ -162,7 +162,7 @@ def _write_metrics(
 ) -> None:
     """Write the metrics by view and as means; views with their nearest training views."""
     cameras, training = ([view.camera for view in views] for views in (scene.test, scene.train))
-    near = nearness(cameras, training, scene.extent)
+    near = nearest_training_cameras(cameras, training, scene.extent)
     places = {view.name: place for view, place in zip(scene.test, near, strict=True)}  # no metrics: they are in no mean
     if any(view.mask is not None for view in [*scene.train, *scene.test]):
         places = {view.name: places[view.name] | {COUNTED: view.counted} for view in scene.test}

@@ -23,9 +23,9 @@ from gsbench.scene.colmap import write_frames
 from gsbench.scene.courtyard.render import render_courtyard
 from gsbench.scene.images import image_size
 from gsbench.scene.load import load_scene
-from gsbench.scene.masks import IMAGES, prepare, prepared_mask, write_mask
+from gsbench.scene.masks import IMAGES, prepare_photograph, prepared_mask, write_mask
 from gsbench.scene.names import png_name
-from gsbench.scene.options import Behind, SceneConfig, check_final_size
+from gsbench.scene.options import Backdrop, SceneConfig, check_final_size
 from gsbench.scene.readers import (
     SPARSE_FOLDERS,
     existing_folder,
@@ -100,41 +100,43 @@ def _courtyard_step(options: SceneConfig) -> Step:
     return step_of(CAPTURE, inputs, build)
 
 
-def _transforms_step(said: Transforms) -> Step:
+def _transforms_step(transforms: Transforms) -> Step:
     """The step that writes the cameras and points of ``transforms.json`` as a COLMAP model."""
-    sizes = {name: [frame.camera.width, frame.camera.height] for name, frame in said.frames.items()}
-    inputs = {"transforms": [file_sha256(file) for file in said.sources], "sizes": sizes}
+    sizes = {name: [image.camera.width, image.camera.height] for name, image in transforms.images.items()}
+    inputs = {"transforms": [file_sha256(file) for file in transforms.sources], "sizes": sizes}
 
     def build(target: Path) -> None:
         cloud = None
-        if said.points is not None:
-            points, colors = read_points(said.points)
+        if transforms.points is not None:
+            points, colors = read_points(transforms.points)
             grey = np.full(points.shape, GREY, dtype=np.uint8)
-            cloud = said.undo.points(points), grey if colors is None else colors
-        frames = {name: (frame.camera, frame.rotation, frame.translation) for name, frame in said.frames.items()}
+            cloud = transforms.applied.undo(points), grey if colors is None else colors
+        frames = {name: (image.camera, image.rotation, image.translation) for name, image in transforms.images.items()}
         write_frames(target / SPARSE_FOLDERS[0], frames, cloud=cloud)
 
     return step_of(CAPTURE, inputs, build)
 
 
-def masked_step(capture: Capture, behind: Behind) -> Step | None:
+def masked_step(capture: Capture, backdrop: Backdrop) -> Step | None:
     """The step that replaces what masks ignore and what is transparent, before anything looks at it.
 
     None for a capture without masks whose transparent pixels are black, as they are read anyway.
     """
-    if not capture.masks and behind == "black":
+    if not capture.masks and backdrop == "black":
         return None
     inputs: dict[str, Any] = {
         "images": fingerprint(capture.images, capture.image_names),
         "masks": {name: file_sha256(file) for name, file in sorted(capture.masks.items())},
     }
-    if behind != "black":
-        inputs["behind"] = behind
+    if backdrop != "black":
+        inputs["behind"] = backdrop
 
     def build(folder: Path) -> None:
         names = capture.image_names
         with progress("scene") as report, ThreadPoolExecutor(max_workers=available_threads()) as pool:
-            made = pool.map(lambda name: prepare(folder, capture.images, capture.masks, name, behind), names)
+            made = pool.map(
+                lambda name: prepare_photograph(folder, capture.images, capture.masks, name, backdrop), names
+            )
             for done, _ in enumerate(made, 1):
                 report("pixels replaced", done, len(names))
 

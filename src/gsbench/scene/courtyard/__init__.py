@@ -1,1 +1,1 @@
-"""The built-in scene, rendered by a small ray tracer."""
+"""The built-in scene: a courtyard, rendered by a small ray tracer."""

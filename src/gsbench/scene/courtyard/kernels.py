@@ -1,4 +1,4 @@
-"""Ray casting for the courtyard, compiled with numba; scalar and without any shared state."""
+"""Ray casting for the courtyard, compiled with numba; all functions are scalar and share no state."""
 
 from math import exp, floor, inf, sqrt
 
@@ -11,9 +11,9 @@ from gsbench.system.jit import inlined, kernel
 GROUND, SKY = -1, -2
 SUN = (-0.5130, -0.4305, 0.7426)  # unit vector towards the sun: from the south-west, 48 degrees high
 SUN_LIGHT = (2.55, 2.30, 1.90)
-SKY_LIGHT = (0.42, 0.50, 0.64)  # from above
-BOUNCE_LIGHT = (0.19, 0.18, 0.13)  # from below
-OCCLUSION_STEPS = (0.1, 0.35)  # m along the normal
+SKY_LIGHT = (0.42, 0.50, 0.64)  # ambient light from above
+BOUNCE_LIGHT = (0.19, 0.18, 0.13)  # ambient light from below
+OCCLUSION_STEPS = (0.1, 0.35)  # m along the normal, where ambient occlusion is measured
 EXPOSURE = 1.12
 SUBSAMPLES = 2  # per side of a pixel
 _EPSILON = 1e-4  # m, how far a shadow ray starts above the surface
@@ -37,7 +37,7 @@ def inverse(value):
 
 @inlined
 def enter_box(lx, ly, lz, hx, hy, hz, ox, oy, oz, ix, iy, iz):
-    """(entry, exit) of a ray with inverse direction i through the box from l to h; entry > exit where it misses."""
+    """(entry, exit) of a ray with inverse direction i through the box from l to h; entry > exit if it misses."""
     ax, bx = (lx - ox) * ix, (hx - ox) * ix
     ay, by = (ly - oy) * iy, (hy - oy) * iy
     az, bz = (lz - oz) * iz, (hz - oz) * iz
@@ -46,7 +46,7 @@ def enter_box(lx, ly, lz, hx, hy, hz, ox, oy, oz, ix, iy, iz):
 
 @inlined
 def hit_tube(outer, half, inner, ox, oy, oz, dx, dy, dz):
-    """The first distance > 0 at which a ray meets a capped cylinder, or one with a bore; inf where it misses."""
+    """The first distance > 0 at which a ray meets a capped cylinder, solid or with a bore; inf if it misses."""
     best = inf
     a = dx * dx + dy * dy
     for radius in (outer, inner):
@@ -70,7 +70,7 @@ def hit_tube(outer, half, inner, ox, oy, oz, dx, dy, dz):
 
 @inlined
 def hit_primitive(kind, size, ox, oy, oz, dx, dy, dz):
-    """The first distance > 0 along a local ray to the primitive, inf where it misses."""
+    """The first distance > 0 along a local ray to the primitive, or inf if it misses."""
     if kind == BOX:
         entry, exit_ = enter_box(
             -size[0], -size[1], -size[2], size[0], size[1], size[2], ox, oy, oz, inverse(dx), inverse(dy), inverse(dz)
@@ -87,11 +87,14 @@ def hit_primitive(kind, size, ox, oy, oz, dx, dy, dz):
 
 
 @inlined
-def cast(kind, center, rotation, size, start, low, high, ox, oy, oz, dx, dy, dz, anything):
-    """(distance, primitive) of the first hit, GROUND or SKY included; with ``anything`` the first one found will do."""
+def cast(kind, center, rotation, size, start, low, high, ox, oy, oz, dx, dy, dz, any_hit):
+    """(distance, primitive) of the nearest hit, GROUND or SKY included.
+
+    With ``any_hit``, for shadow rays, the first primitive found ends the search, and the ground is ignored.
+    """
     best, index = inf, SKY
     ix, iy, iz = inverse(dx), inverse(dy), inverse(dz)
-    if dz < -1e-9 and not anything:
+    if dz < -1e-9 and not any_hit:
         best, index = -oz / dz, GROUND
     for g in range(len(start) - 1):
         entry, exit_ = enter_box(
@@ -103,13 +106,13 @@ def cast(kind, center, rotation, size, start, low, high, ox, oy, oz, dx, dy, dz,
             x, y, z = ox - center[i, 0], oy - center[i, 1], oz - center[i, 2]
             along = x * dx + y * dy + z * dz
             if along * along < x * x + y * y + z * z - size[i, 3] * size[i, 3]:
-                continue  # passes the bounding sphere
+                continue  # misses the bounding sphere
             lx, ly, lz = to_local(rotation[i], x, y, z)
             ux, uy, uz = to_local(rotation[i], dx, dy, dz)
             t = hit_primitive(kind[i], size[i], lx, ly, lz, ux, uy, uz)
             if t < best:
                 best, index = t, i
-                if anything:
+                if any_hit:
                     return best, index
     return best, index
 
@@ -149,7 +152,7 @@ def nearest_surface(kind, center, rotation, size, start, low, high, x, y, z, lim
 
 @inlined
 def local_normal(kind, size, x, y, z):
-    """The outward normal at a local surface point, and coordinates (u, v) in m along the face."""
+    """The outward normal (3 values) at a local surface point, and coordinates (u, v) in m along the face."""
     if kind == SPHERE:
         r = size[0]
         return x / r, y / r, z / r, (x + y) * 0.8, z + 0.4 * (x - y)

@@ -26,10 +26,11 @@ _LEAF, _DEEP_LEAF, _PALE_LEAF = (0.10, 0.20, 0.045), (0.055, 0.13, 0.04), (0.17,
 
 @dataclass(frozen=True)
 class Layout:
-    """The primitives as arrays, sorted by group; a group is a box in space that rays test first.
+    """The primitives as arrays, sorted by group; rays test the bounding box of a group first.
 
-    ``size``: BOX half extents; SPHERE (radius, -, -); TUBE (outer radius, half height, inner radius or 0), axis along
-    local z; and, fourth, the radius of the bounding sphere. ``rotation`` [S, 3, 3] takes local to world directions.
+    The first three values of ``size`` are half extents of a BOX, (radius, -, -) of a SPHERE, or (outer radius, half
+    height, inner radius or 0) of a TUBE, whose axis is local z. The fourth is the radius of the bounding sphere.
+    ``rotation`` [S, 3, 3] maps local to world directions.
     """
 
     kind: NDArray[np.int64]  # [S]
@@ -45,7 +46,7 @@ class Layout:
 
 @dataclass
 class _Builder:
-    """Collects primitives in groups; positions are relative to the group's place and yaw."""
+    """Collects primitives in groups; positions are relative to the group's position and yaw."""
 
     rows: list[tuple[int, NDArray, NDArray, tuple, int, tuple]] = field(default_factory=list)
     starts: list[int] = field(default_factory=list)
@@ -94,10 +95,10 @@ class _Builder:
 
 
 def build_layout(seed: int) -> Layout:
-    """The courtyard of a seed: one plan; the seed varies the turn and shade of the small things and the shrubs."""
+    """The courtyard. The plan is fixed; the seed varies angles and tints of small objects and the shrubs."""
     rng = np.random.default_rng(seed)
     build = _Builder()
-    # near things first: a ray that has hit one skips the groups behind it
+    # Objects near the cameras come first: a ray that hits one skips the groups behind it.
     _well(build)
     _crates(build, rng)
     _bench(build, rng)
@@ -265,7 +266,7 @@ def _sundial(build: _Builder, rng: np.random.Generator) -> None:
 
 
 def _rotation(yaw: float = 0.0, tilt: float = 0.0, roll: float = 0.0) -> NDArray[np.float64]:
-    """Degrees: ``roll`` about x, then ``tilt`` about y, then ``yaw`` about z; [3, 3]."""
+    """The rotation [3, 3] by ``roll`` about x, then ``tilt`` about y, then ``yaw`` about z, in degrees."""
     a, b, c = radians(yaw), radians(tilt), radians(roll)
     about_z = np.array([[cos(a), -sin(a), 0], [sin(a), cos(a), 0], [0, 0, 1]])
     about_y = np.array([[cos(b), 0, sin(b)], [0, 1, 0], [-sin(b), 0, cos(b)]])
@@ -274,7 +275,7 @@ def _rotation(yaw: float = 0.0, tilt: float = 0.0, roll: float = 0.0) -> NDArray
 
 
 def _bounds(kind: int, center: NDArray, rotation: NDArray, size: tuple) -> tuple[NDArray, NDArray]:
-    """The axis-aligned bounds of one primitive, a little widened: (low [3], high [3])."""
+    """The axis-aligned bounds (low [3], high [3]) of one primitive, widened by 1e-6 m."""
     half = {BOX: size, SPHERE: size, TUBE: (size[0], size[0], size[1])}[kind]
     reach = np.full(3, size[0]) if kind == SPHERE else np.abs(rotation) @ np.array(half)
     return center - reach - 1e-6, center + reach + 1e-6

@@ -1,7 +1,7 @@
-"""The embedded scene: a procedural courtyard, rendered to photographs with exactly known cameras.
+"""The built-in scene: a procedural courtyard, rendered to photographs with exactly known cameras.
 
-A well, crates, a bench and pots on a large lawn of faint texture, a gravel path, stone walls and a house front: detail
-for structure from motion beside the low-texture ground on which 3DGS grows oversized Gaussians. One seed, one result.
+It has a well, crates, a bench, pots, a gravel path, stone walls and a house front, with detail for structure from
+motion, and a large lawn of faint texture, on which 3DGS grows oversized Gaussians. Equal seeds give equal images.
 """
 
 from concurrent.futures import ThreadPoolExecutor
@@ -18,7 +18,7 @@ from gsbench.scene.camera import Camera
 from gsbench.scene.courtyard.kernels import render
 from gsbench.scene.courtyard.layout import Layout, build_layout
 
-VERSION = 1  # raise when the pictures change
+VERSION = 1  # to be raised when the images change
 MAX_STEP = radians(7.5)  # between neighbouring views; wider steps gave wrong SfM models on scenes like this one
 RING_RADIUS = 4.55  # m
 FIELD_OF_VIEW = radians(56.0)  # horizontal
@@ -40,7 +40,7 @@ def render_courtyard(
     ``width`` and ``height`` are in px. The same arguments give the same bytes, whatever ``threads`` is. ``progress``
     counts views. Raises `InputError` for fewer than 3 views or images below 16 px.
     """
-    from gsbench.scene.colmap import write_model  # pycolmap is needed for writing alone
+    from gsbench.scene.colmap import write_model  # loads pycolmap, which is slow and only needed here
 
     cameras = courtyard_cameras(views, width, height)
     layout = build_layout(seed)
@@ -58,7 +58,7 @@ def render_courtyard(
 
 
 def courtyard_cameras(views: int, width: int, height: int) -> dict[str, Camera]:
-    """The cameras by file name: a wavy ring in steps of 7.5 degrees or, for more than 48 views, less."""
+    """The cameras by file name, on a wavy ring in steps of 7.5 degrees, or of less for more than 48 views."""
     if views < MIN_VIEWS:
         raise InputError(f"scene.views must be at least {MIN_VIEWS}, got {views}")
     if min(width, height) < 16:
@@ -68,7 +68,7 @@ def courtyard_cameras(views: int, width: int, height: int) -> dict[str, Camera]:
 
 
 def ring_camera(angle: float, width: int, height: int) -> Camera:
-    """The camera at an azimuth (rad); its height and distance are smooth, periodic functions of it."""
+    """The camera at an azimuth (rad); its height and distance are smooth, periodic functions of the azimuth."""
     radius = RING_RADIUS + 0.2 * cos(2 * angle)
     center = np.array([radius * cos(angle), radius * sin(angle), 1.95 + 0.40 * sin(5 * angle)])
     forward = np.array(TARGET) - center

@@ -1,7 +1,7 @@
 """Procedural solid textures of the courtyard, compiled with numba.
 
-Every pattern is a sum of noise octaves that fade out as their cells approach the footprint of a pixel on the surface,
-so a picture from afar shows no aliasing. All functions are scalar, pure and deterministic. Colours are linear RGB.
+Every pattern is a sum of noise octaves. An octave fades out as its cells approach the footprint of a pixel on the
+surface, so distant surfaces show no aliasing. All functions are scalar, pure and deterministic. Colours are linear RGB.
 """
 
 from math import floor, sqrt
@@ -43,13 +43,13 @@ def noise3(x, y, z, seed):
 
 @inlined
 def visible(cell, footprint):
-    """The weight of a detail of size ``cell`` where a pixel covers ``footprint``: 1 above two pixels, 0 below one."""
+    """The weight of a detail of size ``cell`` if a pixel covers ``footprint``: 0 up to one pixel, 1 from two pixels."""
     return min(1.0, max(0.0, cell / footprint - 1.0))
 
 
 @inlined
 def octaves2(x, y, cell, count, gain, footprint, seed):
-    """Noise octaves over the plane from cells of ``cell`` m downwards, each half as large; about [-1, 1]."""
+    """Noise octaves over the plane, about [-1, 1]; the cells of the first are ``cell`` m, each next half as large."""
     total, amplitude = 0.0, 1.0
     for k in range(count):
         weight = visible(cell, footprint)
@@ -63,7 +63,7 @@ def octaves2(x, y, cell, count, gain, footprint, seed):
 
 @inlined
 def octaves3(x, y, z, cell, count, gain, footprint, seed):
-    """Noise octaves in space from cells of ``cell`` m downwards, each half as large; about [-1, 1]."""
+    """Noise octaves in space, about [-1, 1]; the cells of the first are ``cell`` m, each next half as large."""
     total, amplitude = 0.0, 1.0
     for k in range(count):
         weight = visible(cell, footprint)
@@ -77,7 +77,7 @@ def octaves3(x, y, z, cell, count, gain, footprint, seed):
 
 @inlined
 def pebbles(x, y, cell, seed):
-    """Cellular noise: (distance to the nearest feature point, that to the cell's border, shade of the cell)."""
+    """Cellular noise: (distance to the nearest feature point, distance to the cell's border, shade of the cell)."""
     gx, gy = floor(x / cell), floor(y / cell)
     first, second, shade = 9.0, 9.0, 0.0
     for i in range(gx - 1, gx + 2):
@@ -117,7 +117,7 @@ def ground(x, y, footprint, seed):
     soil = min(7.2 - abs(x), 7.2 - abs(y)) - 1.05 + 1.3 * wobble
     edge = max(0.03, footprint)
 
-    # grass: faint by design; a lawn that a feature detector finds little in
+    # The grass is faint on purpose, so that feature detectors find little in the lawn.
     patch = octaves2(x, y, 1.9, 3, 0.55, footprint, seed + 21)
     blades = octaves2(x * 1.5, y, 0.14, 4, 0.85, 0.8 * footprint, seed + 31)
     tuft = noise2(x / 0.33, y / 0.33, seed + 41)
