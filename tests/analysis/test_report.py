@@ -240,11 +240,11 @@ def test_a_line_chart_puts_values_where_they_belong() -> None:
 def test_an_axis_has_round_ticks_within_its_range(values: tuple[float, float], log: bool) -> None:
     """Its range goes a little beyond the values; on a logarithmic one of no two decades, ends and middle are named."""
     axis = Axis(values, log, 100.0, 300.0)
-    places = [axis.place(tick) for tick in axis.ticks]
+    places = [axis.to_px(tick) for tick in axis.ticks]
     assert 2 <= len(places) <= 12
     assert places == sorted(set(places))
     assert 100 - 1e-9 <= places[0] < places[-1] <= 300 + 1e-9
-    ends = sorted(axis.place(value) for value in values)
+    ends = sorted(axis.to_px(value) for value in values)
     assert ends == pytest.approx([200, 200] if values[0] == values[1] else [100 + 200 / 27, 300 - 200 / 27])
     assert len({axis.label(tick) for tick in axis.ticks}) == len(places)
     decades = [math.log10(tick) for tick in axis.ticks] if log else []
@@ -258,7 +258,7 @@ def test_an_axis_has_round_ticks_within_its_range(values: tuple[float, float], l
 
 def test_an_axis_from_zero_begins_at_zero() -> None:
     axis = Axis([0.0, 10.0], False, 0.0, 104.0)
-    assert [axis.place(value) for value in (0, 5, 10)] == pytest.approx([0, 50, 100])
+    assert [axis.to_px(value) for value in (0, 5, 10)] == pytest.approx([0, 50, 100])
 
 
 @pytest.mark.parametrize(

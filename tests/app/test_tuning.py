@@ -16,7 +16,7 @@ from gsbench import cli
 from gsbench.analysis.cells import with_variants
 from gsbench.analysis.fairness import fairness_table
 from gsbench.analysis.report.build import build_report
-from gsbench.analysis.report.sections import search_part
+from gsbench.analysis.report.sections import search_summary
 from gsbench.analysis.results import load_experiment
 from gsbench.analysis.tables import build_table
 from gsbench.app.tuning import TuneSettings
@@ -258,7 +258,7 @@ def test_an_interval_searches_one_arm(runs: Path, monkeypatch: pytest.MonkeyPatc
     searched = ["densify.volume_threshold=tag(log, interval(1e-3, 1e-1))", "hydra.sweeper.tune.points=3"]
     assert cli.run([*words, *searched]) == 0
     assert fake.batches == [2, 1, 2]
-    part = search_part(runs / "fair-tune-random-volumetric")
+    part = search_summary(runs / "fair-tune-random-volumetric")
     assert part is not None
     assert "no test view was looked at" in part[0]
     assert "<svg" in part[1]

@@ -24,7 +24,7 @@ from typing import Any
 from gsbench.analysis.cells import to_frame
 from gsbench.analysis.explain import explain_cell
 from gsbench.analysis.fairness import tuning_lines
-from gsbench.analysis.report.sections import event_charts, search_part, training_charts, volume_charts
+from gsbench.analysis.report.sections import event_charts, search_summary, training_charts, volume_charts
 from gsbench.analysis.results import load_experiment, read_views
 from gsbench.analysis.table_formats import to_html_page
 from gsbench.analysis.tables import build_table
@@ -236,7 +236,7 @@ def look(runs: Path, places: dict[str, Path]) -> int:
     attempt(lambda: read_plan(home))
     attempt(lambda: FinishedTrials(runs).estimate(values_of(runs, "adc", 0, 0.03)))
     attempt(lambda: read_declarations(home))
-    attempt(lambda: search_part(home))
+    attempt(lambda: search_summary(home))
     for folder in {path.parent for path in places.values()} - {home}:
         attempt(lambda folder=folder: TrialFolder(folder).configuration())  # type: ignore[misc]
         attempt(lambda folder=folder: TrialFolder(folder).stage_and_step())  # type: ignore[misc]

@@ -14,7 +14,7 @@ from gsbench.analysis.differences import (
     differing_settings,
 )
 from gsbench.analysis.quantities import Quantity, metric_keys
-from gsbench.analysis.results import Experiment, TrialResult, by_key
+from gsbench.analysis.results import Experiment, TrialResult, group_by
 from gsbench.errors import InputError
 from gsbench.runs.keys import NOT_HASHED
 
@@ -89,7 +89,7 @@ def check_averageable(trials: Sequence[TrialResult], where: str) -> None:
     """Raise ``InputError`` that names the differing keys, unless each scene's trials repeat one configuration."""
     if code := differing_code(trials):
         raise _code_refusal(where, code, trials[0].experiment)
-    by_scene = by_key(trials, lambda trial: trial.scene)
+    by_scene = group_by(trials, lambda trial: trial.scene)
     for scene, group in by_scene.items():
         keys = differing_conditions(group) or differing_settings(group)
         if keys:
@@ -108,7 +108,7 @@ def check_averageable(trials: Sequence[TrialResult], where: str) -> None:
 
 def swept_settings(trials: Iterable[TrialResult]) -> list[str]:
     """The settings in which trials of one scene, initialiser and densifier differ, without `IGNORED_SETTINGS`."""
-    groups = by_key(trials, lambda trial: (trial.scene, trial.init, trial.densify)).values()
+    groups = group_by(trials, lambda trial: (trial.scene, trial.init, trial.densify)).values()
     return sorted({key for group in groups for key in differing_settings(group)})
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from gsbench.analysis.configurations import canonical, departures
-from gsbench.analysis.results import Arm, TrialResult, by_key, seeds_words
+from gsbench.analysis.results import Arm, TrialResult, group_by, seeds_words
 from gsbench.runs.code import SHOWN
 from gsbench.words import counted, listed
 
@@ -127,7 +127,7 @@ def short_version(version: str) -> str:
 
 def _scenes_and_seeds(trials: Sequence[TrialResult]) -> str:
     """``garden seeds 0, 1; room seed 0``"""
-    by_scene = sorted(by_key(trials, lambda trial: trial.scene).items())
+    by_scene = sorted(group_by(trials, lambda trial: trial.scene).items())
     return "; ".join(f"{scene} {seeds_words(own)}" for scene, own in by_scene)
 
 
@@ -210,7 +210,7 @@ def representatives(trials: Iterable[TrialResult], first: Arm, second: Arm) -> t
 
     Raises ValueError for an arm without trials.
     """
-    by_arm = by_key(trials, lambda trial: trial.arm)
+    by_arm = group_by(trials, lambda trial: trial.arm)
     if missing := [arm for arm in (first, second) if arm not in by_arm]:
         raise ValueError(f"no trial of {missing[0]}")
     pairs = itertools.product(by_arm[first], by_arm[second])

@@ -19,8 +19,8 @@ from gsbench.analysis.differences import (
 )
 from gsbench.analysis.pairing import pair_trials
 from gsbench.analysis.quantities import COSTS, relative_change
-from gsbench.analysis.results import Arm, TrialResult, by_key, read_experiment
-from gsbench.analysis.table_formats import Column, Entry, Row, Table
+from gsbench.analysis.results import Arm, TrialResult, group_by, read_experiment
+from gsbench.analysis.table_formats import Column, Row, Table, TableEntry
 from gsbench.records import read_if_sound
 from gsbench.runs.experiments import Point, TuningRecord
 from gsbench.runs.layout import TUNING
@@ -84,7 +84,7 @@ def fairness_table(trials: Sequence[TrialResult], first: Arm, second: Arm) -> Ta
 def _row(what: str, values: Sequence[str], rule_above: bool = False) -> Row:
     """A row with the values of both arms, and whether they differ."""
     differs = ALIKE if values[0] == values[1] else UNLIKE
-    return Row((what,), tuple(map(Entry, [*values, differs])), rule_above)
+    return Row((what,), tuple(map(TableEntry, [*values, differs])), rule_above)
 
 
 def _shown(value: Any) -> str:
@@ -242,7 +242,7 @@ def _varied_settings(trials: Sequence[TrialResult], own: TrialResult) -> list[st
     """Name the settings that were varied among the experiment's arms with one initialiser and densifier class."""
     target = own.config.get("densify._target_")
     same_class = [t for t in trials if t.init == own.init and t.config and t.config.get("densify._target_") == target]
-    choices = [group[0] for group in by_key(same_class, lambda trial: trial.arm).values()]
+    choices = [group[0] for group in group_by(same_class, lambda trial: trial.arm).values()]
     keys = sorted({key for other in choices for key in differing_keys(own.config, other.config)})
     if len(choices) < 2 or not keys:
         return []

@@ -12,7 +12,7 @@ import numpy as np
 
 from gsbench.analysis.pairing import Pairs, TrialPair, find_pairs
 from gsbench.analysis.quantities import Quantity, asked_quantity
-from gsbench.analysis.results import TrialResult, by_key
+from gsbench.analysis.results import TrialResult, group_by
 from gsbench.analysis.statistics import (
     TOO_SMALL,
     UNDECIDED,
@@ -132,7 +132,7 @@ def judge(trials: Sequence[TrialResult], declaration: Declaration) -> list[Verdi
     first look that decides it; otherwise Holm's method adjusts them as one family. Secondary questions have an error
     rate of their own.
     """
-    by_arm, by_folder = by_key(trials, lambda trial: trial.arm), by_key(trials, lambda trial: trial.key)
+    by_arm, by_folder = group_by(trials, lambda trial: trial.arm), group_by(trials, lambda trial: trial.key)
 
     def trials_of(question: Question) -> list[TrialResult]:
         # Grouped once above: searching all trials for each of many questions is slow.

@@ -7,7 +7,7 @@ from gsbench.analysis.cells import with_variants
 from gsbench.analysis.declaration import active_declaration
 from gsbench.analysis.fairness import caveats
 from gsbench.analysis.pairing import choose_pairs, controls_of
-from gsbench.analysis.results import Arm, Experiment, TrialResult, by_key, seeds_words
+from gsbench.analysis.results import Arm, Experiment, TrialResult, group_by, seeds_words
 from gsbench.runs.code import SHOWN
 from gsbench.runs.layout import TUNING
 from gsbench.runs.trial_record import FROM_MODEL, FROM_RENDERS
@@ -62,7 +62,7 @@ def comparison_notes(experiment: Experiment) -> list[str]:
         from gsbench.analysis.verdicts import declared_lines, judge_pairs  # here, since SciPy is slow to import
 
         notes = declared_lines(declared, judge_pairs(trials, pairs, declared))
-    by_arm = by_key(trials, lambda trial: trial.arm)
+    by_arm = group_by(trials, lambda trial: trial.arm)
     for first, second in pairs:
         if _are_equal(by_arm[first], by_arm[second]):
             names = f"{second} and {first}"
@@ -109,9 +109,9 @@ def machine_notes(trials: Sequence[TrialResult]) -> list[str]:
 def cloud_notes(trials: Sequence[TrialResult]) -> list[str]:
     """A line for each scene and initialiser whose trials have the same settings but started from several clouds."""
     notes = []
-    groups = by_key(trials, lambda trial: (trial.scene, trial.init, trial.record.hashes.get("init")))
+    groups = group_by(trials, lambda trial: (trial.scene, trial.init, trial.record.hashes.get("init")))
     for (scene, init, _), group in groups.items():
-        clouds = by_key([trial for trial in group if trial.cloud], lambda trial: trial.cloud)
+        clouds = group_by([trial for trial in group if trial.cloud], lambda trial: trial.cloud)
         if len(clouds) > 1:
             listed = "; ".join(f"{cloud[:SHOWN]}: {_arms(own)}" for cloud, own in clouds.items())
             notes.append(f"{scene}: trials of init {init} started from {len(clouds)} different clouds ({listed}).")
@@ -122,7 +122,7 @@ def held_out_notes(trials: Sequence[TrialResult]) -> list[str]:
     """A line for each way in which views were held out; it names the scenes if there are several ways and scenes."""
     notes = []
     recorded = [trial for trial in trials if trial.record.held_out]
-    splits = by_key(recorded, lambda trial: (trial.question, trial.record.held_out))
+    splits = group_by(recorded, lambda trial: (trial.question, trial.record.held_out))
     for (question, words), group in sorted(splits.items(), key=lambda item: (-len(item[1]), item[0])):
         scenes = sorted({trial.scene for trial in group})
         counts = sorted({(trial.record.test_views or 0, trial.record.train_views or 0) for trial in group})
@@ -152,5 +152,5 @@ def _points_from(trial: TrialResult) -> str:
 
 def _arms(trials: Sequence[TrialResult]) -> str:
     """``adc seeds 0, 1; volumetric seed 0``"""
-    groups = by_key(trials, lambda trial: trial.densify)
+    groups = group_by(trials, lambda trial: trial.densify)
     return "; ".join(f"{densify} {seeds_words(own)}" for densify, own in groups.items())

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from gsbench.analysis.cells import check_averageable
 from gsbench.analysis.differences import differing_conditions
 from gsbench.analysis.quantities import asked_quantity, value_of
-from gsbench.analysis.results import TrialResult, by_key
+from gsbench.analysis.results import TrialResult, group_by
 from gsbench.errors import InputError
 from gsbench.runs.declaration import Arm, Question
 from gsbench.words import counted, some_of
@@ -126,13 +126,13 @@ def find_pairs(trials: Sequence[TrialResult], question: Question) -> Pairs:
 def _sides(trials: Sequence[TrialResult], question: Question) -> dict[str, tuple[list[TrialResult], list[TrialResult]]]:
     """The trials of the baseline and of the arm, by scene."""
     if question.scenes:
-        by_folder = by_key(trials, lambda trial: trial.key)
+        by_folder = group_by(trials, lambda trial: trial.key)
         return {
             scene: (by_folder.get(one, []), by_folder.get(other, [])) for scene, (one, other) in question.scenes.items()
         }
     return {
         scene: ([t for t in own if t.arm == question.baseline], [t for t in own if t.arm == question.arm])
-        for scene, own in by_key(trials, lambda trial: trial.scene).items()
+        for scene, own in group_by(trials, lambda trial: trial.scene).items()
     }
 
 
@@ -223,7 +223,7 @@ def choose_pairs(
 
 def controls_of(trials: Sequence[TrialResult]) -> dict[str, str]:
     """The control of each densifier, another densifier that the trials' settings name (``eval.controls``)."""
-    firsts = [group[0] for group in by_key(trials, lambda trial: trial.arm).values()]
+    firsts = [group[0] for group in group_by(trials, lambda trial: trial.arm).values()]
     return {
         key.removeprefix(CONTROLS): str(value)
         for trial in firsts

@@ -1,4 +1,4 @@
-"""Printed numbers of papers as data, the paper's Tables 1 and 2 from one's own trials, and how far both lie apart."""
+"""Printed numbers of papers, Tables 1 and 2 of the method's paper from measured trials, and the differences."""
 
 import math
 from collections import Counter
@@ -12,14 +12,14 @@ import yaml
 
 from gsbench.analysis.cells import Cell, check_averageable, make_cell
 from gsbench.analysis.quantities import Quantity, choose_quantities, quantity
-from gsbench.analysis.results import Arm, Experiment, TrialResult, by_key
-from gsbench.analysis.table_formats import Column, Entry, Row, Table
+from gsbench.analysis.results import Arm, Experiment, TrialResult, group_by
+from gsbench.analysis.table_formats import Column, Row, Table, TableEntry
 from gsbench.analysis.tables import build_table
 from gsbench.errors import InputError
 from gsbench.words import closest, signed
 
-OWN = "_own"  # ends the name of the same table with poses and gauge of each initialiser's own
-STAND_FOR = {"dim_paper": "dim"}  # initialisers that are one of the paper's arms under another name
+OWN = "_own"  # suffix of an experiment that repeats a table with each initialiser's own poses and gauge
+STAND_FOR = {"dim_paper": "dim"}  # our initialiser -> the paper's initialiser that it repeats
 CONFIDENCE = 0.95
 PAPER_TABLES = ("table1", "table2")
 QUANTITIES = {
@@ -30,16 +30,16 @@ ARMS = {
     "table1": (("dim", "adc"), ("dim", "volumetric")),
     "table2": (("sfm", "adc"), ("dim", "adc"), ("sfm", "volumetric"), ("dim", "volumetric")),
 }
-NAMES = {"adc": "3DGS", "volumetric": "Ours", "sfm": "SfM", "dim": "DIM"}
-ROUNDING, INTERVAL, DIFFERS = "=", "≈", "≠"  # how a measured cell agrees with the printed number
+PRINTED_NAMES = {"adc": "3DGS", "volumetric": "Ours", "sfm": "SfM", "dim": "DIM"}
+ROUNDING, INTERVAL, DIFFERS = "=", "≈", "≠"  # marks of measured cells beside printed numbers (`agreement`)
 
 Key = tuple[str, str, str, str]  # scene, init, densify, quantity
-Find = Callable[[str, Arm, str], "Printed | None"]  # the printed number of a scene, an arm and a quantity
+FindPrinted = Callable[[str, Arm, str], "PrintedNumber | None"]  # by scene, arm and quantity
 
 
 @dataclass(frozen=True)
-class Printed:
-    """A printed number; it stands for anything within half a step of its last digit."""
+class PrintedNumber:
+    """A printed number; it stands for the ``range`` of values within half a unit of its last digit."""
 
     text: str
 
@@ -53,46 +53,46 @@ class Printed:
 
     @property
     def range(self) -> tuple[float, float]:
-        half_step = 0.5 * 10.0**-self.decimals
-        return self.value - half_step, self.value + half_step
+        half_unit = 0.5 * 10.0**-self.decimals
+        return self.value - half_unit, self.value + half_unit
 
 
 @dataclass(frozen=True)
 class Paper:
-    """The paper of the method: its ``tables`` by name, what it contradicts of itself (a sentence each), and its words
-    on settings beside the method.
+    """The paper of the method: its ``tables`` by name, where it contradicts itself (one sentence each), and what it
+    says on settings (``setup``, by topic).
     """
 
-    tables: Mapping[str, Mapping[Key, Printed]]
+    tables: Mapping[str, Mapping[Key, PrintedNumber]]
     contradictions: tuple[str, ...]
     setup: Mapping[str, str]
 
     def scenes(self, name: str) -> list[str]:
-        """The scenes of a table in the printed order."""
+        """The scenes of the table ``name`` in the printed order."""
         return list(dict.fromkeys(key[0] for key in self.tables[name]))
 
 
 @dataclass(frozen=True)
 class Published:
-    """Another paper's numbers; ``printed`` maps (scene, quantity) to what its method has there."""
+    """Another paper's numbers; ``printed`` maps (scene, quantity) to the number of its method."""
 
     name: str
     title: str
     source: str  # where the numbers were read
-    conventions: str  # under which they were measured, as far as the source says
-    densify: str  # the densifier of ours that is the paper's method
+    conventions: str  # of the measurement, as far as the source states them
+    densify: str  # gsbench's densifier of the paper's method
     quantities: tuple[str, ...]
-    printed: Mapping[tuple[str, str], Printed]
+    printed: Mapping[tuple[str, str], PrintedNumber]
     setup: Mapping[str, str]
 
 
 @cache
 def load_paper() -> Paper:
-    """The paper's tables from the file that ships with the package."""
+    """The method's paper, from the file that ships with gsbench."""
     content = _read("paper.yaml")
     tables = {
         name: {
-            (scene, *arm, key): Printed(text)
+            (scene, *arm, key): PrintedNumber(text)
             for scene, rows in content[name]["scenes"].items()
             for key, texts in zip(QUANTITIES[name], rows, strict=True)
             for arm, text in zip(ARMS[name], texts, strict=True)
@@ -103,21 +103,21 @@ def load_paper() -> Paper:
 
 
 def published_names() -> list[str]:
-    """The papers whose numbers ship with gsbench, beside the paper of the method."""
+    """The names of the other papers whose numbers ship with gsbench."""
     folder = files("gsbench.analysis").joinpath("published")
-    return sorted(entry.name.removesuffix(".yaml") for entry in folder.iterdir() if entry.name.endswith(".yaml"))
+    return sorted(file.name.removesuffix(".yaml") for file in folder.iterdir() if file.name.endswith(".yaml"))
 
 
 @cache
 def load_published(name: str) -> Published:
-    """The numbers of the paper ``name``; raises InputError that lists the papers there are."""
-    known = published_names()
-    if name not in known:
-        raise InputError(f"no published numbers {name!r}{closest(name, known)} (there are: {', '.join(known)})")
+    """The numbers of the paper ``name``; for an unknown name raises InputError that lists the known ones."""
+    names = published_names()
+    if name not in names:
+        raise InputError(f"no published numbers {name!r}{closest(name, names)} (there are: {', '.join(names)})")
     content = _read(f"published/{name}.yaml")
     quantities = tuple(content["quantities"])
     printed = {
-        (scene, key): Printed(text)
+        (scene, key): PrintedNumber(text)
         for scene, texts in content["scenes"].items()
         for key, text in zip(quantities, texts, strict=True)
     }
@@ -130,7 +130,7 @@ def _read(name: str) -> Any:
 
 
 def layout_of(name: str) -> str | None:
-    """The paper's table that the experiment ``name`` repeats, by its name: ``table1`` for ``table1_own``, too."""
+    """The paper's table that the experiment ``name`` repeats, or None: ``table1`` for ``table1`` and ``table1_own``."""
     table = name.removesuffix(OWN)
     return table if table in PAPER_TABLES else None
 
@@ -138,14 +138,14 @@ def layout_of(name: str) -> str | None:
 def paper_tables(
     experiment: Experiment, name: str, trials: Sequence[TrialResult] | None = None, metrics: Sequence[str] | None = None
 ) -> list[Table]:
-    """The measured table in the paper's layout and the table of differences from the printed numbers.
+    """The measured table in the paper's layout, and the table of differences from the printed numbers.
 
-    Where DIM was not run and one other initialiser was, that one stands in for it in Table 1.
+    ``name`` is ``table1`` or ``table2``. If only one initialiser was run and it is not DIM, it replaces DIM in Table 1.
     """
     paper, arms = load_paper(), ARMS[name]
     trials = list(experiment.trials if trials is None else trials)
     inits = {trial.init for trial in trials}
-    run_as = {of_paper: _run_as(of_paper, inits) for of_paper, _ in arms}
+    run_as = {of_paper: _run_as(of_paper, inits) for of_paper, _ in arms}  # the paper's initialiser -> ours
     notes = []
     if name == "table1" and run_as["dim"] not in inits and len(inits) == 1:
         (run_as["dim"],) = inits
@@ -170,31 +170,32 @@ def paper_tables(
         metrics=metrics,
         title=f"{title}, measured (experiment {experiment.name})",
         order=([(scene,) for scene in scenes], [arm[-len(columns) :] for arm in shown]),
-        names=NAMES | {own: NAMES[of_paper] for of_paper, own in run_as.items() if own in STAND_FOR},
+        names=PRINTED_NAMES | {own: PRINTED_NAMES[of_paper] for of_paper, own in run_as.items() if own in STAND_FOR},
     )
-    of_paper = {own: init for init, own in run_as.items()}
+    papers_init = {own: init for init, own in run_as.items()}
     keys = [one.key for one in choose_quantities(trials, metrics)]
     compared = [key for key in keys if key in QUANTITIES[name]]
     if left_out := [key for key in keys if key not in compared]:
         notes.append(f"Not compared, since the paper prints no such number: {', '.join(left_out)}.")
 
-    def find(scene: str, arm: Arm, key: str) -> Printed | None:
-        return paper.tables[name].get((scene, of_paper[arm.init], arm.densify, key))
+    def find(scene: str, arm: Arm, key: str) -> PrintedNumber | None:
+        return paper.tables[name].get((scene, papers_init[arm.init], arm.densify, key))
 
     title = f"{title}, difference from the printed values"
     return [measured, _differences(title, "paper", trials, scenes, compared, find, notes, paper.setup)]
 
 
 def _run_as(init: str, inits: set[str]) -> str:
-    """The initialiser that stands for the paper's ``init``: itself, unless only another of that kind was run."""
-    others = [other for other in sorted(inits) if init not in inits and STAND_FOR.get(other) == init]
-    return others[0] if others else init
+    """Our initialiser for the paper's ``init``: the one of this name, or if it was not run, one that repeats it."""
+    if init in inits:
+        return init
+    return next((own for own in sorted(inits) if STAND_FOR.get(own) == init), init)
 
 
 def published_table(trials: Sequence[TrialResult], name: str) -> Table:
-    """Table of our arms on the paper's scenes beside the printed numbers, with the differences.
+    """The measured arms on the scenes of the paper ``name``, its printed numbers, and the differences.
 
-    Raises InputError where no trial is of a scene of the paper, or where a cell would mix what may not be averaged.
+    Raises InputError if no trial is of a scene of the paper, or if a cell would average unlike trials.
     """
     paper = load_published(name)
     scenes = list(dict.fromkeys(scene for scene, _ in paper.printed))
@@ -204,7 +205,7 @@ def published_table(trials: Sequence[TrialResult], name: str) -> Table:
     method = f"The printed numbers are of densify={paper.densify}; other arms are shown for orientation."
     notes = [f"{paper.title}.", f"Read from {paper.source}.", f"Conventions: {paper.conventions}.", method]
 
-    def find(scene: str, arm: Arm, key: str) -> Printed | None:
+    def find(scene: str, arm: Arm, key: str) -> PrintedNumber | None:
         return paper.printed.get((scene, key))
 
     return _differences(f"Difference from {name}", name, own, scenes, paper.quantities, find, notes, paper.setup)
@@ -216,27 +217,27 @@ def _differences(
     trials: Sequence[TrialResult],
     scenes: Sequence[str],
     keys: Sequence[str],
-    find: Find,
+    find: FindPrinted,
     notes: Sequence[str],
     setup: Mapping[str, str],
 ) -> Table:
-    """A scene and an arm a row: what the ``paper`` printed, and how far the mean of the trials is from it."""
+    """A table with a row per scene and arm: what the ``paper`` printed, and the measured minus the printed value."""
     shown = [quantity(key, trials) for key in keys]
     expected = len({trial.seed for trial in trials})
     marks: Counter[str] = Counter()
     rows = []
     ordered = sorted(trials, key=lambda trial: scenes.index(trial.scene))
-    for (scene, arm), group in by_key(ordered, lambda trial: (trial.scene, trial.arm)).items():
+    for (scene, arm), group in group_by(ordered, lambda trial: (trial.scene, trial.arm)).items():
         check_averageable(group, f"scene={scene} init={arm.init} densify={arm.densify}")
-        entries: list[Entry] = []
+        entries: list[TableEntry] = []
         for one in shown:
             cell, printed = make_cell(group, one, [scene], expected), find(scene, arm, one.key)
-            entries += [Entry(printed.text if printed else ""), _difference(cell, printed, one, marks)]
+            entries += [TableEntry(printed.text if printed else ""), _difference(cell, printed, one, marks)]
         rows.append(Row((scene, arm.init, str(replace(arm, init=""))), tuple(entries)))
     columns = [
         Column(one.name, *heads) for one in shown for heads in ((paper, (one.key, paper)), ("Δ", (one.key, "delta")))
     ]
-    said = [f"The paper on {topic}: it {words}." for topic, words in setup.items()]
+    setup_notes = [f"The paper on {topic}: it {words}." for topic, words in setup.items()]
     legend = (
         f"Δ is measured minus printed. Of {marks.total()} cells {marks[ROUNDING]} are within rounding ({ROUNDING}), "
         f"{marks[INTERVAL]} within our {CONFIDENCE:.0%} t interval of the mean ({INTERVAL}), {marks[DIFFERS]} differ "
@@ -244,24 +245,24 @@ def _differences(
         "single trial has no interval."
     )
     headings = ("scene", "init", "densify")
-    return Table(title, headings, tuple(columns), tuple(rows), (legend, *notes, *said))
+    return Table(title, headings, tuple(columns), tuple(rows), (legend, *notes, *setup_notes))
 
 
-def _difference(cell: Cell, printed: Printed | None, shown: Quantity, marks: Counter[str]) -> Entry:
-    """How far a cell is from the printed number; its mark is counted."""
+def _difference(cell: Cell, printed: PrintedNumber | None, shown: Quantity, marks: Counter[str]) -> TableEntry:
+    """The measured minus the printed value with its mark; the mark is counted in ``marks``."""
     if printed is None or cell.mean is None:
-        return Entry("—")
+        return TableEntry("—")
     mark = agreement(cell, printed)
     marks[mark] += 1
     decimals = max(shown.decimals, printed.decimals)
-    return Entry(f"{signed(cell.mean - printed.value, f'.{decimals}f')} {mark}", cell=cell)
+    return TableEntry(f"{signed(cell.mean - printed.value, f'.{decimals}f')} {mark}", cell=cell)
 
 
-def agreement(cell: Cell, printed: Printed) -> str:
-    """The mark of a measured cell beside a printed number: its mean lies within half a step of the last digit, its
-    interval meets what the number stands for, or neither. A single trial has no interval.
+def agreement(cell: Cell, printed: PrintedNumber) -> str:
+    """The mark of a measured cell: ``=`` if its mean is in the printed number's range, ``≈`` if its interval overlaps
+    the range, else ``≠``. A single trial has no interval.
     """
-    from gsbench.analysis.statistics import StudentT  # here, for a quick start of what needs no interval
+    from gsbench.analysis.statistics import StudentT  # here, since SciPy is slow to import
 
     assert cell.mean is not None
     low, high = printed.range

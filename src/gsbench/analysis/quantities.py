@@ -1,7 +1,7 @@
 """Quantities of a trial: metrics, counts and costs, with their names, directions and formats.
 
-Tables show counts and times in a unit that suits the trials; a question asks about them in their own unit, since only
-their ratios mean something.
+Tables show counts and times in a unit that suits the trials (`quantity`). Questions compare them in their own unit
+(`asked_quantity`).
 """
 
 from collections.abc import Callable, Container, Iterable, Sequence
@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from statistics import fmean
 
-from gsbench.analysis.results import TrialResult, by_key
+from gsbench.analysis.results import TrialResult, group_by
 from gsbench.errors import InputError
 from gsbench.eval.facts import LPIPS, find, from_record, known_keys
 from gsbench.eval.protocol import PAPER, protocol_of
@@ -22,11 +22,11 @@ Reader = Callable[[TrialResult], float | None]
 
 @dataclass(frozen=True)
 class Quantity:
-    """One number of a trial.
+    """A number that every trial may have.
 
-    ``direction`` is +1 where more is better, -1 where less is and 0 where that is not known; a ``cost`` is never set in
-    bold, since fewer Gaussians or seconds are no aim in themselves. ``worthwhile`` is the smallest difference worth
-    resolving, in the quantity's own unit.
+    ``direction`` is +1 if more is better, -1 if less is better, 0 if that is not known. A ``cost`` is never printed in
+    bold: fewer Gaussians or seconds are no aim in themselves. ``worthwhile`` is the smallest difference worth
+    resolving, in the quantity's unit.
     """
 
     key: str
@@ -46,17 +46,17 @@ class Quantity:
 
 
 def total_seconds(trial: TrialResult) -> float | None:
-    """The seconds of all stages; None for what another program made."""
+    """The seconds of all stages; None if the training was outside gsbench."""
     return None if trial.made_elsewhere else sum(trial.record.seconds.values())
 
 
 def _textured(trial: TrialResult) -> float:
-    from gsbench.analysis.images import textured_error  # here, since only claims about it read pictures
+    from gsbench.analysis.images import textured_error  # here, since only claims about this error read pictures
 
     return textured_error(trial)
 
 
-COSTS: dict[str, tuple[str, Reader]] = {  # name, and the value in its own unit
+COSTS: dict[str, tuple[str, Reader]] = {  # name, and value in its own unit (one, s or MB)
     "gaussians": ("Gaussians", lambda trial: trial.record.num_gaussians),
     "train_time": ("training time", lambda trial: trial.record.seconds.get("train")),
     "init_points": ("initial points", lambda trial: trial.record.num_init_points),
@@ -64,6 +64,7 @@ COSTS: dict[str, tuple[str, Reader]] = {  # name, and the value in its own unit
     "peak_memory_mb": ("peak memory", lambda trial: trial.record.peak_memory_mb),
 }
 COUNTS = ("gaussians", "init_points")
+# (cost, symbol, scale, decimals) of the names that fix a unit.
 FIXED_UNITS = {"gaussians_millions": ("gaussians", "M", MILLION, 2), "train_minutes": ("train_time", "min", MINUTE, 1)}
 ALIASES = {"num_gaussians": "gaussians", "seconds": "train_time", "train": "train_time"}
 TEXTURED = Quantity("error_textured", "error in textured parts (levels)", -1, 2, _textured)
@@ -72,7 +73,7 @@ AT = "@"  # psnr@7000 is the PSNR at iteration 7000 (eval.at)
 
 @dataclass(frozen=True)
 class Change:
-    """The relative change of a cost over so many ``scenes``: as a ratio of totals, and as the mean of their ratios."""
+    """The relative change of a cost over ``scenes`` scenes: as a ratio of totals, and as the mean of scenes' ratios."""
 
     of_totals: float
     of_scenes: float
@@ -86,7 +87,7 @@ class Change:
 
 
 def relative_change(baseline: Iterable[TrialResult], other: Iterable[TrialResult], read: Reader) -> Change | None:
-    """The change of a cost over the scenes on which both have a value above 0; None without one."""
+    """The change of a cost over the scenes on which both arms have a value above 0; None without such a scene."""
     one, two = (_means(own, read) for own in (baseline, other))
     scenes = sorted(one.keys() & two.keys())
     if not scenes:
@@ -97,12 +98,12 @@ def relative_change(baseline: Iterable[TrialResult], other: Iterable[TrialResult
 
 def _means(trials: Iterable[TrialResult], read: Reader) -> dict[str, float]:
     """The mean of a cost by scene."""
-    known = by_key([trial for trial in trials if read(trial)], lambda trial: trial.scene)
-    return {scene: fmean(read(trial) or 0.0 for trial in own) for scene, own in known.items()}
+    with_value = group_by([trial for trial in trials if read(trial)], lambda trial: trial.scene)
+    return {scene: fmean(read(trial) or 0.0 for trial in own) for scene, own in with_value.items()}
 
 
 def choose_quantities(trials: Iterable[TrialResult], names: Iterable[str] | None = None) -> list[Quantity]:
-    """The quantities by name; by default all metrics that some trial has, LPIPS as it was asked for, and main costs."""
+    """The named quantities; by default all metrics of any trial, the LPIPS that was asked for, and the main costs."""
     trials = list(trials)
     if names is None:
         wanted = {key for trial in trials for key in _lpips_asked_for(trial)}
@@ -111,16 +112,16 @@ def choose_quantities(trials: Iterable[TrialResult], names: Iterable[str] | None
 
 
 def quantity(name: str, trials: Iterable[TrialResult]) -> Quantity:
-    """The quantity ``name`` (a metric, a cost or an alias); raises ``InputError``.
+    """The quantity ``name`` (a metric, a cost or an alias) for tables; raises ``InputError`` for an unknown name.
 
-    Counts and times come in a unit that suits the trials, those named by their unit always in that one.
+    Counts and times have a unit that suits the trials, unless the name fixes the unit (`FIXED_UNITS`).
     """
     trials = list(trials)
     key = ALIASES.get(name, name)
     metric, _, step = key.partition(AT)
     if metric == "lpips":
         metric = _protocol_lpips(trials[0]) if trials else f"{LPIPS}{PAPER.lpips}"
-    if find(metric) is not None or any(metric in trial.metrics for trial in trials):  # the latter: a user's own
+    if find(metric) is not None or any(metric in trial.metrics for trial in trials):  # gsbench's metric or a user's
         return _metric(metric, step, trials)
     if key in FIXED_UNITS:
         cost, symbol, scale, decimals = FIXED_UNITS[key]
@@ -137,9 +138,9 @@ def quantity(name: str, trials: Iterable[TrialResult]) -> Quantity:
 
 
 def asked_quantity(key: str, trials: Iterable[TrialResult] = ()) -> Quantity:
-    """The number that a question about ``key`` compares: a metric at the end of trials, or a cost in its own unit.
+    """The number that a question about ``key`` compares: a metric at the end of training, or a cost in its own unit.
 
-    Of a user's own metric that no trial has, nothing but the key is known.
+    If ``key`` is a user's metric that no trial has, the quantity has default facts.
     """
     if key == TEXTURED.key:
         return TEXTURED
@@ -150,12 +151,12 @@ def asked_quantity(key: str, trials: Iterable[TrialResult] = ()) -> Quantity:
 
 
 def askable_names() -> tuple[str, ...]:
-    """The names that the ``metric`` of a question may have, apart from a user's own."""
+    """The names that the ``metric`` of a question may have, without a user's own metrics."""
     return (*known_keys(), TEXTURED.key, *COSTS)
 
 
 def value_of(asked: Quantity, trial: TrialResult) -> float:
-    """The trial's value; raises InputError that says why there is none."""
+    """The trial's value; raises InputError that says why it is missing."""
     value = asked.read(trial)
     if value is None:
         raise InputError(trial.unavailable.get(asked.key, f"{trial.label} has no {asked.name}"))
@@ -163,22 +164,22 @@ def value_of(asked: Quantity, trial: TrialResult) -> float:
 
 
 def metric_keys(trials: Iterable[TrialResult], wanted: Container[str] = ()) -> list[str]:
-    """The metrics that some trial has or that are ``wanted``, in the order of tables; a user's own come last."""
+    """The metrics of any trial and those ``wanted``, in the order of tables; a user's own come last."""
     present = {key for trial in trials for key in trial.metrics}
     own = sorted(key for key in present if find(key) is None)
     return [key for key in known_keys() if key in present or key in wanted] + own
 
 
 def _metric(key: str, step: str, trials: Sequence[TrialResult]) -> Quantity:
-    """A metric at the end, or after the iteration ``step`` (text); a user's own is described by the trials' files."""
+    """A metric at the end, or at iteration ``step`` unless it is "". Trials record the facts of a user's metric."""
     records = [trial.record.metric_facts.get(key) for trial in trials if key in trial.metrics]
     facts = find(key) or from_record(key, records[0] if records else None)
     name, read = facts.name, partial(_final_value, key)
     if step:
-        known = sorted({int(at) for trial in trials for at in trial.record.metrics_at})
-        if step not in map(str, known):
-            there = ", ".join(map(str, known)) or "none"
-            raise InputError(f"no trial was measured at iteration {step!r}; measured were (eval.at) {there}")
+        measured = sorted({int(at) for trial in trials for at in trial.record.metrics_at})
+        if step not in map(str, measured):
+            steps = ", ".join(map(str, measured)) or "none"
+            raise InputError(f"no trial was measured at iteration {step!r}; measured were (eval.at) {steps}")
         name, read = f"{facts.label} at {int(step):,}", partial(_value_at, key, step)
     return Quantity(
         f"{key}{AT}{step}" if step else key, name, facts.direction, facts.decimals, read, worthwhile=facts.worthwhile
@@ -195,20 +196,20 @@ def _value_at(key: str, step: str, trial: TrialResult) -> float | None:
 
 
 def _protocol_lpips(trial: TrialResult) -> str:
-    """Key of the metric that the trial's protocol means by LPIPS."""
+    """The key of the LPIPS variant of the trial's protocol."""
     protocol = protocol_of(trial.record.protocol) or PAPER
     return f"{LPIPS}{protocol.lpips or PAPER.lpips}"
 
 
 def _lpips_asked_for(trial: TrialResult) -> list[str]:
-    """Key of what the trial's protocol means by LPIPS, or keys where its configuration asks for others alone."""
-    protocols, setting = _protocol_lpips(trial), trial.config.get("eval.lpips")
+    """The key of the protocol's LPIPS variant, or those of ``eval.lpips`` if it asks only for other variants."""
+    by_protocol, setting = _protocol_lpips(trial), trial.config.get("eval.lpips")
     asked = [f"{LPIPS}{variant}" for variant in setting] if isinstance(setting, list) else []
-    return asked if asked and protocols not in asked else [protocols]
+    return asked if asked and by_protocol not in asked else [by_protocol]
 
 
 def _scaled(key: str, cost: str, symbol: str, scale: float, decimals: int) -> Quantity:
-    """A cost in a unit, as tables show it."""
+    """A cost in the unit ``symbol``, as tables show it."""
     name, read = COSTS[cost]
 
     def scaled(trial: TrialResult) -> float | None:

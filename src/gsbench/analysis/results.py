@@ -1,7 +1,7 @@
-"""Reading the result files of an experiment: what is complete and sound becomes trials, everything else is named.
+"""Reading the results of an experiment: complete and sound trials, and a warning for every other folder.
 
-A trial lies in ``<runs>/<experiment>/<scene>/<init>-<densify>/<hash8>-seed<k>/``; its ``results.json``, written last,
-says that it is complete. Nothing here needs torch, so that tables over thousands of trials come at once.
+A trial's folder is ``<runs>/<experiment>/<scene>/<init>-<densify>/<hash8>-seed<k>/``. Its ``results.json`` is written
+last: a folder that has it is complete. Nothing here needs torch, so tables over thousands of trials start quickly.
 """
 
 import math
@@ -19,7 +19,7 @@ from gsbench.files import require_own
 from gsbench.parsing import DamagedError, one_line
 from gsbench.runs.declaration import QUESTIONS, trial_key, unix_time
 from gsbench.runs.declaration import Arm as Arm
-from gsbench.runs.experiments import experiment_home, places_of_trials
+from gsbench.runs.experiments import experiment_home, trial_folders
 from gsbench.runs.layout import CONFIG, FAILED, PER_VIEW, RESULTS, SEED
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import FROM_RENDERS, TrialRecord, UnfinishedError, split_text
@@ -34,15 +34,16 @@ TRIAL_FOLDER = re.compile(rf"(?P<hash>[0-9a-f]{{8}}){SEED}(?P<seed>\d+)")
 
 @dataclass(frozen=True)
 class TrialResult:
-    """One complete trial; ``record`` is its ``results.json``, ``config_hash`` that in its folder's name.
+    """One complete trial.
 
-    ``settings`` are the configurations of its experiment, each read once.
+    ``record`` is its ``results.json``, ``config_hash`` the hash in its folder's name. ``settings`` reads the
+    configurations of its experiment.
     """
 
     path: Path
     config_hash: str
     record: TrialRecord = field(repr=False)
-    variant: tuple[tuple[str, str], ...] = ()  # swept settings that tell the arm from others of the same two names
+    variant: tuple[tuple[str, str], ...] = ()  # swept settings that distinguish arms of one initialiser and densifier
     settings: Configurations = field(default_factory=Configurations, repr=False, compare=False)
 
     @property
@@ -67,7 +68,7 @@ class TrialResult:
 
     @property
     def metrics(self) -> Mapping[str, float]:
-        """Means over the test views."""
+        """The means of metrics over the test views."""
         return self.record.metrics
 
     @property
@@ -77,7 +78,7 @@ class TrialResult:
 
     @cached_property
     def arm(self) -> Arm:
-        """The compared arm that the trial is of."""
+        """The trial's arm in comparisons."""
         return Arm(self.init, self.densify, self.variant)
 
     @property
@@ -87,9 +88,9 @@ class TrialResult:
 
     @property
     def config(self) -> Mapping[str, Any]:
-        """The settings that determine the result, with dotted keys; empty where they are absent or cannot be read.
+        """The settings that determine the result, with dotted keys; empty if they are missing or cannot be read.
 
-        They are read once for all trials that share them: a trial's own are `whole_config`.
+        They are read once for all trials that share them; `whole_config` is read from the trial's own file.
         """
         return self.settings.shared(self.key, self.path)
 
@@ -102,13 +103,13 @@ class TrialResult:
     def key(self) -> str:
         """The trial's folder within its experiment without the seed, ``<scene>/<init>-<densify>/<hash8>``.
 
-        Trials that differ in their seeds alone share it.
+        Trials that differ only in their seeds share it.
         """
         return trial_key(self.scene, f"{self.init}-{self.densify}", self.config_hash)
 
     @cached_property
     def whole_config(self) -> Mapping[str, Any]:
-        """Every setting of the trial, those included that have no part in the result; as `config`."""
+        """Every setting of the trial with dotted keys, also those that do not change the result; as `config`."""
         try:
             return load_flat_config(self.path)
         except (FileNotFoundError, DamagedError):
@@ -121,10 +122,9 @@ class TrialResult:
 
     @cached_property
     def code(self) -> dict[str, str]:
-        """The versions of the code that made the trial; empty for what another program made.
+        """The versions of the code that made the trial; empty if another program made it.
 
-        ``code of <module>`` is the hash of a user's module, ``stage <name>`` the version of
-        one of gsbench's stages.
+        ``code of <module>`` is the hash of a user's module, ``stage <name>`` the version of a stage of gsbench.
         """
         code = self.record.code
         return {f"code of {module}": digest for module, digest in code.sources.items()} | {
@@ -133,7 +133,7 @@ class TrialResult:
 
     @cached_property
     def rooms(self) -> dict[str, str]:
-        """The rooms of gsbench that had a part in the trial, with their states then (`gsbench.runs.code`)."""
+        """The rooms (parts of gsbench's code) that made the trial, with their states then (`gsbench.runs.code`)."""
         return {f"gsbench's {room}": state for room, state in self.record.code.rooms.items()}
 
     @property
@@ -143,7 +143,7 @@ class TrialResult:
 
     @cached_property
     def machine(self) -> str | None:
-        """The kind of machine that trained the trial, in a phrase; None where it was not recorded."""
+        """The kind of machine that trained the trial, in a phrase; None if it was not recorded."""
         try:
             return None if self.record.machine is None else kind_of_machine(self.record.machine)
         except KeyError:
@@ -151,82 +151,81 @@ class TrialResult:
 
     @property
     def cloud(self) -> str:
-        """The hash of the initial model's files (cameras, poses, points); "" where it was not recorded."""
+        """The hash of the initial model's files (cameras, poses, points); "" if it was not recorded."""
         return self.record.hashes.get("cloud", "")
 
     @property
     def measured(self) -> float:
-        """The Unix time at which the metrics were there; that of the file where the results do not say it."""
+        """The Unix time at which the metrics were measured; if it is not recorded, that of the file."""
         moment = None if self.record.measured is None else unix_time(self.record.measured)
         return self.finished if moment is None else moment
 
     @cached_property
     def conditions(self) -> Mapping[str, str]:
-        """The known conditions that trials must share before their numbers may be averaged, as comparable text."""
-        known = {
+        """The recorded conditions that trials must share before their numbers may be averaged, as comparable text."""
+        conditions = {
             "protocol": self.record.protocol,
             "resolution": _size_text(self.record.resolution),
             "data": str(self.record.hashes.get("data")),
         }
         if self.split:
-            known["split"] = self.split
+            conditions["split"] = self.split
         if not self.from_renders:
-            known["raster"] = self.record.raster
+            conditions["raster"] = self.record.raster
         if not self.made_elsewhere:
-            known["iterations"] = str(self.record.iterations)
+            conditions["iterations"] = str(self.record.iterations)
         if not self.made_elsewhere and not self.program:
-            known["budget"] = "null" if self.record.budget is None else canonical(asdict(self.record.budget))
-        return known
+            conditions["budget"] = "null" if self.record.budget is None else canonical(asdict(self.record.budget))
+        return conditions
 
     @cached_property
     def split(self) -> str:
-        """The rule that holds views out, as short text; "" where neither a record nor the configuration says it."""
+        """The rule that holds views out, as short text; "" if neither the record nor the configuration has it."""
         if self.record.split:
             return self.record.split
         return split_text(self.config) if self.config.get("scene.split") else ""
 
     @cached_property
     def question(self) -> str:
-        """The question that held-out views ask of a model: interpolation or extrapolation; "" for a list of views."""
+        """The question that the held-out views ask, interpolation or extrapolation; "" for a list of views."""
         kind = re.split("[ ,]", self.split, maxsplit=1)[0]
         return QUESTIONS.get(kind, "")
 
     @property
     def from_renders(self) -> bool:
-        """Return whether renders of another program were measured, without a model."""
+        """Return whether another program's renders were measured, without its model."""
         return self.record.evaluated_from == FROM_RENDERS
 
     @property
     def made_elsewhere(self) -> bool:
-        """Return whether another program made the model or the renders, so that time and budget are unknown."""
+        """Return whether a training outside gsbench made the model or the renders: its time and budget are unknown."""
         return self.record.evaluated_from is not None and not self.program
 
     @property
     def program(self) -> str:
-        """The program that gsbench let train in its place, as it is called; "" where it trained itself, or nobody
-        did."""
+        """The name of the program that gsbench ran to train this trial; "" if gsbench ran none."""
         return "" if self.record.trained_by is None else self.record.trained_by.program
 
     @property
     def trainer_version(self) -> str:
-        """The version of that program; "" where there is none."""
+        """The version of `program`; "" without one."""
         return "" if self.record.trained_by is None else self.record.trained_by.version
 
     @property
     def budget_acted(self) -> bool:
-        """Return whether the trial's budget may have changed it: a cap that refused or steers, or a limit of time."""
+        """Return whether the budget may have changed the trial: a cap that blocks or steers growth, or a time limit."""
         if self.made_elsewhere or self.program:
             return False
         budget, events = self.record.budget, self.record.events
         if budget is None or not events:
             return True
-        steered = budget.cap == "governor"
-        return steered or budget.seconds is not None or events.get("blocked_by_cap") != 0
+        is_steered = budget.cap == "governor"
+        return is_steered or budget.seconds is not None or events.get("blocked_by_cap") != 0
 
 
 @dataclass(frozen=True)
 class Experiment:
-    """Trials of an experiment that can be used, and one line for each trial folder that cannot."""
+    """The usable trials of an experiment, and a line for each trial folder that cannot be used."""
 
     name: str
     folder: Path
@@ -243,11 +242,11 @@ class Experiment:
         return {trial.path.relative_to(self.folder).as_posix(): trial for trial in self.trials}
 
 
-def by_key(trials: Iterable[T], key: Callable[[T], K]) -> dict[K, list[T]]:
-    """Trials (or pairs of them) grouped by ``key(trial)``, in order of appearance."""
+def group_by(items: Iterable[T], key: Callable[[T], K]) -> dict[K, list[T]]:
+    """The items grouped by ``key(item)``, in order of appearance."""
     groups: dict[K, list[T]] = {}
-    for trial in trials:
-        groups.setdefault(key(trial), []).append(trial)
+    for item in items:
+        groups.setdefault(key(item), []).append(item)
     return groups
 
 
@@ -258,7 +257,7 @@ def seeds_words(trials: Iterable[TrialResult]) -> str:
 
 
 def load_experiment(runs_dir: Path, name: str) -> Experiment:
-    """Read every trial of the experiment ``name``; raises ``InputError`` where there is no usable one."""
+    """Read every trial of the experiment ``name``; raises ``InputError`` if none can be used."""
     experiment = read_experiment(experiment_home(runs_dir, name))
     if not experiment.trials:
         warnings = experiment.warnings
@@ -270,42 +269,43 @@ def load_experiment(runs_dir: Path, name: str) -> Experiment:
 
 
 def read_experiment(folder: Path) -> Experiment:
-    """Read every trial of the experiment in ``folder``, which may have none yet."""
+    """Read every trial of the experiment in ``folder``; it may have no trials yet."""
     runs_dir = folder.parent
     trials: list[TrialResult] = []
     warnings: list[str] = []
     settings = Configurations()
-    for place in places_of_trials(folder):
+    for path in trial_folders(folder):
         try:
-            trials.append(read_trial(Path(place), runs_dir, settings))
+            trials.append(read_trial(Path(path), runs_dir, settings))
         except _UnusableError as reason:
-            warnings.append(f"{os.path.relpath(place, runs_dir)}: {one_line(str(reason))}")
-    trials, unknown = _with_known_settings(trials, settings)
-    warnings += [f"{os.path.relpath(trial.path, runs_dir)}: damaged, {reason}" for trial, reason in unknown]
+            warnings.append(f"{os.path.relpath(path, runs_dir)}: {one_line(str(reason))}")
+    trials, unreadable = _check_settings(trials, settings)
+    warnings += [f"{os.path.relpath(trial.path, runs_dir)}: damaged, {reason}" for trial, reason in unreadable]
     trials.sort(key=lambda trial: (trial.scene, trial.init, trial.densify, trial.seed, trial.config_hash))
     return Experiment(folder.name, folder, tuple(trials), tuple(sorted(warnings)))
 
 
-def _with_known_settings(
+def _check_settings(
     trials: Sequence[TrialResult], settings: Configurations
 ) -> tuple[list[TrialResult], list[tuple[TrialResult, str]]]:
-    """The trials whose settings are known where they are needed, and the others, each with the reason.
+    """The usable trials, and those whose settings are needed but cannot be read, each with the reason.
 
-    Settings are needed where trials of one scene, initialiser and densifier differ in them.
+    Settings are needed only if trials of one scene, initialiser and densifier have different ones. Other trials' files
+    are not opened here, which saves time.
     """
-    folders: dict[str, dict[str, list[Path]]] = {}  # by arm on a scene, and by trial without the seed
+    folders: dict[str, dict[str, list[Path]]] = {}  # {scene and arm: {trial without the seed: its folders}}
     for trial in trials:
         folders.setdefault(trial.key.rpartition("/")[0], {}).setdefault(trial.key, []).append(trial.path)
-    several = [found for found in folders.values() if len(found) > 1]
-    faults = {key: settings.read(key, paths) for found in several for key, paths in found.items()}
-    known = [trial for trial in trials if not faults.get(trial.key)]
-    return known, [(trial, faults[trial.key]) for trial in trials if faults.get(trial.key)]
+    several = [by_trial for by_trial in folders.values() if len(by_trial) > 1]
+    faults = {key: settings.read(key, paths) for by_trial in several for key, paths in by_trial.items()}
+    usable = [trial for trial in trials if not faults.get(trial.key)]
+    return usable, [(trial, faults[trial.key]) for trial in trials if faults.get(trial.key)]
 
 
 def read_views(trial: TrialResult) -> dict[str, dict[str, float]]:
-    """The metrics of every test view, ``{view: {metric: value}}``; raises ``InputError`` where the file is damaged.
+    """The metrics of every test view, ``{view: {metric: value}}``; raises ``InputError`` if the file is damaged.
 
-    The file must average to the trial's own metrics, so that a truncated one cannot pass.
+    Its values must average to the trial's metrics, so a truncated file is detected.
     """
     path = trial.path / PER_VIEW
     try:
@@ -327,11 +327,11 @@ def read_views(trial: TrialResult) -> dict[str, dict[str, float]]:
 
 
 class _UnusableError(Exception):
-    """Reason why a folder is not a usable trial."""
+    """A folder is not a usable trial; the text says why."""
 
 
 def read_trial(path: Path, runs_dir: Path, settings: Configurations) -> TrialResult:
-    """Read and check one trial folder."""
+    """Read and check one trial folder; raises `_UnusableError`."""
     try:
         require_own(runs_dir, path, below=True)
         record = TrialFolder(path).record()
@@ -346,10 +346,10 @@ def read_trial(path: Path, runs_dir: Path, settings: Configurations) -> TrialRes
     match = TRIAL_FOLDER.fullmatch(path.name)
     if match is None:
         raise _UnusableError("foreign, the folder is not named <hash8>-seed<k>")
-    places = path.relative_to(runs_dir).parts[-4:-1]
-    said = {"experiment": record.experiment, "scene": record.scene, "arm": f"{record.init}-{record.densify}"}
-    for (key, value), place in zip(said.items(), places, strict=True):
-        if value != place:
+    folder_names = path.relative_to(runs_dir).parts[-4:-1]
+    recorded = {"experiment": record.experiment, "scene": record.scene, "arm": f"{record.init}-{record.densify}"}
+    for (key, value), folder_name in zip(recorded.items(), folder_names, strict=True):
+        if value != folder_name:
             raise _UnusableError(f"foreign, its {RESULTS} is of {key} {value!r}")
     if str(record.seed) != match["seed"]:
         raise _UnusableError(f"foreign, its {RESULTS} is of seed {record.seed}")

@@ -1,4 +1,4 @@
-"""A table as plain data, and its forms: Markdown, CSV, LaTeX (booktabs) and HTML."""
+"""Tables as plain data, and their formats: Markdown, CSV, LaTeX (booktabs) and HTML."""
 
 import itertools
 import re
@@ -15,8 +15,8 @@ TEMPLATES = "gsbench.analysis.report"
 
 
 @dataclass(frozen=True)
-class Entry:
-    """One cell as shown: ``text`` without markup, and the numbers behind it."""
+class TableEntry:
+    """A table cell as shown: ``text`` without markup, and the ``cell`` behind it if it shows a number."""
 
     text: str
     bold: bool = False
@@ -25,7 +25,7 @@ class Entry:
 
 @dataclass(frozen=True)
 class Column:
-    """A column's group (the quantity, shared by neighbours) and its own heading; ``key``: both for machines."""
+    """A column: its group (the quantity, shared by neighbours), its heading, and both for machines (``key``)."""
 
     group: str
     heading: str
@@ -35,13 +35,13 @@ class Column:
 @dataclass(frozen=True)
 class Row:
     labels: tuple[str, ...]
-    entries: tuple[Entry, ...]
+    entries: tuple[TableEntry, ...]
     rule_above: bool = False
 
 
 @dataclass(frozen=True)
 class Table:
-    """A titled table with notes below it; cells of a ``wrapped`` one hold text that may need several lines."""
+    """A titled table with notes below it. The cells of a ``wrapped`` table may need several lines."""
 
     title: str
     row_headings: tuple[str, ...]
@@ -58,7 +58,7 @@ class Table:
 
 
 def fill(template: str, package: str = TEMPLATES, **values: Any) -> str:
-    """The page that a jinja2 template of ``package`` (or of the report) makes of ``values``, which are escaped."""
+    """Fill a jinja2 template of ``package``, or else of the report, with ``values``. Values are escaped for HTML."""
     return _environment(package).get_template(template).render(**values)
 
 
@@ -69,7 +69,7 @@ def _environment(package: str) -> Environment:
 
 
 def to_markdown(table: Table) -> str:
-    """A GitHub-flavoured Markdown table under its title, with notes as a list."""
+    """A GitHub-flavoured Markdown table under its title, with its notes as a list."""
     heads = [*table.row_headings, *(f"{column.group} {column.heading}".strip() for column in table.columns)]
     rule = [":---"] * len(table.row_headings) + ["---:"] * len(table.columns)
     rows = [[*row.labels, *(f"**{e.text}**" if e.bold else e.text for e in row.entries)] for row in table.rows]
@@ -83,7 +83,7 @@ def _markdown_row(cells: list[str]) -> str:
 
 
 def to_csv(table: Table) -> str:
-    """One line for each cell, in full precision, with the folders of its trials."""
+    """CSV with one line per cell: its values in full precision, its text, and the folders of its trials."""
     import pandas as pd  # here, since it is slow to import
 
     heads = [*table.row_headings, "quantity", "column", "mean", "std", "count", "expected", "best", "text", "trials"]
@@ -142,7 +142,7 @@ FORMATS: dict[str, tuple[str, Callable[[Table], str]]] = {  # name -> file suffi
     "html": ("html", to_html_page),
 }
 
-WRAPPED_SHARE = 0.7  # of a line of LaTeX, for the columns of a table whose cells wrap
+WRAPPED_SHARE = 0.7  # share of a LaTeX line for the columns of a ``wrapped`` table
 
 _LATEX = {
     "\\": "\\textbackslash{}", "&": "\\&", "%": "\\%", "$": "\\$", "#": "\\#", "_": "\\_", "{": "\\{", "}": "\\}",
@@ -155,11 +155,11 @@ _LATEX_PATTERN = re.compile("|".join(re.escape(character) for character in _LATE
 
 
 def escape_latex(text: str) -> str:
-    """Text as LaTeX source; a character that plain LaTeX does not know becomes a question mark."""
+    """Text as LaTeX source; a character that plain LaTeX does not have becomes a question mark."""
     escaped = _LATEX_PATTERN.sub(lambda match: _LATEX[match[0]], text)
     return escaped.encode("latin-1", "replace").decode("latin-1")
 
 
-def _latex_text(entry: Entry) -> str:
+def _latex_text(entry: TableEntry) -> str:
     text = escape_latex(entry.text)
     return f"\\textbf{{{text}}}" if entry.bold else text

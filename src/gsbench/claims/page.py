@@ -8,7 +8,7 @@ from gsbench.analysis.cells import with_variants
 from gsbench.analysis.fairness import caveats, fairness_table
 from gsbench.analysis.notes import cloud_notes, machine_notes
 from gsbench.analysis.report.charts import ForestRow, forest_plot
-from gsbench.analysis.results import TrialResult, by_key, seeds_words
+from gsbench.analysis.results import TrialResult, group_by, seeds_words
 from gsbench.analysis.statistics import Outcome, plan_looks
 from gsbench.analysis.table_formats import Table, fill
 from gsbench.analysis.verdicts import like_these_words, outlying_words
@@ -171,7 +171,7 @@ def _chart(one: ClaimVerdict) -> str:
 
 def _folders(trials: Sequence[TrialResult]) -> tuple[tuple[str, str], ...]:
     """``("exp/garden/sfm-adc/1a2b3c4d", "seeds 0, 1, 2")`` for each arm of a scene."""
-    groups = by_key(trials, lambda trial: trial.label.rpartition(SEED)[0])
+    groups = group_by(trials, lambda trial: trial.label.rpartition(SEED)[0])
     return tuple((folder, seeds_words(own)) for folder, own in groups.items())
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from gsbench.analysis.cells import select_trials, with_variants
 from gsbench.analysis.fairness import budget_words
 from gsbench.analysis.pairing import Pairs, find_pairs
-from gsbench.analysis.results import Arm, TrialResult, by_key
+from gsbench.analysis.results import Arm, TrialResult, group_by
 from gsbench.analysis.statistics import Interval, StudentT, t_test
 from gsbench.claims.archive import unpack_archive
 from gsbench.errors import InputError
@@ -133,7 +133,7 @@ def read_studies(path: Path, wanted: Wanted, name: str) -> Found:
     with tempfile.TemporaryDirectory() as folder:
         every = unpack_archive(path, Path(folder)).trials
         trials = with_variants(select_trials(every, wanted.where))
-        by_protocol = sorted(by_key(trials, lambda trial: trial.record.protocol).items())
+        by_protocol = sorted(group_by(trials, lambda trial: trial.record.protocol).items())
         for protocol, own in by_protocol:
             groups = _groups(own, _pairs(own, wanted, path))
             for pairs in groups:

@@ -15,7 +15,7 @@ from gsbench.analysis.cells import with_variants
 from gsbench.analysis.configurations import Configurations
 from gsbench.analysis.judgement import Verdict, judge
 from gsbench.analysis.pairing import choose_pairs
-from gsbench.analysis.results import Arm, TrialResult, by_key, read_experiment
+from gsbench.analysis.results import Arm, TrialResult, group_by, read_experiment
 from gsbench.analysis.statistics import FIRST_LOOK, plan_looks
 from gsbench.analysis.verdicts import in_words
 from gsbench.config.compose import Trial
@@ -180,7 +180,7 @@ def facts_for(metric: str, values: Mapping[str, Any]) -> MetricFacts:
 
 def _seeds(trials: Sequence[TrialResult]) -> tuple[int, ...]:
     """The seeds that all scenes and arms have, in the order of the sweep; raises InputError where they differ."""
-    groups = by_key(trials, lambda trial: (trial.scene, trial.arm))
+    groups = group_by(trials, lambda trial: (trial.scene, trial.arm))
     seeds = {key: tuple(dict.fromkeys(trial.seed for trial in group)) for key, group in groups.items()}
     first = next(iter(seeds.values()))
     for (scene, arm), own in seeds.items():
@@ -199,7 +199,7 @@ def _seeds(trials: Sequence[TrialResult]) -> tuple[int, ...]:
 def _scenes(trials: Sequence[TrialResult], baseline: Arm, arm: Arm) -> dict[str, tuple[str, str]]:
     """The folders of both arms' trials on each scene that has both."""
     scenes = {}
-    for scene, group in by_key(trials, lambda trial: trial.scene).items():
+    for scene, group in group_by(trials, lambda trial: trial.scene).items():
         one, other = ({trial.key for trial in group if trial.arm == side} for side in (baseline, arm))
         if len(one) == len(other) == 1:
             scenes[scene] = one.pop(), other.pop()

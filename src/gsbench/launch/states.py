@@ -20,7 +20,7 @@ from gsbench.files import write_json
 from gsbench.launch.record import read_plan
 from gsbench.parsing import DamagedError
 from gsbench.records import Record, read_if_sound
-from gsbench.runs.experiments import places_of_trials
+from gsbench.runs.experiments import trial_folders
 from gsbench.runs.keys import determining
 from gsbench.runs.layout import CONFIG, FAILED, LOCK, RESULTS, SEED, SUBMITTED
 from gsbench.runs.trial_folder import State, TrialFolder
@@ -49,7 +49,7 @@ class TrialState:
 def states_of_experiment(home: Path) -> list[TrialState]:
     """The state of every trial of the experiment in ``home``, planned or found there."""
     planned = {folder: trial.time for folder, trial in read_plan(home).items()}
-    found = {path for path in map(Path, places_of_trials(home)) if SEED in path.name and (path / CONFIG).exists()}
+    found = {path for path in map(Path, trial_folders(home)) if SEED in path.name and (path / CONFIG).exists()}
     folders = sorted({*planned, *found})
     queue = ask_queue(folders)
     return _without_mended([_state(folder, planned.get(folder), queue) for folder in folders])

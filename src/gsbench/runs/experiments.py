@@ -36,7 +36,7 @@ def make_home(home: Path) -> None:
     home.mkdir(parents=True, exist_ok=True)
 
 
-def places_of_trials(home: Path) -> Iterator[str]:
+def trial_folders(home: Path) -> Iterator[str]:
     """Every folder three levels below the experiment in ``home``, in no particular order."""
     for scene in folders_in(home):
         for arm in folders_in(scene):

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from gsbench.analysis.cells import select_trials
-from gsbench.analysis.results import TrialResult, by_key, read_experiment
+from gsbench.analysis.results import TrialResult, group_by, read_experiment
 from gsbench.app.command import first_trials, run_trials
 from gsbench.claims.archive import unpack_archive
 from gsbench.claims.gate import NEW, NOT_DECIDED, PASSED, WORSE, Gate, ask, describe, deviations, result_of
@@ -76,7 +76,7 @@ def _baseline(trials: Sequence[TrialResult], first: Mapping[str, Trial]) -> dict
             there = listed(sorted({trial.scene for trial in trials}))
             raise InputError(f"the archive has no trial on {scene} (it has {there})")
         own = [trial for trial in own if _arm(trial) == new.folder.parent.name] or own
-        if len(kinds := by_key(own, lambda trial: (_arm(trial), trial.config_hash))) > 1:
+        if len(kinds := group_by(own, lambda trial: (_arm(trial), trial.config_hash))) > 1:
             arms = listed([f"{arm} ({settings})" for arm, settings in kinds])
             raise InputError(f"the archive has several arms on {scene}, {arms}: choose by --where KEY=VALUE")
         found[scene] = own

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from gsbench.errors import GsbenchError
-from gsbench.runs.experiments import experiment_home, list_experiments, places_of_trials
+from gsbench.runs.experiments import experiment_home, list_experiments, trial_folders
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.tracking.follower import sync
 from gsbench.tracking.mirror import MirrorError
@@ -26,7 +26,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
         else [runs / n for n in list_experiments(runs)]
     )
     try:
-        folders = [TrialFolder(Path(place)) for home in homes for place in sorted(places_of_trials(home))]
+        folders = [TrialFolder(Path(place)) for home in homes for place in sorted(trial_folders(home))]
         for line in sync(folders, options.uri):
             print(line, flush=True)
     except (MirrorError, OSError) as error:

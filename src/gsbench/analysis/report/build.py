@@ -1,4 +1,4 @@
-"""Putting the report together: one HTML file that needs no network, no script to be read, and no other file."""
+"""The report as one HTML file: it needs no network and no other file, and can be read without JavaScript."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -14,11 +14,11 @@ from gsbench.analysis.report.sections import (
     event_charts,
     event_table,
     provenance,
-    search_part,
+    search_summary,
     training_charts,
     volume_charts,
 )
-from gsbench.analysis.results import Experiment, TrialResult, by_key
+from gsbench.analysis.results import Experiment, TrialResult, group_by
 from gsbench.analysis.table_formats import Table, fill
 from gsbench.analysis.tables import build_table
 from gsbench.runs.layout import FIGURES
@@ -26,12 +26,12 @@ from gsbench.words import signed
 
 
 def build_report(experiment: Experiment, baseline: str = BASELINE) -> str:
-    """The report as HTML, with every densifier held against ``baseline``; a pure function of the experiment's files."""
+    """The report as HTML, made from the experiment's files alone; every densifier is compared with ``baseline``."""
     trials = with_variants(experiment.trials)
     arms = sorted({trial.arm for trial in trials})
     declared = active_declaration(experiment.folder, trials)
-    search = search_part(experiment.folder)
-    # Among points of a search, which were chosen by results, no test holds.
+    search = search_summary(experiment.folder)
+    # The points of a search were chosen by results, so no test of them is valid.
     pairs = [] if search else choose_pairs(arms, baseline, controls_of(trials))
     judged = verdicts.judge_pairs(trials, pairs, declared)
     quantity = next((one.declared for one in judged if one.declared is not None), None)
@@ -65,22 +65,22 @@ def build_report(experiment: Experiment, baseline: str = BASELINE) -> str:
 
 
 def _without_verdicts(table: Table) -> Table:
-    """The table without the notes that repeat the verdicts, which stand at the top of the page."""
+    """The table without its notes on verdicts: the top of the page has them."""
     return replace(table, notes=tuple(note for note in table.notes if not note.startswith(verdicts.VERDICT)))
 
 
 def trial_figures(trials: Sequence[TrialResult]) -> list[tuple[str, str]]:
-    """(caption, data URI) of the pictures that trials left for the report; one seed of each scene and arm.
+    """(caption, data URI) of the pictures in trials' ``figures`` folders, for one seed of each scene and arm.
 
-    A picture that several arms of a scene share, such as that of their initial cloud, is there once.
+    A picture that arms of a scene share, such as that of their initial cloud, appears once.
     """
-    found: dict[tuple[str, str, str], list[str]] = {}  # by name, scene and picture: the arms and seeds
-    for group in by_key(trials, lambda trial: (trial.scene, trial.arm)).values():
+    sources: dict[tuple[str, str, str], list[str]] = {}  # {(name, scene, data URI): arms and seeds}
+    for group in group_by(trials, lambda trial: (trial.scene, trial.arm)).values():
         trial = group[0]
         for path in sorted((trial.path / FIGURES).glob("*.png")):
             key = path.stem.replace("_", " "), trial.scene, png_uri(read_image(path))
-            found.setdefault(key, []).append(f"{trial.init}-{trial.densify}, seed {trial.seed}")
-    return [(f"{name}: {scene}, {'; '.join(arms)}", uri) for (name, scene, uri), arms in found.items()]
+            sources.setdefault(key, []).append(f"{trial.init}-{trial.densify}, seed {trial.seed}")
+    return [(f"{name}: {scene}, {'; '.join(arms)}", uri) for (name, scene, uri), arms in sources.items()]
 
 
 def _signed(value: float | None, decimals: int) -> str:

@@ -1,6 +1,6 @@
-"""Charts as inline SVG: no script, no network, sharp on paper, and described in words for those who cannot see them.
+"""Charts as inline SVG, without script or network, each with a description in words.
 
-Here values find their places; ``charts.html.j2`` writes the elements.
+This module computes positions; ``line_chart.html.j2`` and ``forest_plot.html.j2`` write the elements.
 """
 
 import itertools
@@ -15,17 +15,17 @@ from gsbench.words import true_minus
 WIDTH, HEIGHT = 380, 250  # px at full size; text is 12 px
 LEFT, RIGHT, TOP, BOTTOM = 58, 18, 26, 44  # margins
 FOREST_LEFT, FOREST_TOP, FOREST_ROW = 132, 12, 26
-COLORS = ("#4477aa", "#cc3311", "#228833", "#aa3377", "#b8860b", "#0099a8")  # told apart also by colour-blind readers
+COLORS = ("#4477aa", "#cc3311", "#228833", "#aa3377", "#b8860b", "#0099a8")  # distinct for colour-blind readers
 DASHES = ("", "6 3", "2 3", "8 3 2 3", "1 2", "10 4")
 TICKS = 5
-THOUSANDS = 1e4  # from here on numbers are written with k or M
+THOUSANDS = 1e4  # numbers from here on are written with k or M
 
 Points = Sequence[tuple[float, float]]
 
 
 @dataclass(frozen=True)
 class Line:
-    """A line of a chart with its name, in px."""
+    """A line of a chart with its name; points are in px."""
 
     name: str
     points: Points
@@ -35,14 +35,14 @@ class Line:
 
 @dataclass(frozen=True)
 class ForestRow:
-    """A difference with its interval, where that is known."""
+    """A difference with its interval, None if it is unknown."""
 
     label: str
     mean: float
     interval: Interval | None = None
 
     def color(self, better: int) -> str:
-        """Grey where the interval holds zero, green on the side that is ``better``, else red."""
+        """Grey if the interval contains 0 or is unknown, green on the side of the sign ``better``, else red."""
         if self.interval is None or not self.interval.excludes_zero():
             return "#555555"
         return "#1b7837" if self.mean * better > 0 else "#b2182b"
@@ -56,23 +56,23 @@ def line_chart(
     log: bool = False,
     marker: float | None = None,
 ) -> str:
-    """Lines, each with its name, over common axes, which are both linear or both logarithmic; "" without any point.
+    """Named lines over common axes, both linear or both logarithmic (``log``); "" without any point.
 
-    ``marker`` is a vertical line. What a log axis cannot show is dropped.
+    ``marker`` is the x of a vertical line. Points that a logarithmic axis cannot show are dropped.
     """
     shown = [(name, [(x, y) for x, y in points if not log or (x > 0 and y > 0)]) for name, points in series]
     shown = [(name, points) for name, points in shown if points]
     if not shown:
         return ""
-    places = [point for _, points in shown for point in points]
-    x = Axis([x for x, _ in places] + ([] if marker is None else [marker]), log, LEFT, WIDTH - RIGHT)
-    y = Axis([y for _, y in places], log, HEIGHT - BOTTOM, TOP)
+    all_points = [point for _, points in shown for point in points]
+    x = Axis([x for x, _ in all_points] + ([] if marker is None else [marker]), log, LEFT, WIDTH - RIGHT)
+    y = Axis([y for _, y in all_points], log, HEIGHT - BOTTOM, TOP)
     lines = [
-        Line(name, [(x.place(a), y.place(b)) for a, b in points], COLORS[k % len(COLORS)], DASHES[k % len(DASHES)])
+        Line(name, [(x.to_px(a), y.to_px(b)) for a, b in points], COLORS[k % len(COLORS)], DASHES[k % len(DASHES)])
         for k, (name, points) in enumerate(shown)
     ]
     words = f"{title}. {y_label} against {x_label}: {'; '.join(f'{name} {_ends(points)}' for name, points in shown)}."
-    marked = None if marker is None else (x.place(marker), f"V_th {marker:g}")
+    marked = None if marker is None else (x.to_px(marker), f"V_th {marker:g}")
     return fill(
         "line_chart.html.j2",
         title=title,
@@ -94,7 +94,7 @@ def line_chart(
 
 
 def forest_plot(title: str, rows: Sequence[ForestRow], x_label: str, better: int) -> str:
-    """Differences with intervals, one row each, about a line at zero; ``better`` is the sign of an improvement."""
+    """Differences with intervals, one per row, and a line at 0; ``better`` is the sign of an improvement."""
     if not rows:
         return ""
     known = [row.interval for row in rows if row.interval is not None]
@@ -121,7 +121,7 @@ def forest_plot(title: str, rows: Sequence[ForestRow], x_label: str, better: int
     )
 
 
-ROUND = (1, 2, 2.5, 5, 10)  # steps between ticks, of a power of ten
+ROUND = (1, 2, 2.5, 5, 10)  # steps between ticks, as multiples of a power of ten
 
 
 class Axis:
@@ -140,16 +140,16 @@ class Axis:
         self.ticks = self._log_ticks() if log else _round_ticks(self._low, self._high, ticks)
 
     def label(self, tick: float) -> str:
-        """The tick's value with as many digits as tell it from its neighbours."""
+        """The tick's value, with enough digits to differ from its neighbours."""
         step = min((b - a for a, b in itertools.pairwise(self.ticks)), default=0.0)
         if self._log or step == 0 or abs(tick) >= THOUSANDS:
             return short_number(tick)
         decimals = max(0, math.ceil(-math.log10(step) - 1e-9) + (f"{step:e}"[2] != "0"))
         return true_minus(f"{tick:.{decimals}f}")
 
-    def place(self, value: float) -> float:
-        part = (self._scale(value) - self._low) / (self._high - self._low)
-        return self._start + part * (self._end - self._start)
+    def to_px(self, value: float) -> float:
+        fraction = (self._scale(value) - self._low) / (self._high - self._low)
+        return self._start + fraction * (self._end - self._start)
 
     def _scale(self, value: float) -> float:
         return math.log10(value) if self._log else value
@@ -162,11 +162,11 @@ class Axis:
 
 
 def _round_ticks(low: float, high: float, count: int) -> list[float]:
-    """About ``count`` round values between, and two at least: one alone would be no scale."""
+    """About ``count`` round values from ``low`` to ``high``, but at least two, since one gives no scale."""
     raw = (high - low) / count
     power = 10.0 ** math.floor(math.log10(raw))
-    place = next(place for place, factor in enumerate(ROUND) if factor * power >= raw)
-    for factor in (*reversed(ROUND[: place + 1]), 0.5):
+    first = next(index for index, factor in enumerate(ROUND) if factor * power >= raw)
+    for factor in (*reversed(ROUND[: first + 1]), 0.5):
         step = factor * power
         indices = range(math.ceil(low / step), math.floor(high / step) + 1)
         if len(indices) > 1:
@@ -175,16 +175,16 @@ def _round_ticks(low: float, high: float, count: int) -> list[float]:
 
 
 def _ends(points: Points) -> str:
-    """The first and the last point in words."""
+    """The first and the last point of a line in words."""
     (x0, y0), (x1, y1) = points[0], points[-1]
     return f"from {short_number(y0)} at {short_number(x0)} to {short_number(y1)} at {short_number(x1)}"
 
 
 def short_number(value: float) -> str:
-    """A number as short as a tick label needs it, such as 26k or −0.02."""
-    size = abs(value)
+    """A number with up to three digits for a tick label, such as 26k or −0.02."""
+    magnitude = abs(value)
     for limit, unit, suffix in ((1e6, 1e6, "M"), (THOUSANDS, 1e3, "k")):
-        if size >= limit:
+        if magnitude >= limit:
             return true_minus(f"{value / unit:.3g}{suffix}")
-    text = f"{value:.0e}" if 0 < size < 1e-4 else f"{value:.3g}" if size < 1000 else f"{value:.0f}"
+    text = f"{value:.0e}" if 0 < magnitude < 1e-4 else f"{value:.3g}" if magnitude < 1000 else f"{value:.0f}"
     return true_minus(text)

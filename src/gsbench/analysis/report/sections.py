@@ -1,4 +1,4 @@
-"""Sections of the report, each made from result files only."""
+"""The sections of a report, made from result files alone."""
 
 import logging
 import math
@@ -17,8 +17,8 @@ from gsbench.analysis.judgement import Verdict
 from gsbench.analysis.pairing import pair_trials
 from gsbench.analysis.quantities import COSTS, relative_change
 from gsbench.analysis.report.charts import ForestRow, forest_plot, line_chart
-from gsbench.analysis.results import Arm, TrialResult, by_key
-from gsbench.analysis.table_formats import Column, Entry, Row, Table
+from gsbench.analysis.results import Arm, TrialResult, group_by
+from gsbench.analysis.table_formats import Column, Row, Table, TableEntry
 from gsbench.analysis.verdicts import PairVerdicts
 from gsbench.errors import InputError
 from gsbench.eval.facts import find
@@ -45,11 +45,11 @@ Curve = list[tuple[float, float]]
 
 
 @dataclass(frozen=True)
-class Versus:
-    """All results about one pair of arms, beside its verdicts (``judged``)."""
+class ArmComparison:
+    """All results about one pair of arms; ``judged`` are its verdicts."""
 
     judged: PairVerdicts
-    caveats: str  # what else than the idea may have made the difference
+    caveats: str  # what may have made the difference besides the idea
     fairness: Table
     costs: tuple[str, ...]
     forests: tuple[str, ...]
@@ -61,16 +61,16 @@ class Versus:
         return f"{self.judged.second} against {self.judged.first}"
 
     @property
-    def beyond(self) -> bool:
-        """Return whether there are scenes enough to ask about scenes like these."""
+    def has_like_these(self) -> bool:
+        """Return whether there are enough scenes for a statement about scenes like these."""
         return any(one.like_these is not None for one in self.judged.verdicts)
 
 
-def compare_arms(trials: Sequence[TrialResult], judged: PairVerdicts) -> Versus:
-    """Costs, forest plots and whole views of two arms; what cannot be had is said in the notes."""
+def compare_arms(trials: Sequence[TrialResult], judged: PairVerdicts) -> ArmComparison:
+    """Costs, forest plots and views of two arms; notes say what could not be read."""
     first, second = judged.first, judged.second
     views, faults = choose_views(pair_trials(trials, first, second))
-    return Versus(
+    return ArmComparison(
         judged,
         caveats(trials, first, second),
         fairness_table(trials, first, second),
@@ -83,20 +83,20 @@ def compare_arms(trials: Sequence[TrialResult], judged: PairVerdicts) -> Versus:
 
 def _costs(trials: Sequence[TrialResult], first: Arm, second: Arm) -> list[str]:
     """Say how counts and training times changed over the scenes that both arms have."""
-    baseline, other = _of(trials, first), _of(trials, second)
+    baseline, other = _trials_of(trials, first), _trials_of(trials, second)
     lines = []
     for key in COSTS_COMPARED:
         name, read = COSTS[key]
         change = relative_change(baseline, other, read)
         if change is not None:
-            caution = _unsteady_times([*baseline, *other]) if key == "train_time" else ""
-            lines.append(f"{name[0].upper()}{name[1:]} {change}{caution}")
+            spread = _spread_of_times([*baseline, *other]) if key == "train_time" else ""
+            lines.append(f"{name[0].upper()}{name[1:]} {change}{spread}")
     return lines
 
 
-def _unsteady_times(trials: Sequence[TrialResult]) -> str:
-    """Say how far the training times of equal trials differ, without which a change of them says little."""
-    cells = by_key(trials, lambda trial: (trial.arm, trial.scene)).values()
+def _spread_of_times(trials: Sequence[TrialResult]) -> str:
+    """Say how far the training times of equal trials differ: a smaller change of times means nothing."""
+    cells = group_by(trials, lambda trial: (trial.arm, trial.scene)).values()
     times = [[t for trial in cell if (t := COSTS["train_time"][1](trial))] for cell in cells]
     spread = max((max(own) / min(own) - 1 for own in times if own), default=0.0)
     return f"; times of equal trials differ by up to {spread:.0%}" if spread else ""
@@ -113,28 +113,28 @@ def _forest(verdict: Verdict) -> str:
 def training_charts(trials: Sequence[TrialResult], arms: Sequence[Arm]) -> list[str]:
     """Curves by arm, averaged over scenes and seeds at the steps that all trials have."""
     keys = [key for key, _, _ in CURVES]
-    means = {arm: _mean_curves(_of(trials, arm), layout.CURVES, keys) for arm in arms}
+    means = {arm: _mean_curves(_trials_of(trials, arm), layout.CURVES, keys) for arm in arms}
     charts = [
-        line_chart(title, [(str(arm), found[key]) for arm, found in means.items()], "iteration", y_label)
+        line_chart(title, [(str(arm), curves[key]) for arm, curves in means.items()], "iteration", y_label)
         for key, title, y_label in CURVES
     ]
     return [chart for chart in charts if chart]
 
 
 def event_table(trials: Sequence[TrialResult], arms: Sequence[Arm]) -> Table | None:
-    """A cause of growth or pruning a row: Gaussians of an arm's mean trial; None where none was logged."""
+    """A row per cause of growth or pruning, with the mean number of Gaussians per arm; None if nothing was logged."""
     rows = []
     for cause in EVENT_CAUSES:
-        means = [fmean(float(trial.record.events.get(cause, 0)) for trial in _of(trials, arm)) for arm in arms]
+        means = [fmean(float(trial.record.events.get(cause, 0)) for trial in _trials_of(trials, arm)) for arm in arms]
         if any(means):
-            rows.append(Row((cause.replace("_", " "),), tuple(Entry(f"{mean:,.0f}") for mean in means)))
+            rows.append(Row((cause.replace("_", " "),), tuple(TableEntry(f"{mean:,.0f}") for mean in means)))
     columns = tuple(Column("", str(arm), ("events", str(arm))) for arm in arms)
     return Table("Gaussians by cause, mean of a trial", ("cause",), columns, tuple(rows)) if rows else None
 
 
 def event_charts(trials: Sequence[TrialResult], arms: Sequence[Arm]) -> list[str]:
     """Events by cause over the iterations of each arm."""
-    means = {arm: _mean_curves(_of(trials, arm), layout.EVENTS, EVENT_CAUSES) for arm in arms}
+    means = {arm: _mean_curves(_trials_of(trials, arm), layout.EVENTS, EVENT_CAUSES) for arm in arms}
     causes = [cause for cause in EVENT_CAUSES if any(count for own in means.values() for _, count in own[cause])]
     charts = []
     for arm, own in means.items():
@@ -143,18 +143,18 @@ def event_charts(trials: Sequence[TrialResult], arms: Sequence[Arm]) -> list[str
     return [chart for chart in charts if chart]
 
 
-def _of(trials: Sequence[TrialResult], arm: Arm) -> list[TrialResult]:
+def _trials_of(trials: Sequence[TrialResult], arm: Arm) -> list[TrialResult]:
     return [trial for trial in trials if trial.arm == arm]
 
 
 def _mean_curves(trials: Sequence[TrialResult], name: str, keys: Sequence[str]) -> dict[str, Curve]:
-    """The mean over trials of each key of a file of curves, which is read once."""
-    found: dict[str, list[Curve]] = {key: [] for key in keys}
+    """The mean curve over trials of each key in the trials' file ``name``; each file is read once."""
+    curves_by_key: dict[str, list[Curve]] = {key: [] for key in keys}
     for trial in trials:
         rows = trial.folder.rows(name)
-        for key, curves in found.items():
+        for key, curves in curves_by_key.items():
             curves.append([(float(row["step"]), float(row[key])) for row in rows if key in row])
-    return {key: mean_by_step(curves) for key, curves in found.items()}
+    return {key: mean_by_step(curves) for key, curves in curves_by_key.items()}
 
 
 def mean_by_step(curves: Sequence[Curve]) -> Curve:
@@ -167,13 +167,14 @@ def mean_by_step(curves: Sequence[Curve]) -> Curve:
 
 
 def volume_charts(trials: Sequence[TrialResult], arms: Sequence[Arm]) -> tuple[list[str], list[str]]:
-    """(charts, notes): histograms of the Gaussians' volumes, final by arm and at earlier iterations where logged."""
+    """(charts, notes): histograms of the Gaussians' volumes, for final models and for logged iterations."""
     threshold = _threshold(trials)
     final: list[tuple[str, Curve]] = []
     notes = []
     for arm in arms:
         try:
-            volumes = np.concatenate([log10_volumes(trial.path / layout.POINT_CLOUD) for trial in _of(trials, arm)])
+            models = [trial.path / layout.POINT_CLOUD for trial in _trials_of(trials, arm)]
+            volumes = np.concatenate([log10_volumes(model) for model in models])
         except InputError as error:
             notes.append(f"{arm}: no histogram, {error}")
             continue
@@ -182,7 +183,8 @@ def volume_charts(trials: Sequence[TrialResult], arms: Sequence[Arm]) -> tuple[l
             notes.append(f"{arm}: {np.mean(volumes > math.log10(threshold)):.2%} of volumes exceed {threshold:g}.")
     charts = [line_chart("Volumes of the trained Gaussians", final, *VOLUME_AXES, log=True, marker=threshold)]
     for arm in arms:
-        logged = [(f"iteration {step}", curve) for step, curve in _logged_histograms(_of(trials, arm)).items()]
+        histograms = _logged_histograms(_trials_of(trials, arm))
+        logged = [(f"iteration {step}", curve) for step, curve in histograms.items()]
         title = f"Volumes during training: {arm}"
         charts.append(line_chart(title, logged, *VOLUME_AXES, log=True, marker=threshold))
     return [chart for chart in charts if chart], notes
@@ -191,7 +193,7 @@ def volume_charts(trials: Sequence[TrialResult], arms: Sequence[Arm]) -> tuple[l
 def log10_volumes(path: Path) -> NDArray[np.float64]:
     """log10 of the volumes ``4/3 π s1 s2 s3`` [N] of a 3DGS PLY, whose scales are natural logarithms.
 
-    Raises `InputError` for a file that is none.
+    Raises `InputError` for a file that cannot be read as a 3DGS PLY.
     """
     from plyfile import PlyData, PlyParseError  # here, since only reports read point clouds
 
@@ -204,14 +206,14 @@ def log10_volumes(path: Path) -> NDArray[np.float64]:
 
 
 def histogram(volumes: NDArray[np.float64]) -> Curve:
-    """(volume, share) of finite log10 ``volumes`` [N] in bins of a quarter decade; only filled bins."""
+    """(volume, share) of each filled bin of a quarter decade, from the finite log10 ``volumes`` [N]."""
     finite = volumes[np.isfinite(volumes)]
     bins, counts = np.unique(np.floor(finite / BIN_WIDTH), return_counts=True)
     return list(zip((10 ** ((bins + 0.5) * BIN_WIDTH)).tolist(), (counts / len(finite)).tolist(), strict=True))
 
 
 def _logged_histograms(trials: Sequence[TrialResult]) -> dict[int, Curve]:
-    """Pooled counts of ``volume_histograms.jsonl`` by iteration, as (volume at the bin's centre, share)."""
+    """The logged histograms by iteration, pooled over trials, as (volume at the bin's centre, share)."""
     pooled: dict[int, dict[float, float]] = {}
     for trial in trials:
         for row in trial.folder.histograms():
@@ -226,20 +228,20 @@ def _logged_histograms(trials: Sequence[TrialResult]) -> dict[int, Curve]:
 
 
 def _threshold(trials: Sequence[TrialResult]) -> float | None:
-    """The volume threshold in scene units, where every arm that has one has this one."""
-    settings = [group[0].config for group in by_key(trials, lambda trial: trial.arm).values()]
-    found = {
+    """The absolute volume threshold (cubed scene units), if all arms that have one have the same; else None."""
+    configs = [group[0].config for group in group_by(trials, lambda trial: trial.arm).values()]
+    thresholds = {
         config["densify.volume_threshold"]
-        for config in settings
+        for config in configs
         if config.get("densify.threshold_mode", "absolute") == "absolute" and "densify.volume_threshold" in config
     }
-    known = len(found) == 1 and all(isinstance(value, int | float) for value in found)
-    return float(found.pop()) if known else None
+    is_shared = len(thresholds) == 1 and all(isinstance(value, int | float) for value in thresholds)
+    return float(thresholds.pop()) if is_shared else None
 
 
 def provenance(trials: Sequence[TrialResult]) -> Table:
-    """One row a trial: where it lies, what it came from, with which versions."""
-    found = {
+    """One row per trial: its folder, conditions, hashes, code, machine and versions."""
+    facts_by_trial = {
         trial.label: {
             "raster": trial.record.raster,
             "protocol": trial.record.protocol,
@@ -251,14 +253,17 @@ def provenance(trials: Sequence[TrialResult]) -> Table:
         }
         for trial in trials
     }
-    names = dict.fromkeys(name for facts in found.values() for name in facts)
+    names = dict.fromkeys(name for facts in facts_by_trial.values() for name in facts)
     columns = tuple(Column("", name, ("provenance", name)) for name in names)
-    rows = (Row((label,), tuple(Entry(facts.get(name, "")) for name in names)) for label, facts in found.items())
-    return Table("Trials", ("trial",), columns, tuple(rows), wrapped=True)
+    rows = tuple(
+        Row((label,), tuple(TableEntry(facts.get(name, "")) for name in names))
+        for label, facts in facts_by_trial.items()
+    )
+    return Table("Trials", ("trial",), columns, rows, wrapped=True)
 
 
-def search_part(home: Path) -> tuple[str, str] | None:
-    """A line on the search of an experiment and its chart as SVG; None where there was none, or it cannot be read."""
+def search_summary(home: Path) -> tuple[str, str] | None:
+    """A line on the experiment's search, and its chart as SVG; None if there is no search or it cannot be read."""
     try:
         record = read_tuning(home)
     except FileNotFoundError:
@@ -274,9 +279,9 @@ def search_part(home: Path) -> tuple[str, str] | None:
         return f"{count}; none has a result yet.", ""
     facts = find(record.metric)
     name, decimals = (facts.name, facts.decimals + 1) if facts else (record.metric, 4)
-    number, best, highest = max(done, key=lambda found: record.direction * found[2])
-    where = ", ".join(f"{key} = {value}" for key, value in best.settings.items())
-    line = f"Best {name}: {highest:.{decimals}f} at {where} (point {number}). {count}. "
+    number, best, best_value = max(done, key=lambda numbered: record.direction * numbered[2])
+    settings = ", ".join(f"{key} = {value}" for key, value in best.settings.items())
+    line = f"Best {name}: {best_value:.{decimals}f} at {settings} (point {number}). {count}. "
     line += "Judged by validation views; no test view was looked at."
-    each = [(float(place), value) for place, _, value in done]
-    return line, line_chart("The search", [("each point", each)], "point", name)
+    values = [(float(number), value) for number, _, value in done]
+    return line, line_chart("The search", [("each point", values)], "point", name)
