@@ -1,4 +1,4 @@
-"""The command line: ``gsbench`` is a Hydra app; a first word without ``=``, ``+``, ``~`` or ``-`` is a verb.
+"""The command line: ``gsbench`` is a Hydra app, and a first word without ``=``, ``+``, ``~`` or ``-`` is a verb.
 
 Nothing here loads torch, so that ``--help`` and the verbs that only read files answer at once.
 """
@@ -7,6 +7,7 @@ import sys
 
 INTERRUPTED = 130  # 128 + SIGINT, as shells count
 
+# The imports are in the block, because a Ctrl-C during them would otherwise print a traceback.
 try:
     import importlib
     import os
@@ -20,7 +21,7 @@ try:
     from gsbench.system.own_modules import SAFE_PATH
     from gsbench.verbs import VERBS
     from gsbench.words import closest
-except KeyboardInterrupt:  # Ctrl-C before `run` could catch it
+except KeyboardInterrupt:
     print("gsbench: stopped before it began", file=sys.stderr)
     sys.exit(INTERRUPTED)
 
@@ -38,7 +39,7 @@ def main() -> None:
 def run(argv: list[str]) -> int:
     """Run the command line ``argv``; returns the exit code and prints errors as one line."""
     os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
-    os.environ.setdefault(*SAFE_PATH)  # for all Python processes that we start, whoever starts them for us
+    os.environ.setdefault(*SAFE_PATH)  # also for Python processes that libraries start
     set_up_logging()
     try:
         if argv and argv[0] == "help":
@@ -66,26 +67,27 @@ def run(argv: list[str]) -> int:
             raise
         print("gsbench: stopped; to continue, give the same command again", file=sys.stderr)
         return INTERRUPTED
-    except BrokenPipeError:  # the reader of our output, such as `head`, has gone
+    except BrokenPipeError:  # the reader of our output, such as `head`, has ended
+        # Otherwise Python flushes stdout at exit and prints the error again.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return DONE
 
 
 def _is_interrupt(error: BaseException | None) -> bool:
-    """Return whether a Ctrl-C is behind an error: native modules that it stops while they load raise ImportError."""
+    """Return whether a Ctrl-C caused an error: a native module that it stops while loading raises ImportError."""
     return error is not None and (
         isinstance(error, KeyboardInterrupt) or _is_interrupt(error.__cause__ or error.__context__)
     )
 
 
 def _refuse(error: GsbenchError, code: int) -> int:
-    """Say an error in one line, whatever the name of a file or the message of a library holds."""
+    """Print an error as one line, also if a file's name or a library's message has line breaks or odd bytes."""
     print("gsbench: " + " ".join(str(error).split()).encode("utf-8", "backslashreplace").decode(), file=sys.stderr)
     return code
 
 
 def runs_dir() -> Path:
-    """The runs folder of the verbs: ``$GSBENCH_RUNS``, else ``runs`` here."""
+    """The runs folder of the verbs: ``$GSBENCH_RUNS``, else ``runs`` in the current folder."""
     return checked_runs_folder(os.environ.get("GSBENCH_RUNS", "runs"))
 
 
@@ -133,7 +135,7 @@ def _help(words: list[str]) -> int:
     from gsbench.config.command_words import parse, searched_folders
     from gsbench.config.compose import options_text
 
-    folders = searched_folders(parse(words)[0])  # whose choices are listed too
+    folders = searched_folders(parse(words)[0])  # the choices in the user's folders are listed too
     print(USAGE)
     print("Verbs (gsbench VERB --help):")
     for name, text in VERBS.items():

@@ -1,6 +1,6 @@
-"""Plug-ins by which Hydra finds gsbench's launcher and sweeper; what they do stands in ``gsbench.app.sweep``.
+"""Plug-ins by which Hydra finds gsbench's launcher and sweeper. Their work is done in ``gsbench.app.sweep``.
 
-Hydra imports this file at every start, of any Hydra app in the same environment, so it imports Hydra alone.
+Hydra imports this file whenever any Hydra app in the same environment starts, so it imports only Hydra.
 """
 
 from collections.abc import Sequence
@@ -16,7 +16,7 @@ from omegaconf import DictConfig
 
 
 class GsbenchLauncher(Launcher):
-    """Name for what gsbench's sweeper does by itself: to run all trials as the settings below ``launch`` say."""
+    """A placeholder with a name: gsbench's sweeper itself runs the trials, as the settings ``launch`` say."""
 
     def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
         pass
@@ -26,9 +26,10 @@ class GsbenchLauncher(Launcher):
 
 
 class GsbenchSweeper(Sweeper):
-    """The grid of all listed values, or several joined, handed to the launcher as a whole.
+    """Runs the grid of all listed values, or several joined grids, as one batch.
 
-    ``tune`` says how intervals are searched before that. What ``grids`` say is read before Hydra resolves it.
+    ``tune`` says how intervals are searched before. ``grids`` is always empty here: gsbench reads the grids before
+    Hydra makes this object, because Hydra would resolve them.
     """
 
     def __init__(self, params: dict[str, Any] | None, tune: dict[str, Any] | None = None, grids: Any = None) -> None:
@@ -37,17 +38,17 @@ class GsbenchSweeper(Sweeper):
     def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
         from gsbench.app.sweep import Sweep
 
-        self.begun = Sweep.begin(hydra_context, task_function, config)
+        self.started = Sweep.begin(hydra_context, task_function, config)
 
     def sweep(self, arguments: list[str]) -> None:
-        self.begun.run(self.params, self.tune, arguments)
+        self.started.run(self.params, self.tune, arguments)
 
 
 LAUNCHER = {"_target_": "hydra_plugins.gsbench.GsbenchLauncher"}
 SWEEPER = {"_target_": "hydra_plugins.gsbench.GsbenchSweeper", "params": {}, "grids": []}
-# as gsbench.app.tuning.TuneSettings
+# The defaults of gsbench.app.tuning.TuneSettings, which cannot be imported here.
 TUNE = {"points": 20, "at_once": 1, "metric": None, "seed": 100}
-# Hydra imports this file more than once; from 1.4 on it says so unless it is told that the same may come again.
-AGAIN: dict[str, Any] = {"replace": True} if "replace" in signature(ConfigStore.store).parameters else {}
+# Hydra imports this file more than once. From 1.4 on it warns of that unless ``replace`` is set.
+REPLACE: dict[str, Any] = {"replace": True} if "replace" in signature(ConfigStore.store).parameters else {}
 for group, node in (("launcher", LAUNCHER), ("sweeper", {**SWEEPER, "tune": TUNE})):
-    ConfigStore.instance().store(group=f"hydra/{group}", name="gsbench", node=node, provider="gsbench", **AGAIN)
+    ConfigStore.instance().store(group=f"hydra/{group}", name="gsbench", node=node, provider="gsbench", **REPLACE)

@@ -11,7 +11,7 @@ import pytest
 from gsbench.config.compose import compose_one
 from gsbench.pipeline import trial as pipeline_trial
 from gsbench.pipeline.parts import Parts
-from gsbench.pipeline.steps.scene import makers_of_views
+from gsbench.pipeline.steps.scene import view_versions
 from gsbench.pipeline.trial import TrialSteps
 from gsbench.runs.keys import config_hash
 from gsbench.runs.store import Store
@@ -110,8 +110,8 @@ def test_options_of_ones_own_class_have_an_effect_whatever_they_are_called(home:
 
 def test_the_cache_of_prepared_photographs_knows_the_code_that_prepared_them(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("gsbench.pipeline.steps.scene.edited", lambda rooms: dict.fromkeys(rooms, "edited"))
-    makers_of_views.cache_clear()
-    found = makers_of_views()
-    makers_of_views.cache_clear()
+    view_versions.cache_clear()
+    found = view_versions()
+    view_versions.cache_clear()
     assert found["scene"] == "edited"
     assert {"pycolmap", "pillow"} <= found.keys()

@@ -15,7 +15,7 @@ import torch
 from gsbench.config.compose import compose_one
 from gsbench.densify import ADC, PixelGS
 from gsbench.errors import InputError
-from gsbench.pipeline.parts import build_rasterizer, check_offers
+from gsbench.pipeline.parts import build_rasterizer, check_features
 from gsbench.pipeline.steps.inputs import rasterizer_inputs
 from gsbench.raster import create_rasterizer
 from gsbench.runs.keys import config_hash
@@ -93,13 +93,13 @@ def test_options_are_checked_and_the_key_has_them(folder: Path) -> None:
 def test_without_a_footprint_it_is_refused_where_one_is_asked_for(folder: Path) -> None:
     values = composed(*OWN)
     rasterizer = build_rasterizer(values["raster"], values["allow_targets"], CPU)
-    check_offers(ADC(), "adc", rasterizer.name, rasterizer)
+    check_features(ADC(), "adc", rasterizer.name, rasterizer)
     with pytest.raises(
         InputError, match=r"densify=pixelgs needs .* raster=untiled does not give them; take raster=reference"
     ):
-        check_offers(PixelGS(), "pixelgs", rasterizer.name, rasterizer)
+        check_features(PixelGS(), "pixelgs", rasterizer.name, rasterizer)
     rasterizer.has_footprint = True  # type: ignore[attr-defined]
-    check_offers(PixelGS(), "pixelgs", rasterizer.name, rasterizer)
+    check_features(PixelGS(), "pixelgs", rasterizer.name, rasterizer)
 
 
 def test_only_rasterizers_with_a_name_of_their_own(folder: Path) -> None:

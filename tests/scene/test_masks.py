@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from gsbench.errors import InputError
-from gsbench.pipeline.steps.scene import masked_step
+from gsbench.pipeline.steps.scene import masking_step
 from gsbench.scene.load import load_scene
 from gsbench.scene.masks import fill_ignored, find_masks, prepare_photograph, prepared_mask, read_mask, resize_mask
 from gsbench.scene.options import SceneConfig
@@ -54,7 +54,7 @@ def test_masks_are_found_by_the_names_of_colmap(make_scene: MakeScene, read) -> 
 
 def test_pixels_are_prepared_anew_for_another_colour_behind_them(make_scene: MakeScene) -> None:
     capture = read_photos("toy", with_masks(make_scene()), masks="masks")
-    steps = {behind: masked_step(capture, behind) for behind in ("black", "white")}
+    steps = {behind: masking_step(capture, behind) for behind in ("black", "white")}
     assert all(steps.values())
     assert steps["black"].key != steps["white"].key
     assert steps["white"].inputs["behind"] == "white"

@@ -158,14 +158,14 @@ def test_blenders_angle_its_missing_extension_its_parts_and_its_alpha(tmp_path: 
     assert capture.train_names == tuple(f"train/r_{k}.png" for k in range(5))
     camera = read_transforms(tmp_path).images["train/r_0.png"].camera
     assert camera.params == pytest.approx((0.5 * 40 / math.tan(0.5 * angle),) * 2 + (20, 20))
-    from gsbench.pipeline.steps.scene import masked, masked_step
+    from gsbench.pipeline.steps.scene import masked_capture, masking_step
 
-    assert masked_step(capture, "black") is None
-    step = masked_step(capture, "white")
+    assert masking_step(capture, "black") is None
+    step = masking_step(capture, "white")
     assert step is not None
     (tmp_path / "white").mkdir()
     step.build(tmp_path / "white")
-    white = masked(capture, tmp_path / "white")
+    white = masked_capture(capture, tmp_path / "white")
     with Image.open(white.images / "train/r_0.png") as picture:
         assert picture.mode == "RGB"
         assert picture.getpixel((0, 0)) == (255, 255, 255)

@@ -1,7 +1,7 @@
 """gsbench as a Hydra app: a command line becomes trials and an exit code.
 
-Before Hydra runs, one look at the whole configuration refuses what cannot be (`gsbench.config.compose`). Then
-``hydra.main`` runs the task, or makes a sweep of it by gsbench's sweeper.
+Before Hydra runs, the whole configuration is composed and checked (`gsbench.config.compose`). Then ``hydra.main`` runs
+the task once, or hands it to gsbench's sweeper.
 """
 
 import logging
@@ -19,7 +19,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from gsbench.analysis.quantities import COSTS
 from gsbench.config.command_words import check_words, is_sweep, parse
-from gsbench.config.compose import Trial, compose_whole, look_at, ready_trial, typed
+from gsbench.config.compose import Trial, compose_whole, enforce_permissions, resolve_trial, typed_words
 from gsbench.config.hydra_entry import explained, hydra_ready, run_main
 from gsbench.config.trust import PERMISSIONS, check_composed, load_callbacks
 from gsbench.errors import GsbenchError, InputError
@@ -30,39 +30,39 @@ from gsbench.launch.serial import Outcome
 from gsbench.logs import set_up_logging
 from gsbench.system.own_modules import allow_modules
 
-OWN = "gsbench"  # the name of gsbench's own launcher
+OWN_LAUNCHER = "gsbench"  # its name in Hydra
 
 log = logging.getLogger(__name__)
 
 
 def launch(argv: list[str]) -> int:
-    """Run the trials of the command line ``argv``; 0 if all are done (or left to Slurm), 1 if some failed.
+    """Run the trials of the command line ``argv``; returns 0 if all are done (or left to Slurm), 1 if some failed.
 
-    Raises InputError for a configuration that does not compose or hold together, and for a single trial's bad input.
+    Raises InputError for a wrong configuration, and for a single trial's bad input.
     """
     words, multirun, dry_run = parse(argv)
-    task = Task(list_trials, look_only=True) if dry_run else Task(run_batch)
+    task = TrialTask(list_trials, look_only=True) if dry_run else TrialTask(run_batch)
     run_app(words, multirun, task)
-    if dry_run or not task.trials:  # a sweep that is decided needs none
+    if dry_run or not task.trials:  # a sweep whose question is decided needs no trial
         return 0
     return summarize(task.outcomes, task.trials)
 
 
 def compose_trials(words: Sequence[str], multirun: bool = False) -> list[Trial]:
     """The trials that a command line would run."""
-    task = Task(lambda trials: [], look_only=True)
+    task = TrialTask(lambda trials: [], look_only=True)
     run_app(words, multirun, task)
     return task.trials
 
 
-def first_trials(verb: str, settings: Sequence[str], metric: str) -> dict[str, Trial]:
-    """A trial of each scene for a verb that holds two versions of one trainer against each other (gate, bisect).
+def one_trial_per_scene(verb: str, settings: Sequence[str], metric: str) -> dict[str, Trial]:
+    """A trial of each scene, for a verb that compares two versions of one trainer (gate, bisect).
 
-    Raises InputError for settings that make more than one arm, and for a metric that they do not compute.
+    Raises InputError for settings that make more than one arm, and for a metric that the trials do not compute.
     """
     keys = [word.partition("=")[0].lstrip("+") for word in settings]
-    if given := [key for key in keys if key in ("seed", "eval.primary")]:
-        raise InputError(f"{verb}: {given[0]} follows from the other words: leave it out")
+    if implied := [key for key in keys if key in ("seed", "eval.primary")]:
+        raise InputError(f"{verb}: {implied[0]} follows from the other words: leave it out")
     trials = compose_trials([*settings, "seed=0", *([] if "name" in keys else [f"name={verb}"])], multirun=True)
     by_scene = {trial.values["scene"]["name"]: trial for trial in trials}
     if len(by_scene) < len(trials):
@@ -75,16 +75,17 @@ def first_trials(verb: str, settings: Sequence[str], metric: str) -> dict[str, T
 
 
 def run_trials(trials: Sequence[Trial]) -> int:
-    """Run what is not done among ``trials`` by the launcher that they name; the exit code."""
+    """Run those ``trials`` that are not done, by the launcher that they name; returns the exit code."""
     return summarize(run_batch(trials), trials)
 
 
 @dataclass
-class Task:
-    """The function that Hydra runs. ``handle`` runs trials; where it shall ``look_only``, it says what would run.
+class TrialTask:
+    """Hydra's task function: it gets a composed configuration and hands its trial to ``handle``.
 
-    ``allowed`` is what the command line permits, with the user's modules in ``folder``; ``grids`` are what gsbench's
-    sweeper joins. ``trials`` and ``outcomes`` are what has come together, over all batches of a sweep.
+    ``handle`` runs trials; with ``look_only`` it only reports what would run. ``allowed`` is what the command line
+    permits, ``folder`` holds the user's modules, ``grids`` are the grids that gsbench's sweeper joins. ``trials`` and
+    ``outcomes`` collect all batches of a sweep.
     """
 
     handle: Callable[[Sequence[Trial]], list[Outcome]]
@@ -96,21 +97,23 @@ class Task:
     outcomes: list[Outcome] = field(default_factory=list)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return Task, (self.handle, self.look_only, self.allowed, self.folder)  # nothing of what came together here
+        # Pickled for another launcher's processes, which need nothing that was collected here.
+        return TrialTask, (self.handle, self.look_only, self.allowed, self.folder)
 
     def __call__(self, config: DictConfig) -> None:
-        """One trial, as Hydra or another launcher calls it, perhaps in a process of its own; raises how it failed."""
+        """Run one trial. Called by Hydra or by another launcher, perhaps in another process; raises if it failed."""
         allow_modules(self.allowed, self.folder)
         set_up_logging()
         hydra: Any = HydraConfig.instance().cfg
-        # A job's files may say other things of Hydra than those that were looked at.
+        # Checked again: the files that this job chooses may set other things of Hydra than the checked ones.
         check_composed(hydra, self.allowed)
-        for_hydra, words = typed(hydra.hydra.overrides)
-        trial = ready_trial(look_at(config, self.allowed), [*for_hydra, *words])
+        hydra_words, words = typed_words(hydra.hydra.overrides)
+        trial = resolve_trial(enforce_permissions(config, self.allowed), [*hydra_words, *words])
         if hydra.hydra.mode == RunMode.RUN:
             self.launch([trial])
             return
-        (outcome,) = self.handle([trial])  # of a sweep, whose launcher hands on what is raised
+        # A job of a sweep: its launcher passes on what is raised.
+        (outcome,) = self.handle([trial])
         if outcome.status == "failed":
             raise (InputError if outcome.bad_input else GsbenchError)(outcome.message)
 
@@ -120,10 +123,10 @@ class Task:
         self.outcomes += self.handle(trials)
 
 
-def run_app(words: Sequence[str], multirun: bool, task: Task) -> None:
+def run_app(words: Sequence[str], multirun: bool, task: TrialTask) -> None:
     """Run ``task`` for the trials of a command line: one, or many with ``multirun`` or an experiment that is a sweep.
 
-    Raises InputError, one line, for what does not compose or hold together.
+    Raises InputError, one line, for a wrong configuration.
     """
     check_words(words)
     swept = [word for word in words if is_sweep(word)]
@@ -137,18 +140,18 @@ def run_app(words: Sequence[str], multirun: bool, task: Task) -> None:
         check_launcher(config, multirun)
     task.allowed = tuple(config[PERMISSIONS])
     task.grids = OmegaConf.to_container(config.hydra.sweeper, resolve=False).get("grids")  # type: ignore[union-attr]
-    # Hydra would resolve ${…} in the grids when it makes the sweeper; there it is for each trial to do.
-    chosen = [*words, *["hydra.sweeper.grids=[]"] * bool(task.grids)]
-    if task.look_only:  # no callback hears of a look
-        chosen += [f"~hydra.callbacks.{name}" for name in config.hydra.callbacks]
+    # The grids are taken out: Hydra would resolve their ${…} when it makes the sweeper, before each trial's values.
+    argv = [*words, *["hydra.sweeper.grids=[]"] * bool(task.grids)]
+    if task.look_only:  # nothing runs, so no callback is called
+        argv += [f"~hydra.callbacks.{name}" for name in config.hydra.callbacks]
     else:
         load_callbacks(config.hydra.callbacks, task.allowed)
     with explained(words, (HydraException, OmegaConfBaseException, OSError)):
-        run_main(task, [*chosen, f"hydra.mode={(RunMode.MULTIRUN if multirun else RunMode.RUN).name}"], task.allowed)
+        run_main(task, [*argv, f"hydra.mode={(RunMode.MULTIRUN if multirun else RunMode.RUN).name}"], task.allowed)
 
 
 def list_trials(trials: Sequence[Trial]) -> list[Outcome]:
-    """Print the trials with their states, and what they will miss; run none."""
+    """Print the trials with their states, and the folders that they will miss; run none."""
     if not need_no_check(trials):
         check_parts(trials, here=False)
     lines = describe_plan(trials, trials[0].values["launch"]["parallel"])
@@ -157,7 +160,7 @@ def list_trials(trials: Sequence[Trial]) -> list[Outcome]:
 
 
 def check_sweep_settings(config: DictConfig, multirun: bool) -> None:
-    """Refuse what goes with a sweep alone where there is none, and parameters of a sweep that are no mapping."""
+    """Refuse settings of a sweep without a sweep, and parameters of a sweep that are no mapping."""
     sweeper = config.hydra.sweeper
     params = sweeper.get("params")
     if not multirun and config.hydra.mode is None and (params or sweeper.get("grids")):
@@ -171,9 +174,9 @@ def check_sweep_settings(config: DictConfig, multirun: bool) -> None:
 
 
 def check_launcher(config: DictConfig, multirun: bool) -> None:
-    """Refuse another launcher than gsbench's where it cannot run trials, or where two would."""
+    """Refuse another launcher than gsbench's without a sweep, or beside a launcher that ``launch`` names."""
     launcher = config.hydra.runtime.choices["hydra/launcher"]
-    if launcher == OWN:
+    if launcher == OWN_LAUNCHER:
         return
     if not multirun:
         raise InputError(f"hydra/launcher={launcher} launches sweeps: add -m, or leave it out")
@@ -182,16 +185,16 @@ def check_launcher(config: DictConfig, multirun: bool) -> None:
 
 
 def summarize(outcomes: Sequence[Outcome], trials: Sequence[Trial]) -> int:
-    """Say how the trials ended; 0 if all are done, 1 if some failed, 2 if all failed for bad input.
+    """Report how the trials ended; returns 0 if all are done, 1 if some failed, 2 if all failed for bad input.
 
-    A single trial's failure is raised, so that it is the one line that the program prints.
+    A single trial's failure is raised, so that the program prints this one line only.
     """
     failed = [outcome for outcome in outcomes if outcome.status == "failed"]
     if failed and len(outcomes) == 1:
         raise (InputError if failed[0].bad_input else GsbenchError)(failed[0].message)
     for outcome in failed:
         print(f"gsbench: failed: {outcome.label}: {outcome.message}", file=sys.stderr)
-    name = trials[-1].values["name"]  # a tuning comes before, in experiments of its own
+    name = trials[-1].values["name"]  # the last one's: a tuning runs before, in its own experiments
     done = sum(outcome.status == "done" for outcome in outcomes)
     if any(outcome.status == "queued" for outcome in outcomes):
         advice = f"how far the others are: gsbench status {name}"

@@ -1,7 +1,7 @@
-"""The points of a sweep: what its words list, and what an experiment's file joins.
+"""The points of a sweep: the grid of its words, or several grids that an experiment's file joins.
 
-An experiment's file may join several grids, below ``hydra.sweeper.grids``. Each names settings and their values as
-``hydra.sweeper.params`` does, which they share:
+An experiment's file lists such grids below ``hydra.sweeper.grids``. Each grid maps settings to values, and all share
+the settings of ``hydra.sweeper.params``:
 
     hydra:
       mode: MULTIRUN
@@ -13,8 +13,8 @@ An experiment's file may join several grids, below ``hydra.sweeper.grids``. Each
           - densify: volumetric
             densify.volume_threshold: 0.01,0.03
 
-A word of the command line whose setting some of the grids list is meant for these, and takes the place of what they
-list; any other word is meant for all.
+If some grids list the setting of a word of the command line, the word replaces their values and does not reach the
+other grids. Any other word is for all grids.
 """
 
 from collections.abc import Mapping, Sequence
@@ -29,8 +29,8 @@ from gsbench.errors import InputError
 GRIDS = "hydra.sweeper.grids"
 
 
-def grid(overrides: Sequence[Override]) -> list[list[str]]:
-    """The words of every point of the grid that ``overrides`` span; of two for one key the later counts."""
+def grid_points(overrides: Sequence[Override]) -> list[list[str]]:
+    """The words of every point of the grid that ``overrides`` span. If two set one key, the later counts."""
     choices: dict[str, list[str]] = {}
     for override in overrides:
         key = override.get_key_element()
@@ -38,7 +38,7 @@ def grid(overrides: Sequence[Override]) -> list[list[str]]:
             check_sweep(override)
             try:
                 choices[key] = [f"{key}={value}" for value in override.sweep_string_iterator()]
-            except ValueError as error:  # such as a range of steps of 0
+            except ValueError as error:  # such as a range with a step of 0
                 raise InputError(f"{override.input_line}: {error}") from error
             if not choices[key]:
                 raise InputError(f"{override.input_line} lists no value")
@@ -48,17 +48,17 @@ def grid(overrides: Sequence[Override]) -> list[list[str]]:
 
 
 def is_interval(override: Override) -> bool:
-    """Return whether a word gives an interval, in which a value is searched, in place of a list of values."""
+    """Return whether a word gives an interval in which a value is searched, instead of a list of values."""
     return override.is_sweep_override() and not override.is_discrete_sweep()
 
 
-def text_of(override: Override) -> str:
+def value_text(override: Override) -> str:
     """The value of a word as it was typed."""
     return str(override.input_line).partition("=")[2]
 
 
 def checked_grids(grids: Any) -> list[dict[str, str]]:
-    """The grids as they stand in the configuration; raises InputError for what is no list of settings with values."""
+    """The grids of the configuration, with values as texts. Raises InputError unless they are a list of mappings."""
     if not isinstance(grids, list) or not all(isinstance(grid, dict) and grid for grid in grids):
         raise InputError(f"{GRIDS} must be a list, each a mapping of settings to values, got {grids!r}")
     return [{str(key): _text(key, value) for key, value in grid.items()} for grid in grids]
@@ -67,23 +67,23 @@ def checked_grids(grids: Any) -> list[dict[str, str]]:
 def words_of_grids(
     params: Mapping[str, Any], grids: Sequence[Mapping[str, str]], given: Sequence[str]
 ) -> list[list[str]]:
-    """List the words of each grid: its own, the shared ones, and of the command line those that are meant for it.
+    """The words of each grid: its own, the shared ``params``, and the words ``given`` that are for it.
 
-    Of two for one setting the later counts; trials are in the order of the grids, the shared settings varying fastest.
+    If two set one key, the later counts. Trials are in the order of the grids; the shared settings vary fastest.
     """
-    listed = {bare(key) for grid in grids for key in grid}
+    listed = {bare_key(key) for grid in grids for key in grid}
     return [
         [
             *(f"{key}={value}" for key, value in grid.items()),
-            *(f"{key}={value}" for key, value in params.items() if bare(key) not in map(bare, grid)),
-            *(word for word in given if key_of(word) not in listed - set(map(bare, grid))),
+            *(f"{key}={value}" for key, value in params.items() if bare_key(key) not in map(bare_key, grid)),
+            *(word for word in given if key_of(word) not in listed - set(map(bare_key, grid))),
         ]
         for grid in grids or [{}]
     ]
 
 
-def bare(key: str) -> str:
-    """A key without the signs by which it is added or taken away."""
+def bare_key(key: str) -> str:
+    """A key without the signs that add or remove it."""
     return key.lstrip("+~")
 
 

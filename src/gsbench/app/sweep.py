@@ -1,6 +1,6 @@
-"""A sweep: the trials that its words make, run all at once or seed by seed until their question is decided.
+"""A sweep: its trials, run as one batch, or seed by seed until their question is decided.
 
-Either may begin by tuning its arms (`gsbench.app.tuning`).
+A sweep may first tune its arms (`gsbench.app.tuning`).
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from hydra.plugins.launcher import Launcher
 from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig
 
-from gsbench.app.command import OWN, Task
-from gsbench.app.grids import bare, checked_grids, grid, is_interval, words_of_grids
+from gsbench.app.command import OWN_LAUNCHER, TrialTask
+from gsbench.app.grids import bare_key, checked_grids, grid_points, is_interval, words_of_grids
 from gsbench.app.tuning import tuned_jobs
 from gsbench.claims.stopping import Planned, headline, plan_sweep, run_looks
 from gsbench.config.command_words import parse_word
@@ -38,34 +38,35 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Sweep:
-    """A sweep that Hydra has begun: its configuration, its task, and what makes jobs of words and runs them."""
+    """A sweep that Hydra has started: its configuration, its task, Hydra's context and the launcher."""
 
     config: DictConfig
-    task: Task
+    task: TrialTask
     context: HydraContext
     launcher: Launcher
 
     @classmethod
     def begin(cls, context: HydraContext, task: TaskFunction, config: DictConfig) -> Sweep:
-        """The work of gsbench's sweeper on what Hydra gives it."""
-        assert isinstance(task, Task)
+        """Make a sweep from what Hydra gives a sweeper."""
+        assert isinstance(task, TrialTask)
         config.allow_targets = list(task.allowed)
         resolve_times(config)
         launcher = Plugins.instance().instantiate_launcher(hydra_context=context, task_function=task, config=config)
         return cls(config, task, context, launcher)
 
     def run(self, params: Mapping[str, Any], tune: Mapping[str, Any], words: Sequence[str]) -> None:
-        """Run all points that the words of the sweep span; ``params`` are the settings and values of
-        ``hydra.sweeper.params``, ``tune`` says how the intervals among them are searched before (`gsbench.app.tuning`).
+        """Run all points that the ``words`` and ``params`` (``hydra.sweeper.params``) of the sweep span.
+
+        ``tune`` (``hydra.sweeper.tune``) says how intervals among them are searched first (`gsbench.app.tuning`).
         """
         grids = checked_grids(self.task.grids or [])
         jobs: list[list[str]] = []
-        intervals: list[dict[str, Override]] = []  # among the words of each job: what is searched for its arm
-        for of_grid in words_of_grids(params, grids, words):
-            given = {bare(one.get_key_element()): one for one in self.parse(of_grid)}  # the later counts
-            points = grid([one for one in given.values() if not is_interval(one)])
+        intervals: list[dict[str, Override]] = []  # for each job, the settings that are searched for its arm
+        for grid_words in words_of_grids(params, grids, words):
+            by_key = {bare_key(override.get_key_element()): override for override in self.parse(grid_words)}
+            points = grid_points([override for override in by_key.values() if not is_interval(override)])
             jobs += points
-            searched = {one.get_key_element(): one for one in given.values() if is_interval(one)}
+            searched = {override.get_key_element(): override for override in by_key.values() if is_interval(override)}
             intervals += [searched] * len(points)
         trials = self.trials(tuned_jobs(self, tune, jobs, intervals))
         if any(trial.values["launch"]["stop_when_decided"] for trial in trials):
@@ -76,21 +77,18 @@ class Sweep:
     def parse(self, words: Sequence[str]) -> list[Override]:
         """The words as Hydra reads them, with the choices of ``glob(*)``."""
         for word in words:
-            parse_word(word)  # which says what is wrong with one that a file has
+            parse_word(word)  # for its errors: words from a file were not checked before
         with explained(words):
             return OverridesParser.create(self.context.config_loader).parse_overrides(list(words))
 
     def trials(self, jobs: Sequence[Sequence[str]]) -> list[Trial]:
-        """The trials of jobs, each the list of its words."""
+        """The trials of ``jobs``, each the list of its words."""
         return compose_jobs(self.context.config_loader, self.config, jobs)
 
     def launch(self, trials: Sequence[Trial]) -> None:
-        """Run trials by the launcher.
-
-        Another launcher than gsbench's gets them after a look at all, so that what is refused is refused before work.
-        """
+        """Run trials by the launcher. For another launcher than gsbench's, all trials are checked before the first."""
         name = self.config.hydra.runtime.choices["hydra/launcher"]
-        if name == OWN or self.task.look_only:
+        if name == OWN_LAUNCHER or self.task.look_only:
             self.task.launch(trials)
             return
         begin_for_another_launcher(trials)
@@ -106,9 +104,9 @@ class Sweep:
         self.task.outcomes += [_outcome(trial, ended) for trial, ended in zip(trials, returned, strict=True)]
 
     def _run_until_decided(self, trials: Sequence[Trial]) -> None:
-        """Run the trials in planned looks, and no further ones of pairs of arms that are decided.
+        """Run the trials in the looks that the sequential test plans. Decided pairs of arms get no further trials.
 
-        Raises InputError for a sweep that cannot be looked at so.
+        Raises InputError for a sweep that cannot be tested so.
         """
         stopping = plan_sweep(trials)
         if self.task.look_only:
@@ -132,6 +130,6 @@ class Sweep:
 
 
 def _outcome(trial: Trial, returned: JobReturn) -> Outcome:
-    """Say how a trial ended that another launcher ran."""
-    value: Any = returned._return_value  # the property of that name would write a line to stderr
+    """The outcome of a trial that another launcher ran."""
+    value: Any = returned._return_value  # the public property `return_value` would write a line to stderr
     return outcome_of_error(trial.folder, value) if isinstance(value, Exception) else Outcome(trial.folder, "done")

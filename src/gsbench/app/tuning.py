@@ -1,12 +1,12 @@
-"""Tuning parity: before a sweep's trials, each arm gets the same number of points of a search, on validation views.
+"""Tuning parity: before a sweep's trials, each arm gets the same number of search points, on validation views.
 
-What is tuned is given as intervals among the words of the sweep or in its grids, each for the arms that it is meant
-for; an arm without any stays as it is. A search is the tuning of one arm. Each arm's points are trained in an
-experiment of its own, so that no table holds them; the first is the arm as it is, where that lies in the intervals. The
-best point's values become words of the sweep's jobs.
+Intervals among the words of the sweep or in its grids say what is tuned, and for which arms. An arm without intervals
+is not tuned. Each arm has its own search, whose points are trained in an experiment of its own, so that no table shows
+them. The first point is the arm's own values, if they lie in the intervals. The best point's values become words of the
+sweep's jobs.
 
-Each arm has a study of Optuna's in memory, whose proposals depend on the results before them alone. A sweep that was
-killed asks it from the first point on again, and finds what was trained in the trials' folders.
+Each search has an Optuna study in memory, whose proposals depend only on the results before them. After a kill, the
+same proposals are made again from the first, and finished trials are found in their folders.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from hydra.core.override_parser.types import Override
 from omegaconf import OmegaConf
 from pydantic import NonNegativeInt, PositiveInt
 
-from gsbench.app.grids import bare, grid, text_of
+from gsbench.app.grids import bare_key, grid_points, value_text
 from gsbench.claims.stopping import facts_for
 from gsbench.config.command_words import check_makes_trials, key_of, parse_word
 from gsbench.config.compose import Trial
@@ -53,20 +53,20 @@ PLACE = "hydra.sweeper.tune"
 DEFAULT_METRIC = "psnr"
 DEFAULT_POINTS = 20
 SEED = "seed"
-MEASURED_ON = ("scene", "eval", "launch", "tracking", "hydra")  # groups that no arm may tune: they say how it is judged
-REPLACED = (SEED, "name", "scene.validation", "eval.primary")  # words of a job that a point's trials have otherwise
-DIGITS = 4  # significant digits of a value: a name for it that people can type
+NOT_TUNED = ("scene", "eval", "launch", "tracking", "hydra")  # groups that say how all arms are run and judged
+REPLACED = (SEED, "name", "scene.validation", "eval.primary")  # settings that a point's trials have different values of
+DIGITS = 4  # significant digits of a value, so that people can type it
 
 
 @dataclass(frozen=True)
 class TuneSettings:
-    """Settings of a tuning. ``points`` are those of each arm; 0: nothing is tuned, and intervals are left out.
+    """Settings of a tuning. ``points`` is the number for each arm; 0: nothing is tuned, and intervals are left out.
 
-    ``seed`` are the seeds of a point's trials, none of which the sweep may have.
+    ``seed`` lists the seeds of a point's trials. The sweep may have none of them.
     """
 
     points: NonNegativeInt = DEFAULT_POINTS
-    at_once: PositiveInt = 1  # points of an arm that are chosen before the next result is known
+    at_once: PositiveInt = 1  # points of an arm that are proposed and trained together
     metric: str | None = None  # None: eval.primary, else PSNR
     seed: int | str = 100
 
@@ -76,7 +76,7 @@ class TuneSettings:
 
 @dataclass(frozen=True)
 class Goal:
-    """The measure of a good point: the mean of ``metric`` over its trials with ``seeds``, times ``sign``."""
+    """Quantity that a search maximises: the mean of ``metric`` over a point's trials with ``seeds``, times ``sign``."""
 
     metric: str
     sign: Literal[-1, 1]
@@ -84,11 +84,11 @@ class Goal:
 
 
 @dataclass(frozen=True)
-class Search:
+class ArmSearch:
     """The search for the values of ``arm`` (INIT-DENSIFY), in the experiment whose folder is ``home``.
 
-    ``jobs`` are the arm's of the sweep, without what a point's trials have otherwise; ``first`` are the arm's own
-    values, if the ranges hold them. ``points`` are those that were judged.
+    ``jobs`` are the arm's jobs in the sweep without the settings `REPLACED`. ``first`` are the arm's own values, None
+    if they lie outside the ranges. ``points`` are the judged points.
     """
 
     arm: str
@@ -104,7 +104,7 @@ class Search:
 
     @cached_property
     def study(self) -> Study:
-        """The study, which holds what was judged so far."""
+        """Optuna's study, which proposes points and gets their results."""
         import optuna
 
         optuna.logging.set_verbosity(optuna.logging.WARNING)
@@ -116,7 +116,7 @@ class Search:
         return study
 
     def propose(self) -> list[Proposal]:
-        """The next points; none where all are judged."""
+        """The next points, ``settings.at_once`` at most; none once all are judged."""
         count = min(self.settings.at_once, self.settings.points - len(self.points))
         return [self.study.ask(dict(self.ranges)) for _ in range(count)]
 
@@ -126,12 +126,12 @@ class Search:
         return [[*job, *own, f"{SEED}={seed}"] for job in self.jobs for seed in self.goal.seeds]
 
     def value_of(self, trial: Trial) -> float | None:
-        """The metric of a trial, by its files."""
+        """The metric of a trial, read from its files; None if it has none."""
         record = trial.files.sound_record()
         return None if record is None else record.metrics.get(self.goal.metric)
 
     def judge(self, proposal: Proposal, trials: Sequence[Trial]) -> Point:
-        """Judge a point by the mean of its trials; it has failed where one lacks the metric."""
+        """Judge a point by the mean of its trials. It has failed if one of them lacks the metric."""
         from optuna.trial import TrialState
 
         values = [value for trial in trials if (value := self.value_of(trial)) is not None]
@@ -142,7 +142,7 @@ class Search:
         return point
 
     def record(self) -> TuningRecord:
-        """The ranges that are searched, and the points that were found so far."""
+        """The record of the search: its ranges, and the points so far."""
         return TuningRecord(
             sweep=self.home.name.removesuffix(f"-tune-{self.arm}"),
             arm=self.arm,
@@ -151,78 +151,82 @@ class Search:
             wanted=self.settings.points,
             seeds=list(self.goal.seeds),
             scenes=list(self.scenes),
-            ranges={key: text_of(one) for key, one in self.intervals.items()},
-            log=[key for key, one in self.ranges.items() if getattr(one, "log", False)],
+            ranges={key: value_text(interval) for key, interval in self.intervals.items()},
+            log=[key for key, values in self.ranges.items() if getattr(values, "log", False)],
             as_it_is=self.first is not None,
             points=self.points,
         )
 
 
 def tuned_jobs(
-    begun: Sweep, settings: Any, jobs: Sequence[Sequence[str]], intervals: Sequence[Mapping[str, Override]]
+    sweep: Sweep, settings: Any, jobs: Sequence[Sequence[str]], intervals: Sequence[Mapping[str, Override]]
 ) -> list[list[str]]:
-    """The jobs of a sweep with the values to which each arm is tuned first, in the ``intervals`` that each job has.
+    """Tune each arm in the ``intervals`` of its jobs; returns the jobs with the values found.
 
-    Raises InputError for ``settings`` (``hydra.sweeper.tune``) and intervals that cannot be, and GsbenchError where no
-    point of an arm could be judged.
+    Raises InputError for wrong ``settings`` (``hydra.sweeper.tune``) or intervals, and GsbenchError if no point of an
+    arm could be judged.
     """
-    wanted = TuneSettings(**OmegaConf.to_container(OmegaConf.create(settings)))  # type: ignore[arg-type]
+    tune = TuneSettings(**OmegaConf.to_container(OmegaConf.create(settings)))  # type: ignore[arg-type]
     untuned = [list(job) for job in jobs]
-    if not wanted.points or not any(intervals):
+    if not tune.points or not any(intervals):
         return untuned
-    if not begun.config.launch.wait:
+    if not sweep.config.launch.wait:
         raise InputError(f"{PLACE} learns from results, so launch.wait must be true")
-    trials = begun.trials(jobs)
-    searches = _plan(wanted, jobs, intervals, trials)
+    trials = sweep.trials(jobs)
+    searches = _plan(tune, jobs, intervals, trials)
     tuned = {search.arm: search for search in searches if search.ranges}
-    if begun.task.look_only:
+    if sweep.task.look_only:
         print(_describe(searches))
-    if not _search(begun, list(tuned.values())):
+    if not _search(sweep, list(tuned.values())):
         print("what it will choose is not known yet: the arms are listed as they are")
         return untuned
-    chosen = {arm: _best_words(search) for arm, search in tuned.items()}
-    return [[*job, *chosen.get(trial.folder.parent.name, ())] for job, trial in zip(jobs, trials, strict=True)]
+    best_words = {arm: _best_words(search) for arm, search in tuned.items()}
+    return [[*job, *best_words.get(trial.folder.parent.name, ())] for job, trial in zip(jobs, trials, strict=True)]
 
 
-def _search(begun: Sweep, searches: Sequence[Search]) -> bool:
-    """Propose, train and judge the points of all arms side by side; False where one is only looked at, and missing."""
-    while asked := [(search, proposal) for search in searches for proposal in search.propose()]:
-        words = [search.jobs_of(proposal.params) for search, proposal in asked]
-        trials = begun.trials([job for jobs in words for job in jobs])
-        of_points = [[trials.pop(0) for _ in jobs] for jobs in words]
+def _search(sweep: Sweep, searches: Sequence[ArmSearch]) -> bool:
+    """Propose, train and judge the points of all arms side by side.
+
+    A dry run judges only points whose trials are done already; it returns False at the first that is not.
+    """
+    while proposals := [(search, proposal) for search in searches for proposal in search.propose()]:
+        jobs_by_point = [search.jobs_of(proposal.params) for search, proposal in proposals]
+        # Composed together, because `compose_jobs` composes only once what trials share.
+        trials = iter(sweep.trials([job for jobs in jobs_by_point for job in jobs]))
+        trials_by_point = [[next(trials) for _ in jobs] for jobs in jobs_by_point]
         missing = [
             trial
-            for (search, _), own in zip(asked, of_points, strict=True)
-            for trial in own
+            for (search, _), point_trials in zip(proposals, trials_by_point, strict=True)
+            for trial in point_trials
             if search.value_of(trial) is None
         ]
-        if missing and begun.task.look_only:
+        if missing and sweep.task.look_only:
             return False
         if missing:
-            _write(searches)  # what is searched stands there before it is trained
-            begun.task.launch(missing)
-        for (search, proposal), own in zip(asked, of_points, strict=True):
-            point = search.judge(proposal, own)
+            _write(searches)  # before training, so that the ranges were on record before any result
+            sweep.task.launch(missing)
+        for (search, proposal), point_trials in zip(proposals, trials_by_point, strict=True):
+            point = search.judge(proposal, point_trials)
             if missing:
-                came = "failed" if point.value is None else f"{point.value:.5g}"
-                where, number = ", ".join(words_of_values(point.settings)), len(search.points)
-                place = f"{search.home.name}: point {number} of {search.settings.points}"
-                log.info("%s: %s: %s %s", place, where, search.goal.metric, came)
-    if not begun.task.look_only:
+                value = "failed" if point.value is None else f"{point.value:.5g}"
+                settings, number = ", ".join(words_of_values(point.settings)), len(search.points)
+                title = f"{search.home.name}: point {number} of {search.settings.points}"
+                log.info("%s: %s: %s %s", title, settings, search.goal.metric, value)
+    if not sweep.task.look_only:
         _write(searches)
     return True
 
 
-def _write(searches: Sequence[Search]) -> None:
-    """Write what was found so far where the report looks for it."""
+def _write(searches: Sequence[ArmSearch]) -> None:
+    """Write the records of the searches to their experiments, where the report reads them."""
     for search in searches:
         make_runs_folder(checked_runs_folder(str(search.home.parent)))
         make_home(search.home)
         write_json(search.home / TUNING, search.record().to_json())
 
 
-def _best_words(search: Search) -> list[str]:
-    """The words of the best point of an arm."""
+def _best_words(search: ArmSearch) -> list[str]:
+    """The words of the best point of an arm. Raises GsbenchError if no point has the metric."""
     best, name = search.record().best, search.home.name
     if best is None:
         raise GsbenchError(
@@ -236,15 +240,16 @@ def _best_words(search: Search) -> list[str]:
     return words
 
 
-def _describe(searches: Sequence[Search]) -> str:
-    """A line that a dry run prints of the searches."""
-    one = searches[0]
-    trials = {search.arm: len(search.jobs) * len(one.goal.seeds) for search in searches if search.ranges}
-    left = [search.arm for search in searches if not search.ranges]
+def _describe(searches: Sequence[ArmSearch]) -> str:
+    """The line in which a dry run describes the searches."""
+    first = searches[0]
+    goal, points = first.goal, first.settings.points
+    trials = {search.arm: len(search.jobs) * len(goal.seeds) for search in searches if search.ranges}
+    untuned = [search.arm for search in searches if not search.ranges]
     return (
-        f"tunes first: {counted(one.settings.points, 'point')} each for {listed(list(trials))}, by {one.goal.metric} "
-        f"of validation views on {listed(one.scenes)} with {counted(len(one.goal.seeds), 'seed')}, "
-        f"{sum(trials.values()) * one.settings.points} trainings" + (f"; not tuned: {listed(left)}" if left else "")
+        f"tunes first: {counted(points, 'point')} each for {listed(list(trials))}, by {goal.metric} "
+        f"of validation views on {listed(first.scenes)} with {counted(len(goal.seeds), 'seed')}, "
+        f"{sum(trials.values()) * points} trainings" + (f"; not tuned: {listed(untuned)}" if untuned else "")
     )
 
 
@@ -252,12 +257,12 @@ def _describe(searches: Sequence[Search]) -> str:
 
 
 def _plan(
-    wanted: TuneSettings,
+    tune: TuneSettings,
     jobs: Sequence[Sequence[str]],
     intervals: Sequence[Mapping[str, Override]],
     trials: Sequence[Trial],
-) -> list[Search]:
-    """The search of each arm of a sweep, without ranges where the arm stays as it is.
+) -> list[ArmSearch]:
+    """The search of each arm of a sweep; for an arm that is not tuned it has no ranges.
 
     Raises InputError for what cannot be searched.
     """
@@ -268,39 +273,40 @@ def _plan(
         raise InputError(f"{PLACE}: all trials of the sweep need one name, got {listed(sorted(h.name for h in homes))}")
     if any(trial.values["scene"]["validation"] for trial in trials):
         raise InputError(f"{PLACE} searches on validation views by itself: leave scene.validation out")
-    goal = _goal(wanted, trials)
+    goal = _goal(tune, trials)
     (home,) = homes
-    names = [trial.folder.parent.name for trial in trials]
+    arms = [trial.folder.parent.name for trial in trials]
     searches = []
-    for name in dict.fromkeys(names):
-        places = [place for place, own in enumerate(names) if own == name]
-        given = dict(sorted((key, one) for place in places for key, one in intervals[place].items()))
-        own = [tuple(word for word in jobs[place] if key_of(word) not in REPLACED) for place in places]
-        if both := next((key for key in given if any(key_of(word) == bare(key) for job in own for word in job)), None):
-            raise InputError(f"{both} of {name} is searched in one grid and given in another: leave one of them out")
-        ranges = {key: distribution(one) for key, one in given.items()}
+    for arm in dict.fromkeys(arms):
+        indices = [index for index, name in enumerate(arms) if name == arm]
+        arm_intervals = dict(sorted((key, interval) for i in indices for key, interval in intervals[i].items()))
+        arm_jobs = [tuple(word for word in jobs[i] if key_of(word) not in REPLACED) for i in indices]
+        fixed = {key_of(word) for job in arm_jobs for word in job}
+        if both := next((key for key in arm_intervals if bare_key(key) in fixed), None):
+            raise InputError(f"{both} of {arm} is searched in one grid and given in another: leave one of them out")
+        ranges = {key: distribution(interval) for key, interval in arm_intervals.items()}
         searches.append(
-            Search(
-                arm=name,
-                home=home.with_name(f"{home.name}-tune-{name}"),
-                settings=wanted,
+            ArmSearch(
+                arm=arm,
+                home=home.with_name(f"{home.name}-tune-{arm}"),
+                settings=tune,
                 goal=goal,
-                intervals=given,
+                intervals=arm_intervals,
                 ranges=ranges,
-                jobs=list(dict.fromkeys(own)),
+                jobs=list(dict.fromkeys(arm_jobs)),
                 scenes=list(dict.fromkeys(trial.values["scene"]["name"] for trial in trials)),
-                first=_own_values(trials[places[0]].values, ranges),
+                first=_own_values(trials[indices[0]].values, ranges),
             )
         )
     return searches
 
 
-def _goal(wanted: TuneSettings, trials: Sequence[Trial]) -> Goal:
-    """Raises InputError for a metric that is not known, or of which it is not known whether more of it is better."""
+def _goal(tune: TuneSettings, trials: Sequence[Trial]) -> Goal:
+    """The goal of all searches. Raises InputError for an unknown metric, and for one without a better direction."""
     values = trials[0].values
     declared = {str(trial.values["eval"].get("primary") or "") for trial in trials}
     primary = metric_and_question(declared.pop())[0] if len(declared) == 1 else ""
-    metric = wanted.metric or primary or DEFAULT_METRIC
+    metric = tune.metric or primary or DEFAULT_METRIC
     known = (*known_keys(), *(values["eval"].get("extra") or ()))
     if metric not in known:
         raise InputError(f"{PLACE}.metric={metric}: there is no such metric{closest(metric, known)}")
@@ -308,9 +314,9 @@ def _goal(wanted: TuneSettings, trials: Sequence[Trial]) -> Goal:
     if not sign:
         raise InputError(f"{PLACE}.metric={metric}: whether more or less of it is better is not known")
     try:
-        seeds = tuple(int(text.partition("=")[2]) for (text,) in grid([parse_word(f"{SEED}={wanted.seed}")]))
+        seeds = tuple(int(word.partition("=")[2]) for (word,) in grid_points([parse_word(f"{SEED}={tune.seed}")]))
     except ValueError:
-        raise InputError(f"{PLACE}.seed must list whole numbers, as 100,101, got {wanted.seed!r}") from None
+        raise InputError(f"{PLACE}.seed must list whole numbers, as 100,101, got {tune.seed!r}") from None
     if both := sorted(set(seeds) & {trial.values["seed"] for trial in trials}):
         raise InputError(f"{PLACE}.seed: {listed(list(map(str, both)))} is a seed of the sweep, too: tune with others")
     return Goal(metric, 1 if sign > 0 else -1, seeds)
@@ -320,12 +326,12 @@ def _goal(wanted: TuneSettings, trials: Sequence[Trial]) -> Goal:
 
 
 def distribution(override: Override) -> BaseDistribution:
-    """Return the range of an interval's values; raises InputError for what makes no other trial of an arm."""
+    """The range of an interval, for Optuna. Raises InputError for a wrong interval or a setting that arms share."""
     from optuna.distributions import FloatDistribution, IntDistribution
 
     check_makes_trials(override)
     key = override.get_key_element()
-    if bare(key).partition(".")[0] in (*MEASURED_ON, *REPLACED):
+    if bare_key(key).partition(".")[0] in (*NOT_TUNED, *REPLACED):
         raise InputError(f"{key} belongs to what all arms share, not to one arm: give it a value")
     sweep: Any = override.value()
     low, high, log_scale = sweep.start, sweep.end, "log" in sweep.tags
@@ -344,24 +350,24 @@ def distribution(override: Override) -> BaseDistribution:
 
 
 def _own_values(values: Mapping[str, Any], ranges: Mapping[str, BaseDistribution]) -> dict[str, Any] | None:
-    """The arm's own values of what is searched; None where the ranges lack one, or nothing is searched."""
+    """The arm's own values of the searched settings; None if one lies outside its range, or nothing is searched."""
     settings = flatten(values)
-    found = {key: settings.get(bare(key)) for key in ranges}
-    return found if found and all(_is_in(found[key], one) for key, one in ranges.items()) else None
+    own = {key: settings.get(bare_key(key)) for key in ranges}
+    return own if own and all(_is_in(own[key], searched) for key, searched in ranges.items()) else None
 
 
-def _is_in(value: Any, one: Any) -> bool:
-    """Return whether the range ``one`` has a value, as a point's trials would have it."""
-    if isinstance(value, bool) or not isinstance(value, int | float) or not one.low <= value <= one.high:
+def _is_in(value: Any, searched: Any) -> bool:
+    """Return whether the range ``searched`` contains a value that rounding to `DIGITS` leaves as it is."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not searched.low <= value <= searched.high:
         return False
-    return isinstance(value, int) if isinstance(one.low, int) else _rounded(float(value)) == value
+    return isinstance(value, int) if isinstance(searched.low, int) else _rounded(float(value)) == value
 
 
 def words_of_values(values: Mapping[str, Any]) -> list[str]:
-    """A point as words of a command line."""
+    """The words of a command line that set ``values``."""
     return [f"{key}={f'{value:.{DIGITS}g}' if isinstance(value, float) else value}" for key, value in values.items()]
 
 
 def _rounded(value: Any) -> Any:
-    """A value of a point as its trials have it."""
+    """A value rounded as `words_of_values` writes it."""
     return float(f"{value:.{DIGITS}g}") if isinstance(value, float) else value

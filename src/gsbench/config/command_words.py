@@ -1,4 +1,4 @@
-"""The words of a command line, before Hydra composes anything: each is understood, or refused with a reason."""
+"""The words of a command line, checked before Hydra composes anything: a wrong word is refused with a reason."""
 
 import re
 import shlex
@@ -12,22 +12,22 @@ from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 
 from gsbench.config.schema import COMPONENTS
-from gsbench.config.trust import PACKAGE, PERMISSIONS, is_allowed, to_type
+from gsbench.config.trust import PACKAGE, PERMISSIONS, is_allowed, permission_advice
 from gsbench.errors import InputError
 from gsbench.runs.keys import DECLARED, NOT_HASHED, WITHOUT_EFFECT
 from gsbench.system.install import conf_dir
 from gsbench.words import closest
 
 GROUPS = ("scene", "init", "densify", "raster", "train", "eval", "tracking", "launch", "experiment")
-EXTERNAL_FOLDER = "external"  # below a group: choices that are no arms of gsbench's own, which glob(*) leaves out
-NAMED_APART = ("name", "seed")  # not hashed, and yet each of their values has a trial of its own
+EXTERNAL_FOLDER = "external"  # subfolder of a group for other programs; glob(*) does not list it
+IN_TRIAL_PATH = ("name", "seed")  # not in the configuration's hash, but in the path of the trial's folder
 OPTIONS = ("-m", "--multirun", "--dry-run", "--config-dir", "--cfg", "--info", "--help", "--version")
-MOST_BRACKETS = 40
+MAX_BRACKETS = 40  # open at once in a word, since Hydra's parser recurses into them
 KEY = re.compile(r"[+~]*\w+([./]\w+)*")
 
 
 def parse(argv: Sequence[str]) -> tuple[list[str], bool, bool]:
-    """Overrides, whether to expand lists (``-m``), and whether to only list the trials (``--dry-run``)."""
+    """The overrides, whether to expand lists (``-m``), and whether to only list the trials (``--dry-run``)."""
     overrides: list[str] = []
     folders: list[Path] = []
     multirun = dry_run = False
@@ -54,7 +54,7 @@ def parse(argv: Sequence[str]) -> tuple[list[str], bool, bool]:
 
 
 def search_path(folders: Sequence[Path], overrides: Sequence[str]) -> list[str]:
-    """The entries of Hydra's search path that ``--config-dir`` stands for."""
+    """The word ``hydra.searchpath=…`` that ``--config-dir`` stands for, in a list; empty without folders."""
     if not folders:
         return []
     if len(folders) > 1 or any(word.startswith("hydra.searchpath=") for word in overrides):
@@ -68,14 +68,14 @@ def search_path(folders: Sequence[Path], overrides: Sequence[str]) -> list[str]:
 
 
 def check_words(words: Sequence[str]) -> None:
-    """Raise InputError, one line, for the first word that nothing would read or that Hydra would choke on."""
+    """Raise InputError for the first word that has no effect or that Hydra cannot take."""
     experiments = [word for word in words if word.startswith("+experiment=")]
     if len(experiments) > 1:
         raise InputError(f"{' '.join(experiments)}: two experiments are two sweeps: give a command for each")
     for word in words:
         override = parse_word(word)
         key = override.get_key_element().lstrip("+~")
-        if key.startswith(("hydra.", "hydra/")):  # what of these cannot be is said of the whole (app/command.py)
+        if key.startswith(("hydra.", "hydra/")):  # the rest about them is checked after composition (config/trust.py)
             if override.is_sweep_override():
                 raise InputError(f"{word}: Hydra's own settings apply to all trials, so choose one value")
         elif key == "experiment" or key.startswith(("experiment/", "experiment@", "experiment.")):
@@ -89,8 +89,8 @@ def check_words(words: Sequence[str]) -> None:
 
 
 def typed_permissions(words: Sequence[str]) -> tuple[str, ...]:
-    """The names that a command line allows: those of ``allow_targets=[…]``, the last if it stands there twice."""
-    found: tuple[str, ...] = ()
+    """The names that a command line allows by ``allow_targets=[…]``; if given twice, the last counts."""
+    allowed: tuple[str, ...] = ()
     for word in words:
         override = parse_word(word)
         if override.get_key_element().lstrip("+~") != PERMISSIONS or override.is_sweep_override():
@@ -98,14 +98,15 @@ def typed_permissions(words: Sequence[str]) -> tuple[str, ...]:
         names: Any = override.value()
         if not isinstance(names, list) or not all(isinstance(name, str) and name and "$" not in name for name in names):
             raise InputError(f"{word}: {PERMISSIONS} is a list of names, such as {PERMISSIONS}=[mine]")
-        found = tuple(names)
-    return found
+        allowed = tuple(names)
+    return allowed
 
 
 def check_search_path(words: Sequence[str], allowed: Sequence[str]) -> None:
-    """Refuse a place of configurations that Hydra would import while it composes: ``hydra.searchpath=[pkg://package]``.
+    """Refuse ``hydra.searchpath=[pkg://package]`` for a package that is not ``allowed``.
 
-    Hydra 1.4 takes ``hydra[searchpath]`` and ``extend_list(pkg://package)`` as well.
+    Hydra imports such a package while it composes. Hydra 1.4 also takes ``hydra[searchpath]`` and
+    ``extend_list(pkg://package)``.
     """
     for word in words:
         override = parse_word(word)
@@ -121,20 +122,20 @@ def check_search_path(words: Sequence[str], allowed: Sequence[str]) -> None:
             if scheme != "pkg":
                 raise InputError(f"hydra.searchpath: {place} is neither a folder (file://…) nor a package (pkg://…)")
             if not is_allowed(package, (PACKAGE, *allowed)):
-                advice = to_type([package.split(".")[0]], allowed)
+                advice = permission_advice([package.split(".")[0]], allowed)
                 raise InputError(f"hydra.searchpath: {place} imports a package; if you trust it, {advice}")
 
 
 @cache
 def parse_word(word: str) -> Override:
-    """A word as Hydra reads it. Raises InputError where it is no ``key=value``."""
+    """A word as Hydra reads it. Raises InputError unless it is a ``key=value``."""
     if "=" not in word and not word.startswith("~"):
         raise InputError(f"{word!r} is not a setting like key=value")
-    if brackets(word) > MOST_BRACKETS:
-        raise InputError(f"{word[:40]!r}… opens more than {MOST_BRACKETS} brackets within each other")
+    if bracket_depth(word) > MAX_BRACKETS:
+        raise InputError(f"{word[:40]!r}… opens more than {MAX_BRACKETS} brackets within each other")
     try:
         override = OverridesParser.create().parse_override(word)
-    except ValueError as error:  # such as a number of more digits than Python converts
+    except ValueError as error:  # such as a number with more digits than Python converts
         raise InputError(f"{word[:40]!r}… is not a setting like key=value ({error})") from None
     except HydraException as error:
         reason = re.sub(r",? expecting .*", "", str(error).splitlines()[0])
@@ -145,12 +146,12 @@ def parse_word(word: str) -> Override:
 
 
 def key_of(word: str) -> str:
-    """The setting that a word is about, whatever it does with it."""
+    """The setting that a word sets, adds or removes."""
     return parse_word(word).get_key_element().lstrip("+~")
 
 
-def brackets(word: str) -> int:
-    """The most brackets that are open at once: Hydra's parser goes down by recursion."""
+def bracket_depth(word: str) -> int:
+    """The largest number of brackets that are open at once."""
     depth = deepest = 0
     for letter in word:
         depth += (letter in "[{(") - (letter in "]})")
@@ -159,7 +160,10 @@ def brackets(word: str) -> int:
 
 
 def hint_for(word: str) -> str:
-    """``; did you mean scene=photos?`` for a word that is a choice of some groups, and what a group's name needs."""
+    """A hint for a word that is no setting: ``; did you mean scene=photos?`` for a choice, or how to choose in a group.
+
+    Empty for any other word.
+    """
     if word in GROUPS:
         return f"; {word} is a group: choose one by {word}=NAME ({', '.join(options(word))})"
     groups = [group for group in GROUPS if word in options(group)]
@@ -168,7 +172,7 @@ def hint_for(word: str) -> str:
 
 
 def _quoted(word: str) -> str:
-    """Say how a word would be read whose value has characters that mean something to Hydra."""
+    """A hint that quotes the word's value, for a value with characters that mean something to Hydra."""
     key, _, value = word.partition("=")
     if not KEY.fullmatch(key):
         return ""
@@ -180,11 +184,11 @@ def _quoted(word: str) -> str:
     return f"; special characters need their own quotes inside those of the shell: {shlex.quote(quoted)}"
 
 
-def check_single(words: Sequence[str], mend: str) -> None:
-    """`check_words`, and refuse a list of values, with the ``mend``, where one configuration is asked for."""
+def check_single(words: Sequence[str], advice: str) -> None:
+    """`check_words`, and raise InputError with the ``advice`` for a word that lists several values."""
     check_words(words)
     if swept := [word for word in words if is_sweep(word)]:
-        raise InputError(f"{swept[0]} lists several values: {mend}")
+        raise InputError(f"{swept[0]} lists several values: {advice}")
 
 
 def is_sweep(word: str) -> bool:
@@ -193,7 +197,7 @@ def is_sweep(word: str) -> bool:
 
 
 def check_sweep(override: Override) -> None:
-    """Raise InputError for a list of values whose trials would all be one and the same trial, or cannot be listed."""
+    """Raise InputError for a sweep that has no list of values, or whose values would all give the same trial."""
     if not override.is_discrete_sweep():
         key = override.get_key_element().lstrip("+~")
         raise InputError(
@@ -204,34 +208,34 @@ def check_sweep(override: Override) -> None:
 
 
 def check_makes_trials(override: Override) -> None:
-    """Raise InputError for a setting whose values would all give one and the same trial."""
+    """Raise InputError for a setting whose values would all give the same trial."""
     key = override.get_key_element().lstrip("+~")
     if not makes_other_trials(key):
         raise InputError(f"{override.input_line}: {key} does not make a different trial, so choose one value")
 
 
 def makes_other_trials(key: str) -> bool:
-    """Return whether each value of a setting has a trial of its own."""
+    """Return whether each value of a setting gives a different trial."""
     first, _, last = key.partition(".")
     without_effect = last in (*WITHOUT_EFFECT, *DECLARED.get(first, ()))
-    return not without_effect and (first not in NOT_HASHED or first in NAMED_APART)
+    return not without_effect and (first not in NOT_HASHED or first in IN_TRIAL_PATH)
 
 
 def options(group: str, folders: Sequence[Path] = ()) -> list[str]:
-    """The YAML files of a group that come with gsbench; those of other programs by their folder, ``external/NAME``.
+    """The choices of a group: gsbench's YAML files, then those in the user's ``folders``.
 
-    Those of a user's ``folders`` follow.
+    Other programs are named with their subfolder, ``external/NAME``.
     """
-    found: dict[str, None] = {}
+    names: dict[str, None] = {}  # a set that keeps its order
     for folder in (Path(conf_dir()), *folders):
-        found |= dict.fromkeys(sorted(path.stem for path in Path(folder, group).glob("*.yaml")))
-        others = Path(folder, group, EXTERNAL_FOLDER).glob("*.yaml")
-        found |= dict.fromkeys(sorted(f"{EXTERNAL_FOLDER}/{path.stem}" for path in others))
-    return list(found)
+        names |= dict.fromkeys(sorted(path.stem for path in Path(folder, group).glob("*.yaml")))
+        programs = Path(folder, group, EXTERNAL_FOLDER).glob("*.yaml")
+        names |= dict.fromkeys(sorted(f"{EXTERNAL_FOLDER}/{path.stem}" for path in programs))
+    return list(names)
 
 
 def searched_folders(words: Sequence[str]) -> list[Path]:
-    """The folders of a user's own that ``hydra.searchpath`` among ``words`` names."""
+    """The user's folders that ``hydra.searchpath`` among ``words`` names."""
     values = [parse_word(word).value() for word in words if word.startswith("hydra.searchpath=")]
     places = [str(place) for value in values if isinstance(value, list) for place in value]
     return [Path(place.removeprefix("file://")) for place in places if not place.startswith("pkg://")]
@@ -254,5 +258,5 @@ def _check_deletion(word: str, key: str) -> None:
 
 
 def _is_choice(override: Override) -> bool:
-    """Return whether the value can be one name in a group, a list of them in a sweep, or its settings ({a: 1})."""
+    """Return whether the value can choose in a group: a name, a list of names, or the group's settings ({a: 1})."""
     return override.is_sweep_override() or isinstance(override.value(), str | int | float | dict)

@@ -1,4 +1,4 @@
-"""Hydra's two entrances, composing a configuration and running an app; and its errors in one line."""
+"""The two entry points into Hydra, composing a configuration and running an app, and its errors in one line."""
 
 import os
 import re
@@ -22,9 +22,9 @@ from gsbench.system.install import conf_dir
 from gsbench.words import closest
 
 CONFIG_NAME = "config"  # conf/config.yaml
-# Hydra 1.3 wants to be told whose defaults hold; from 1.4 on there is one set of them, and being told is warned of.
+# Hydra 1.3 warns unless it is told which version's defaults hold; Hydra 1.4 has one set and warns if it is told.
 VERSION_BASE: dict[str, Any] = {"version_base": "1.3"} if hydra.__version__.startswith("1.3.") else {}
-# From 1.4 on Hydra makes objects within this context of the named classes alone (``mine.*``: all of a module).
+# From Hydra 1.4 on: within this context it instantiates the named classes only (``mine.*``: all of a module).
 WHITELIST: Callable[[Sequence[str]], AbstractContextManager[Any]] = getattr(
     hydra.utils, "execution_whitelist", lambda names: nullcontext()
 )
@@ -33,9 +33,9 @@ HYDRAS_LINE = "Error executing job with overrides"
 
 @contextmanager
 def hydra_ready() -> Iterator[None]:
-    """Hydra with gsbench's folder of configurations; where an app of Hydra's runs, it is so already."""
+    """Initialise Hydra with gsbench's configuration folder within the block."""
     register_schemas()
-    if GlobalHydra.instance().is_initialized():
+    if GlobalHydra.instance().is_initialized():  # within `hydra.main`, or in a block of ours
         yield
         return
     try:
@@ -46,29 +46,29 @@ def hydra_ready() -> Iterator[None]:
 
 
 def run_main(task: Callable[[Any], Any], argv: Sequence[str], allowed: Sequence[str] = ()) -> None:
-    """Run ``task`` as the app that ``hydra.main`` makes of it, with the words ``argv``; raises what it raises.
+    """Run ``task`` as an app of ``hydra.main`` with the words ``argv``; raises what ``task`` raises.
 
-    The classes of callbacks are those that ``allowed`` names, and Hydra's own.
+    Hydra may instantiate the callback classes that ``allowed`` names, and its own.
     """
     names = [name for name in allowed if all(part.isidentifier() for part in name.split("."))]
     register_schemas()
-    saved, sys.argv = sys.argv, ["gsbench", *argv]
-    full = os.environ.get("HYDRA_FULL_ERROR")
-    os.environ["HYDRA_FULL_ERROR"] = "1"  # else Hydra prints errors itself, and exits
+    saved_argv, sys.argv = sys.argv, ["gsbench", *argv]
+    saved_full_error = os.environ.get("HYDRA_FULL_ERROR")
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # otherwise Hydra prints errors itself and exits
     stderr, sys.stderr = sys.stderr, _WithoutHydrasLine(sys.stderr)
     try:
         with WHITELIST([*HYDRAS_CALLBACKS, *names, *(f"{name}.*" for name in names)]):
             hydra.main(**VERSION_BASE, config_path=str(conf_dir()), config_name=CONFIG_NAME)(task)()
     finally:
-        sys.argv, sys.stderr = saved, stderr
+        sys.argv, sys.stderr = saved_argv, stderr
         os.environ.pop("HYDRA_FULL_ERROR")
-        if full is not None:
-            os.environ["HYDRA_FULL_ERROR"] = full
+        if saved_full_error is not None:
+            os.environ["HYDRA_FULL_ERROR"] = saved_full_error
         HydraConfig.instance().cfg = None
 
 
 class _WithoutHydrasLine:
-    """Standard error without the line that Hydra writes before it hands on a job's error, which we say ourselves."""
+    """Standard error without the line that Hydra writes before it raises a job's error. gsbench prints that error."""
 
     def __init__(self, stream: Any) -> None:
         self._stream = stream
@@ -82,8 +82,8 @@ class _WithoutHydrasLine:
 
 # ---- errors
 
-MAX_MESSAGE = 400  # characters of an error of Hydra's that is not understood
-HINTS = {  # where a word may name a class of the user's, or a plug-in of Hydra's that is not installed
+MAX_MESSAGE = 400  # characters of a Hydra error that `explain` does not recognise
+HINTS = {  # for a choice that does not exist, by group: the word may name a user's class or a missing plug-in
     **{group: f"; a class of your own is named by {group}._target_" for group in ("densify", "init", "raster")},
     "hydra/launcher": "; other launchers are separate packages; launch=serial, local or slurm need none",
     "hydra/sweeper": "; gsbench has its own; a search is an interval and hydra.sweeper.tune.points",
@@ -94,9 +94,9 @@ Errors = type[Exception] | tuple[type[Exception], ...]
 
 @contextmanager
 def explained(overrides: Sequence[str], errors: Errors = Exception) -> Iterator[None]:
-    """Raise what the block raises of ``errors`` as InputError, one line in terms of the words that were given.
+    """Raise the block's ``errors`` as InputError: one line in terms of the words ``overrides``.
 
-    While Hydra composes, errors of any kind come from what the user gave.
+    The default is any error, since while Hydra composes all errors come from the user's input.
     """
     try:
         yield
@@ -118,8 +118,8 @@ def explain(error: BaseException, overrides: Sequence[str]) -> str:
     )
     if group:
         word = group.group(1)
-        known = [*GROUPS, *_keys_below("", overrides)]
-        return f"{word} is not a group or setting{closest(word, known)} (groups: {', '.join(GROUPS)})"
+        keys = [*GROUPS, *_keys_below("", overrides)]
+        return f"{word} is not a group or setting{closest(word, keys)} (groups: {', '.join(GROUPS)})"
     missing = re.search(
         r"Could not find '([^']+)'.*?Available options in '([^']+)':\s*(.*?)(?:\n\n|Config search|$)", text, re.S
     )
@@ -141,7 +141,7 @@ def explain(error: BaseException, overrides: Sequence[str]) -> str:
 
 
 def _unknown_setting(bad: str, given: str | None, text: str, overrides: Sequence[str]) -> str:
-    """A key ``bad`` that nothing has: ``given`` with the whole key on the command line, else in a file."""
+    """The error for an unknown key ``bad``. ``given`` is the command line's whole key; None for a key in a file."""
     if given and given.startswith("hydra.sweeper.params."):
         return f"{given}: params are for files of experiments; type {given.partition('params.')[2]}=… itself, with -m"
     if bad in ("grids", "tune"):
@@ -151,38 +151,38 @@ def _unknown_setting(bad: str, given: str | None, text: str, overrides: Sequence
     parent = key[: key.rindex(bad)].rstrip(".") if bad in key else key.rpartition(".")[0]
     where = re.search(r"In '([^']+)'", text)
     file = ""
-    if where and not given:  # in a YAML file, whose folder is the group; an experiment's tells the key by its place
+    # A YAML file's folder is the group. In an experiment's file, Hydra's full_key says where the key stands.
+    if where and not given:
         group, _, name = where.group(1).rpartition("/")
         full = re.search(r"full_key: ([\w.]+)", text)
         key = full.group(1) if full and full.group(1).endswith(bad) else f"{group}.{bad}"
         file, parent = f" in {group}/{name}.yaml", key.rpartition(".")[0]
-    known = _keys_below(parent, overrides)
-    own = any(word.startswith(f"{parent}._target_=") for word in overrides)
-    hint = f"; a key that only your class has is added with a plus: +{key}=…" if own else ""
-    near = belongs_to(parent, bad) or closest(bad, known) or _places_of(key)
-    return (
-        f"{key} is not a setting{file}{near}{hint} ({parent or 'top level'} has: {', '.join(known) or 'no settings'})"
-    )
+    keys = _keys_below(parent, overrides)
+    is_users_class = any(word.startswith(f"{parent}._target_=") for word in overrides)
+    hint = f"; a key that only your class has is added with a plus: +{key}=…" if is_users_class else ""
+    near = _belongs_to(parent, bad) or closest(bad, keys) or _groups_with(key)
+    return f"{key} is not a setting{file}{near}{hint} ({parent or 'top level'} has: {', '.join(keys) or 'no settings'})"
 
 
-def _places_of(key: str) -> str:
-    """``; did you mean scene.path?`` for a key without its group."""
+def _groups_with(key: str) -> str:
+    """``; did you mean scene.path?`` for a key that lacks its group; else nothing."""
     groups = [group for group in GROUPS if group != "experiment"] if "." not in key else []
     places = [f"{group}.{key}" for group in groups if key in _keys_below(group, [])]
     return f"; did you mean {' or '.join(places)}?" if places else ""
 
 
-def belongs_to(group: str, key: str) -> str:
-    """``; it belongs to densify=volumetric`` where other choices of a group have the setting; else nothing."""
+def _belongs_to(group: str, key: str) -> str:
+    """``; it belongs to densify=volumetric`` if other choices of a group have the setting; else nothing."""
     if group not in GROUPS:
         return ""
-    states = re.compile(rf"^{re.escape(key)}:", re.M)
+    key_line = re.compile(rf"^{re.escape(key)}:", re.M)
     files = {name: Path(conf_dir(), group, f"{name}.yaml") for name in options(group) if "/" not in name}
-    having = [name for name, file in files.items() if states.search(file.read_text(encoding="utf-8"))]
-    return f"; it belongs to {group}={' or '.join(having[:3])}" if having else ""
+    choices = [name for name, file in files.items() if key_line.search(file.read_text(encoding="utf-8"))]
+    return f"; it belongs to {group}={' or '.join(choices[:3])}" if choices else ""
 
 
 def _chain(error: BaseException | None) -> list[str]:
+    """The messages of an error and of its causes."""
     messages = []
     while error is not None:
         messages.append(str(error))
@@ -191,14 +191,14 @@ def _chain(error: BaseException | None) -> list[str]:
 
 
 def _keys_below(parent: str, overrides: Sequence[str]) -> list[str]:
-    """The settings below ``parent`` with the group choices among ``overrides``, as far as these compose."""
+    """The settings below ``parent``, with the group choices among ``overrides`` if these compose."""
     groups = (*GROUPS, "hydra/launcher", "hydra/sweeper")
     choices = [word for word in overrides if re.fullmatch(r"[\w/]+=[\w/-]+", word) and word.split("=")[0] in groups]
     with hydra_ready():
         try:
             config = hydra.compose(CONFIG_NAME, choices, return_hydra_config=True)
-        except Exception:  # noqa: BLE001 - the choices may be what is wrong
+        except Exception:  # noqa: BLE001 - a choice itself may be wrong
             config = hydra.compose(CONFIG_NAME, [], return_hydra_config=True)
     node = OmegaConf.select(config, parent) if parent else config
-    hidden = "_target_" if parent.startswith("hydra") else "hydra"  # a plug-in is chosen by its name
+    hidden = "_target_" if parent.startswith("hydra") else "hydra"  # Hydra's plug-ins are chosen by name, not by class
     return [str(key) for key in node if key != hidden] if isinstance(node, DictConfig) else []

@@ -1,8 +1,7 @@
-"""The schema of the configuration, its checks, and where ``conf/`` lies. Loads neither torch nor the library
-packages.
+"""The schema of the configuration and its checks. Loads neither torch nor the library packages.
 
-What a key may be stands at its field (see `gsbench.settings`), rules between the keys of a group in its
-``__post_init__``. Hydra gets the names and the defaults alone, so that one mechanism checks every value.
+Each field's annotation says what values its key takes (see `gsbench.settings`). Rules between the keys of a group are
+in its ``__post_init__``. Hydra gets only names and defaults, so that one mechanism checks every value.
 """
 
 import dataclasses
@@ -56,7 +55,7 @@ DeviceName = Annotated[
 
 @dataclass
 class ComponentConfig:
-    """Keys that ``init`` and ``densify`` have in common; their other keys are the options of the class."""
+    """The keys that ``init`` and ``densify`` have in common. Their other keys are the options of the class."""
 
     name: FolderName
     _target_: TargetName
@@ -69,7 +68,7 @@ class TrackingConfig:
     sink: Literal["mlflow", "tensorboard", "wandb"] = "mlflow"
     uri: Address | None = None  # null: $MLFLOW_TRACKING_URI, else sqlite in the runs folder; W&B: $WANDB_BASE_URL
     flush_seconds: PositiveFloat = 10.0
-    patience_seconds: NonNegativeFloat = 30.0  # with a slow tracker, at the end of a sweep; `gsbench sync` mends it
+    patience_seconds: NonNegativeFloat = 30.0  # waiting for a slow tracker at the end; `gsbench sync` sends the rest
     images: NonNegativeInt = 4  # test renders mirrored per trial
     model: bool = False  # keep the PLY as an artifact (MLflow, W&B)
 
@@ -82,11 +81,11 @@ class LaunchConfig:
     name: Literal["serial", "local", "slurm"] = MISSING
     parallel: PositiveInt | Literal["auto"] = 1  # trials at once; auto: as this machine's cores, memory and GPUs allow
     timeout_min: PositiveInt | None = None  # minutes until a trial is stopped with a checkpoint and queued again
-    stop_when_decided: bool = False  # look at eval.primary seed by seed; what is decided gets no further seeds
-    least_difference: PositiveFloat | None = None  # of eval.primary, that matters; null: what papers count as one
-    wait: bool = True  # Slurm only, as are the next: until all trials have ended; false: submit them and leave
-    max_requeues: NonNegativeInt = 20  # how often a trial may run out of time
-    signal_seconds: PositiveInt = 120  # so long before the end a trial is told to save its checkpoint
+    stop_when_decided: bool = False  # look at eval.primary seed by seed; decided pairs of arms get no further seeds
+    least_difference: PositiveFloat | None = None  # least difference of eval.primary that matters; null: the usual one
+    wait: bool = True  # Slurm, as all below: wait until all trials have ended; false: submit them and leave
+    max_requeues: NonNegativeInt = 20  # how often a trial that ran out of time is queued again
+    signal_seconds: PositiveInt = 120  # a trial is told this long before its time limit to save a checkpoint
     cpus_per_trial: PositiveInt | None = None
     gpus_per_trial: NonNegativeInt = 0
     mem_gb: PositiveInt | None = None  # null: the cluster's default
@@ -111,14 +110,14 @@ class LaunchConfig:
 
 @dataclass
 class Config:
-    """The root. ``init`` and ``densify`` are open, so that a user's own class brings its own keys."""
+    """The root. ``init`` and ``densify`` take any keys, because a user's own class has its own options."""
 
     name: ExperimentName = "default"
     seed: Annotated[int, Interval(ge=0, le=MAX_SEED)] = 0
     device: DeviceName = "auto"
     threads: Threads | Literal["auto"] = "auto"
     runs: PathName = MISSING
-    allow_targets: list[str] = field(default_factory=list)  # what the command line allows to run; no file can say it
+    allow_targets: list[str] = field(default_factory=list)  # what may run beside gsbench; only the command line sets it
     scene: SceneConfig = field(default_factory=SceneConfig)
     init: Any = MISSING
     densify: Any = MISSING
@@ -142,7 +141,7 @@ COMPONENTS = ("init", "densify")  # groups whose keys are the options of a class
 
 @cache
 def register_schemas() -> None:
-    """Make the schemas known to Hydra, the groups' under ``schema/`` so that they are not offered as options."""
+    """Register the schemas with Hydra. Those of groups go under ``schema/``, so that they are no choices."""
     store = ConfigStore.instance()
     store.store(name="config_schema", node=_names_and_defaults(Config))
     for group, schema in GROUP_SCHEMAS.items():
@@ -151,7 +150,7 @@ def register_schemas() -> None:
 
 @cache
 def _names_and_defaults(schema: type) -> type:
-    """A dataclass for Hydra with the fields of ``schema`` and no types: `checked_values` says what is allowed."""
+    """A dataclass for Hydra with the fields of ``schema`` but no types, since `checked_values` checks the values."""
     fields: list[tuple[str, Any, Any]] = []
     for entry in dataclasses.fields(schema):
         factory: Any = entry.default_factory
@@ -164,11 +163,10 @@ def _names_and_defaults(schema: type) -> type:
 
 
 def checked_values(config: DictConfig) -> dict[str, Any]:
-    """The resolved values of a composed configuration, without Hydra's: converted (``1e3``), and held against their
-    schemas and each other.
+    """The resolved values of a composed configuration without Hydra's node, converted (``1e3``) and checked.
 
-    The classes that ``init`` and ``densify`` name check their own options when they are made. Raises InputError naming
-    the key.
+    The classes that ``init`` and ``densify`` name check their options themselves, when they are made. Raises InputError
+    naming the key.
     """
     values = plain(config)
     for group in (*GROUP_SCHEMAS, *COMPONENTS):
@@ -177,10 +175,10 @@ def checked_values(config: DictConfig) -> dict[str, Any]:
     for group, schema in GROUP_SCHEMAS.items():
         given = values[group]
         require_values(given, group)
-        if given.get("_target_") is not None:  # the others are options of a user's own class
+        if given.get("_target_") is not None:  # the other keys are options of the user's class
             given = {key: given.get(key) for key in ("name", "_target_")}
         _require_all(schema, given, f"{group}.")
-        values[group] |= plain(_made(schema, given, group))
+        values[group] |= plain(_converted(schema, given, group))
     root = {key: value for key, value in values.items() if key not in (*GROUP_SCHEMAS, *COMPONENTS)}
     _require_all(Config, values, "")
     values |= checked(Config, root, "")
@@ -202,36 +200,36 @@ def checked_values(config: DictConfig) -> dict[str, Any]:
     return values
 
 
-def _made(schema: type, given: Mapping[str, Any], group: str) -> dict[str, Any]:
-    """The settings of an object of ``schema``, whose own checks convert them and hold them against each other."""
-    known = [entry.name for entry in dataclasses.fields(schema)]
+def _converted(schema: type, given: Mapping[str, Any], group: str) -> dict[str, Any]:
+    """The settings ``given``, converted and checked by the class ``schema``."""
+    fields = [entry.name for entry in dataclasses.fields(schema)]
     for name in given:
-        if name not in known:
-            raise InputError(unknown_setting(f"{group}.{name}", name, known))
-    made = schema(**given)
-    return {name: getattr(made, name) for name in given}
+        if name not in fields:
+            raise InputError(unknown_setting(f"{group}.{name}", name, fields))
+    settings = schema(**given)
+    return {name: getattr(settings, name) for name in given}
 
 
 def _require_all(schema: type, given: Mapping[str, Any], prefix: str) -> None:
-    """Raise InputError for the first setting of ``schema`` that was taken away (``~train.iterations``)."""
+    """Raise InputError for the first setting of ``schema`` that was removed (``~train.iterations``)."""
     for name in (entry.name for entry in dataclasses.fields(schema)):
         if name not in given and name != "_target_":
             raise InputError(f"{prefix}{name} was removed: give it a value instead")
 
 
 def require_values(values: Mapping[str, Any], group: str) -> None:
-    """Raise InputError for the first setting of ``group`` that must be given and is not, or of its ``options``."""
+    """Raise InputError for the first mandatory setting of ``group``, or of its ``options``, that has no value."""
     name = values.get("name")
-    whose = f" ({group}={name})" if name not in (None, MISSING) else ""
+    choice = f" ({group}={name})" if name not in (None, MISSING) else ""
     options = values.get("options")
     nested = options if isinstance(options, Mapping) else {}
     for key, value in [*values.items(), *((f"options.{key}", value) for key, value in nested.items())]:
         if value == MISSING:
-            raise InputError(f"{group}.{key} is not set: give it a value{whose}")
+            raise InputError(f"{group}.{key} is not set: give it a value{choice}")
 
 
 def check_external(values: Mapping[str, Any]) -> None:
-    """Check what another program is asked for; raises InputError for what it cannot give."""
+    """Raise InputError for settings that another program cannot follow."""
     require_values(values["densify"], "densify")
     if values["eval"]["at"]:
         raise InputError("eval.at: another program shows its model only at the end: leave eval.at empty")
@@ -242,12 +240,13 @@ def check_external(values: Mapping[str, Any]) -> None:
 
 
 def plain(values: Any) -> Any:
-    """Settings as plain Python, of the types that JSON has (OmegaConf 2.4 keeps tuples); a configuration is resolved,
-    without Hydra's node.
+    """Settings as plain Python values of JSON's types; OmegaConf 2.4 keeps tuples.
+
+    A configuration is resolved, without Hydra's node.
     """
     if isinstance(values, DictConfig):
         own = OmegaConf.masked_copy(values, [str(key) for key in values if key != "hydra"])
-        OmegaConf.copy_cache(values, own)  # one ${now:…} for all trials of a sweep
+        OmegaConf.copy_cache(values, own)  # keeps ${now:…} the same for all trials of a sweep
         return plain(OmegaConf.to_container(own, resolve=True, enum_to_str=True))
     if isinstance(values, dict):
         return {key: plain(value) for key, value in values.items()}

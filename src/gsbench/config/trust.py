@@ -1,10 +1,10 @@
-"""Permissions of a configuration: it may run gsbench's own classes, and what the command line allows.
+"""Permissions: a configuration may run gsbench's own classes, and what the command line allows.
 
-Permission is what the command line says of ``allow_targets``; no file can give it. It names modules (``mine``),
-programs (``bash``) and environment variables (``PATH``). `docs/security.md` says what this protects from.
+Only ``allow_targets`` on the command line gives permission; no file can. It names modules (``mine``), programs
+(``bash``) and environment variables (``PATH``). `docs/security.md` says what this protects from.
 
-`check_composed` looks at what a command line composes, Hydra's own settings included, before Hydra makes any object of
-it; `check_permissions` at the resolved values of each trial, before its parts are made. Loads no Hydra by itself.
+`check_composed` checks a composed configuration, Hydra's own settings included, before Hydra makes any object of it.
+`check_permissions` checks the resolved values of each trial before its parts are made. Loads no Hydra by itself.
 """
 
 import importlib
@@ -27,11 +27,11 @@ TARGET = "_target_"
 PERMISSIONS = "allow_targets"  # the setting that says what may run; it counts on the command line only
 PACKAGE = "gsbench"
 COMPONENTS = ("init", "densify", "raster")  # groups that name one class each; `eval.extra` names any number
-EXTERNAL = ("gsbench.densify.External", "gsbench.external.settings.External")  # names of the class: another program
-SHELL, SBATCH = "bash", "sbatch"  # the permissions for lines of a shell, and for unusual options of Slurm
-# Variables that a configuration may set: they choose numbers of threads and devices. No list of the dangerous ones
-# could be complete: MPLBACKEND imports a module, NUMBA_CACHE_DIR unpickles, CUDA_INJECTION64_PATH and GCONV_PATH load
-# libraries, CC names a program.
+EXTERNAL = ("gsbench.densify.External", "gsbench.external.settings.External")  # import paths of one class
+SHELL, SBATCH = "bash", "sbatch"  # the permissions for shell lines, and for unusual options of Slurm
+# Variables that a configuration may set: they choose numbers of threads and devices. This is a list of harmless ones,
+# since no list of dangerous ones could be complete: MPLBACKEND imports a module, NUMBA_CACHE_DIR unpickles,
+# CUDA_INJECTION64_PATH and GCONV_PATH load libraries, CC names a program.
 FREE_VARIABLES = frozenset(
     """
     OMP_NUM_THREADS OMP_THREAD_LIMIT OMP_DYNAMIC OMP_PROC_BIND OMP_PLACES OMP_SCHEDULE OMP_STACKSIZE OMP_WAIT_POLICY
@@ -40,8 +40,8 @@ FREE_VARIABLES = frozenset(
     HIP_VISIBLE_DEVICES ROCR_VISIBLE_DEVICES TZ
     """.split()  # noqa: SIM905 - words are easier to read than a list of 20 quoted ones
 )
-# Options of sbatch that choose resources, of Slurm's manual. Others can run a program (task_prolog), a container, or
-# hand variables on (export).
+# Options of sbatch that choose resources (from Slurm's manual). Others can run a program (task_prolog), start a
+# container, or pass on variables (export).
 SBATCH_RESOURCES = frozenset(
     """
     account begin clusters comment constraint contiguous core_spec cores_per_socket cpu_freq cpus_per_gpu cpus_per_task
@@ -52,24 +52,24 @@ SBATCH_RESOURCES = frozenset(
     time time_min tmp use_min_nodes wckey
     """.split()  # noqa: SIM905
 )
-BARE = re.compile(r"[\w./+-]+")  # what needs no quotes in a list on the command line
+UNQUOTED = re.compile(r"[\w./+-]+")  # a name that needs no quotes in a list on the command line
 
-# ---- of Hydra's own settings
-SPECIAL_KEYS = (  # what Hydra reads beside _target_
+# ---- Hydra's own settings
+SPECIAL_KEYS = (  # keys by which Hydra instantiates objects, beside _target_
     "_recursive_", "_convert_", "_args_", "_partial_", "_isolate_", "_execution_whitelist_"
 )  # fmt: skip
 OWN_SWEEPER = "hydra_plugins.gsbench.GsbenchSweeper"
-# Launchers that are looked for among the installed plug-ins. Others can run a line in a shell, as submitit's can.
+# The launchers that may be used, if installed. Others can run shell lines, as submitit's can.
 LAUNCHERS = ("GsbenchLauncher", "BasicLauncher", "JoblibLauncher")
 HYDRAS_CALLBACKS = tuple(
     f"hydra.experimental.callbacks.{name}" for name in ("LogJobReturnCallback", "PickleJobInfoCallback")
 )
-# Settings of Hydra's that stay as conf/config.yaml has them, and why. Some start code: sweepers and logging name
-# classes, and a variable can name what Python, a library or a program loads.
+# Hydra's settings that must stay as in conf/config.yaml, and the error's advice. Some would start code: logging names
+# classes, and a variable can name a file that Python, a library or a program loads.
 RUNS_TRIALS = "gsbench runs the trials itself, as launch=serial, local or slurm says: leave it out"
 IN_LOG = "log.txt in a trial's folder holds everything: leave it out"
 NO_LOGGING = {"version": 1, "root": None, "disable_existing_loggers": False}
-FIXED: dict[str, tuple[Any, str]] = {
+FIXED_SETTINGS: dict[str, tuple[Any, str]] = {
     "output_subdir": (None, RUNS_TRIALS),
     "run": ({"dir": "."}, RUNS_TRIALS),
     "sweep": ({"dir": "${runs}/.hydra", "subdir": "."}, RUNS_TRIALS),
@@ -79,29 +79,29 @@ FIXED: dict[str, tuple[Any, str]] = {
     "job_logging": (NO_LOGGING, IN_LOG),
     "hydra_logging": (NO_LOGGING, IN_LOG),
 }
-# Resolvers that make texts and numbers. Those that make mappings of texts (oc.create, oc.decode, oc.dict) could make a
-# class's name after it was looked for; others, of plug-ins, could do anything.
+# Resolvers that make only texts and numbers. Resolvers that turn texts into mappings (oc.create, oc.decode, oc.dict)
+# could create a `_target_` after the check; resolvers of plug-ins could do anything.
 RESOLVERS = ("hydra", "now", "oc.env", "oc.select", "python_version")
-# Values of Hydra 1.4's own, whose resolvers join the words of a job; with arguments they would call other resolvers.
+# Hydra 1.4's own values, whose resolvers join the words of a job. With arguments they would call other resolvers.
 HYDRAS_VALUES = ("${hydra_override_dirname:}", "${hydra_deprecated_override_dirname:}")
-PUBLIC_CLASS = re.compile(rf"{PACKAGE}\.\w+\.[A-Z]\w*")  # known by its name; importing it may take seconds
-# Settings that a file's sweep may not give its jobs: the look at the whole comes before these are composed.
+PUBLIC_CLASS = re.compile(rf"{PACKAGE}\.\w+\.[A-Z]\w*")  # not imported for the check, which may take seconds
+# Settings that a sweep in a file may not vary: its jobs are composed after the check of the whole configuration.
 NOT_SWEPT = re.compile(rf"[\s+~]*(hydra|{PERMISSIONS})\s*([./@:=\[]|$)")
 
 
 def is_allowed(target: str, allowed: Sequence[str]) -> bool:
-    """Return whether ``target``, the import path of a class, is one of ``allowed`` or lies below it."""
+    """Return whether ``target``, the import path of a class, is one of ``allowed`` or lies below one."""
     return any(target == prefix or target.startswith(prefix.rstrip(".") + ".") for prefix in allowed)
 
 
-def to_type(missing: Sequence[str], allowed: Sequence[str]) -> str:
-    """The word to be typed so that ``missing`` is allowed beside what is: ``allow_targets=[mine,bash]``."""
-    names = [name if BARE.fullmatch(name) else repr(name) for name in dict.fromkeys([*allowed, *missing])]
+def permission_advice(missing: Sequence[str], allowed: Sequence[str]) -> str:
+    """Advice for an error: the word ``allow_targets=[…]`` that allows ``missing`` beside what is ``allowed``."""
+    names = [name if UNQUOTED.fullmatch(name) else repr(name) for name in dict.fromkeys([*allowed, *missing])]
     return f"add allow_targets=[{','.join(names)}] to the command; no file can allow it"
 
 
 def check_target(target: str | None, group: str, allowed: Sequence[str], own: Sequence[str] = (PACKAGE,)) -> None:
-    """Refuse a ``_target_`` outside ``own`` and what the user ``allowed``: importing it would run its code."""
+    """Refuse a ``_target_`` outside ``own`` and what the user ``allowed``, since importing it would run its code."""
     if not target:
         raise InputError(f"{group} names no _target_: the class to use")
     if is_allowed(target, (*own, *allowed)) and target != PACKAGE:
@@ -110,64 +110,62 @@ def check_target(target: str | None, group: str, allowed: Sequence[str], own: Se
     if prefix == PACKAGE:
         raise InputError(f"{group}.{TARGET}={target} is not a class for {group}")
     near = closest(prefix, allowed)
-    advice = to_type([prefix], allowed)
+    advice = permission_advice([prefix], allowed)
     raise InputError(f"{group}.{TARGET}={target} is not gsbench's own{near}; if you trust that code, {advice}")
 
 
 def load_class(target: str, group: str, allowed: Sequence[str]) -> Any:
-    """Load the class at the import path ``target``; it must be of gsbench or of a module that the user ``allowed``.
-
-    A name that a trusted module merely imported (``mine.Popen``) is somebody else's code. Raises InputError.
-    """
+    """Load the class at the import path ``target``. Raises InputError unless it is gsbench's or ``allowed``."""
     check_target(target, group, allowed)
-    module, _, name = target.rpartition(".")
+    module_name, _, name = target.rpartition(".")
     missing = object()
     try:
-        place = importlib.import_module(module)
-        found = getattr(place, name, missing)
+        module = importlib.import_module(module_name)
+        cls = getattr(module, name, missing)
     except (Exception, SystemExit) as error:  # importing a user's file runs it: it may raise anything
-        reason = f"{type(error).__name__}: {error}{_beside(error)}"
+        reason = f"{type(error).__name__}: {error}{_import_advice(error)}"
         raise InputError(f"{group}.{TARGET}={target} cannot be imported ({reason})") from error
-    if found is missing:
+    if cls is missing:
         raise InputError(
-            f"{group}.{TARGET}={target} cannot be imported: {module} has no {name}{closest(name, dir(place))}"
+            f"{group}.{TARGET}={target} cannot be imported: {module_name} has no {name}{closest(name, dir(module))}"
         )
-    home = f"{getattr(found, '__module__', None)}.{getattr(found, '__qualname__', name)}"
-    if isinstance(found, type) and not is_allowed(home, (PACKAGE, *allowed)):
-        advice = to_type([home.split(".")[0]], allowed)
-        raise InputError(f"{group}.{TARGET}={target} is {home}; if you trust that code, {advice}")
-    return found
+    # A name that an allowed module merely imports (`mine.Popen`) is somebody else's code.
+    defined_as = f"{getattr(cls, '__module__', None)}.{getattr(cls, '__qualname__', name)}"
+    if isinstance(cls, type) and not is_allowed(defined_as, (PACKAGE, *allowed)):
+        advice = permission_advice([defined_as.split(".")[0]], allowed)
+        raise InputError(f"{group}.{TARGET}={target} is {defined_as}; if you trust that code, {advice}")
+    return cls
 
 
-def _beside(error: BaseException) -> str:
-    """The mend where a module is missing that lies in another folder, or beside an allowed one without being so."""
+def _import_advice(error: BaseException) -> str:
+    """Advice for a missing module that lies in another folder, or in the folder of an allowed one; else nothing."""
     if not isinstance(error, ModuleNotFoundError):
         return ""
-    name, known = (error.name or "").split(".")[0], allowed_modules()
-    if name in known:
-        return f"; your modules are looked for where the command is given: {known[name]}"
-    if name and any(Path(place, f"{name}.py").is_file() or Path(place, name).is_dir() for place in known.values()):
+    name, folders = (error.name or "").split(".")[0], allowed_modules()
+    if name in folders:
+        return f"; your modules are looked for where the command is given: {folders[name]}"
+    if name and any(Path(place, f"{name}.py").is_file() or Path(place, name).is_dir() for place in folders.values()):
         return f"; it lies here, but only what allow_targets names is imported from here: add {name} there"
     return ""
 
 
 def check_permissions(values: Mapping[str, Any]) -> None:
-    """Refuse the resolved configuration of a trial that would make run what its ``allow_targets`` does not name.
+    """Refuse the resolved configuration of a trial that would run what its ``allow_targets`` does not name.
 
-    This is the last check, of plain values, whatever file or command line they came from. Raises InputError.
+    This is the last check, of plain values, from any file or command line. Raises InputError.
     """
     allowed = values.get(PERMISSIONS) or []
-    # A class that nobody allowed may stand anywhere, also within the options of one that is: its owner may build it.
+    # At any depth: an allowed class may build the classes that its own options name.
     for place, target in targets_in(values):
         group = ".".join(place)
-        check_target(target, group, allowed, homes_of(place))
+        check_target(target, group, allowed, packages_allowed_at(place))
     if is_external(values["densify"]):
         check_program(values["densify"], allowed)
     _check_launch(values["launch"], allowed)
 
 
 def targets_in(values: Any, place: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
-    """Yield every ``_target_`` at any depth, lists included, with the keys that lead to the mapping that has it."""
+    """Yield every ``_target_`` at any depth, lists included, as (keys that lead to its mapping, the target)."""
     if isinstance(values, Mapping):
         if values.get(TARGET) is not None:
             yield place, values[TARGET]
@@ -178,8 +176,8 @@ def targets_in(values: Any, place: tuple[str, ...] = ()) -> Iterator[tuple[tuple
             yield from targets_in(value, (*place, str(number)))
 
 
-def homes_of(place: Sequence[str]) -> tuple[str, ...]:
-    """The packages of gsbench whose classes may stand at a place of the configuration without the user's permission."""
+def packages_allowed_at(place: Sequence[str]) -> tuple[str, ...]:
+    """The packages of gsbench whose classes a place of the configuration may name without permission."""
     if len(place) == 1 and place[0] in COMPONENTS:
         own = f"{PACKAGE}.{place[0]}"
         return (own, f"{PACKAGE}.external") if place[0] == "densify" else (own,)
@@ -189,13 +187,13 @@ def homes_of(place: Sequence[str]) -> tuple[str, ...]:
 
 
 def check_composed(config: DictConfig, allowed: Sequence[str]) -> None:
-    """Refuse a composed configuration, with Hydra's node, that would make run what was not ``allowed``.
+    """Refuse a composed configuration, with Hydra's node, that would run what is not ``allowed``.
 
-    What is looked at is what stands there, before ``${…}`` is resolved: where that could change what is run, it is
-    refused. Raises InputError.
+    The values are checked before ``${…}`` is resolved. An interpolation that could change what runs is refused. Raises
+    InputError.
     """
     raw: Any = OmegaConf.to_container(config, resolve=False)
-    if "hydra" in raw:  # else Hydra has taken it already: it runs the job
+    if "hydra" in raw:  # Hydra removes its node when it runs a job
         _check_hydra(raw["hydra"])
     for place, key, value in _entries(raw):
         if isinstance(value, str) and "${" in value:
@@ -207,7 +205,7 @@ def check_composed(config: DictConfig, allowed: Sequence[str]) -> None:
 
 
 def _entries(values: Any, place: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], str, Any]]:
-    """Every key and value at any depth, lists included, with the keys that lead there."""
+    """Yield every entry at any depth, lists included, as (keys that lead there, its key, its value)."""
     if isinstance(values, dict | list):
         for key, value in values.items() if isinstance(values, dict) else enumerate(values):
             yield place, str(key), value
@@ -218,11 +216,11 @@ def _check_interpolation(place: tuple[str, ...], key: str, value: str) -> None:
     where = ".".join((*place, key))
     if place == ("hydra", "job") and value in HYDRAS_VALUES:
         return
-    if key.startswith("_") and key.endswith("_"):  # the name that is looked at would not be the one that is imported
+    if key.startswith("_") and key.endswith("_"):  # the checked name would not be the imported one
         raise InputError(f"{where}={value}: write the name itself here, since ${{…}} may become another")
     try:
         resolvers = list(_resolvers(parse(value)))
-    except GrammarParseError:  # nothing can be made of it; Hydra says so where somebody asks for the value
+    except GrammarParseError:  # OmegaConf cannot resolve it either, and says so when the value is read
         return
     for name in resolvers:
         if name == "hydra" and place[:1] != ("hydra",):
@@ -232,7 +230,7 @@ def _check_interpolation(place: tuple[str, ...], key: str, value: str) -> None:
 
 
 def _resolvers(tree: Any) -> Iterator[str]:
-    """The names of the resolvers in a parsed text; one that is itself an interpolation as it is written."""
+    """The names of the resolvers in a parsed text. A name that is itself an interpolation is yielded as written."""
     if type(tree).__name__ == "ResolverNameContext":
         yield tree.getText()
     for child in getattr(tree, "children", None) or []:
@@ -240,37 +238,41 @@ def _resolvers(tree: Any) -> Iterator[str]:
 
 
 def _check_place(place: tuple[str, ...], target: Any, allowed: Sequence[str]) -> None:
-    """Refuse a class at a ``place``: Hydra imports what a name leads to, and calls it."""
+    """Refuse a ``target`` that its ``place`` may not name: Hydra would import and call it."""
     if not isinstance(target, str) or target == "???" or place in (("hydra", "launcher"), ("hydra", "sweeper")):
-        return  # a schema, Hydra or `_check_hydra` says what is wrong with it
+        return  # the schema, Hydra or `_check_hydra` reports these
     group = ".".join(place)
-    # Of gsbench's own classes each is for its group: `densify._target_=gsbench.init.…` would run another's constructor.
-    own = HYDRAS_CALLBACKS if place[:2] == ("hydra", "callbacks") and len(place) == 3 else homes_of(place)
+    # gsbench's classes are allowed in their own group only: `densify._target_=gsbench.init.…` is refused.
+    own = HYDRAS_CALLBACKS if place[:2] == ("hydra", "callbacks") and len(place) == 3 else packages_allowed_at(place)
     check_target(target, group, allowed, own)
     if is_allowed(target, (PACKAGE,)) and not PUBLIC_CLASS.fullmatch(target):
-        load_class(target, group, allowed)  # such as gsbench.densify.adc.torch.load
+        load_class(target, group, allowed)  # refuses names such as gsbench.densify.adc.torch.load
 
 
 def _check_hydra(hydra: dict[str, Any]) -> None:
-    """Refuse of Hydra's own settings what is not read here, and what would start code."""
-    for name, (fixed, why) in FIXED.items():
+    """Refuse Hydra's own settings that have no effect here or would start code."""
+    for name, (fixed, advice) in FIXED_SETTINGS.items():
         group, _, key = name.partition(".")
-        found = hydra.get(group) if not key else hydra[group].get(key)
-        if isinstance(fixed, dict) and (isinstance(found, dict) or found is None):
-            found = {**fixed, **(found or {})}
-        if found != fixed:
-            raise InputError(f"hydra.{name}: {why}")
+        value = hydra.get(group) if not key else hydra[group].get(key)
+        if isinstance(fixed, dict) and (isinstance(value, dict) or value is None):
+            value = {**fixed, **(value or {})}
+        if value != fixed:
+            raise InputError(f"hydra.{name}: {advice}")
     launcher, sweeper = hydra["launcher"], hydra["sweeper"]
     if sweeper.get(TARGET) != OWN_SWEEPER:
         raise InputError("hydra.sweeper: gsbench has its own, which searches intervals, too: leave hydra/sweeper out")
-    # ${…} may stand for a mapping with a class in it, of which Hydra would make an object when it makes these.
-    made = {"callbacks": hydra["callbacks"], "launcher": launcher, "sweeper": sweeper | {"params": None, "grids": None}}
-    for place, key, value in _entries(made, ("hydra",)):
+    # Hydra instantiates these, and ${…} may stand for a mapping that names a class.
+    plugins = {
+        "callbacks": hydra["callbacks"],
+        "launcher": launcher,
+        "sweeper": sweeper | {"params": None, "grids": None},
+    }
+    for place, key, value in _entries(plugins, ("hydra",)):
         if isinstance(value, str) and "${" in value:
             raise InputError(f"{'.'.join((*place, key))}: write the settings themselves here, without ${{…}}")
     if not isinstance(launcher, dict) or launcher.get(TARGET) not in known_launchers():
         raise InputError("hydra.launcher: gsbench works with basic and joblib, beside launch=serial, local and slurm")
-    # A job is composed after this look: its words may search packages.
+    # A job is composed after this check, and its words could name packages to import configurations from.
     for place, key, value in _entries(sweeper, ("hydra", "sweeper")):
         for text in (key, value) if key != TARGET else ():
             if isinstance(text, str) and NOT_SWEPT.match(text):
@@ -281,36 +283,36 @@ def _check_hydra(hydra: dict[str, Any]) -> None:
 
 
 def known_launchers() -> set[str]:
-    """The import paths of `LAUNCHERS`, as far as they are installed."""
+    """The import paths of those `LAUNCHERS` that are installed."""
     from hydra.core.plugins import Plugins
     from hydra.plugins.launcher import Launcher
 
-    every = Plugins.instance().discover(Launcher)
-    return {f"{found.__module__}.{found.__name__}" for found in every if found.__name__ in LAUNCHERS}
+    installed = Plugins.instance().discover(Launcher)
+    return {f"{cls.__module__}.{cls.__name__}" for cls in installed if cls.__name__ in LAUNCHERS}
 
 
 def load_callbacks(callbacks: Any, allowed: Sequence[str]) -> None:
-    """Import the classes that ``hydra.callbacks`` names, of which Hydra will make objects; refuse what is none."""
+    """Import the callback classes that ``hydra.callbacks`` names. Raises InputError for what is no such class."""
     from hydra.experimental.callback import Callback
 
     for name, callback in (callbacks or {}).items():
         if not isinstance(callback, Mapping) or not callback.get(TARGET):
             raise InputError(f"hydra.callbacks.{name} names no {TARGET}: the class to use")
         for place, target in targets_in(callback, ("hydra", "callbacks", str(name))):
-            found = load_class(target, ".".join(place), [*allowed, *HYDRAS_CALLBACKS])
-            if not isinstance(found, type) or (len(place) == 3 and not issubclass(found, Callback)):
+            cls = load_class(target, ".".join(place), [*allowed, *HYDRAS_CALLBACKS])
+            if not isinstance(cls, type) or (len(place) == 3 and not issubclass(cls, Callback)):
                 wanted = "a class of hydra.experimental.callback.Callback" if len(place) == 3 else "a class"
                 raise InputError(f"{'.'.join(place)}.{TARGET}={target} is not {wanted}")
 
 
 def is_external(densify: Mapping[str, Any]) -> bool:
-    """Return whether these settings are another program's; by a path other than `EXTERNAL` nothing builds the class."""
+    """Return whether these settings are another program's. The class is built under the names `EXTERNAL` only."""
     return densify.get(TARGET) in EXTERNAL
 
 
 def check_program(settings: Mapping[str, Any], allowed: Sequence[str]) -> None:
-    """Refuse another trainer whose programs or variables the user did not allow."""
-    # A YAML of somebody's may call any program of this machine a trainer, or load code into one by a variable.
+    """Refuse a program as trainer if the user did not allow the programs it starts and the variables it sets."""
+    # A YAML file may call any program of this machine a trainer, or load code into one by a variable.
     options = settings.get("options") or {}
     programs = [program_of(settings.get("command") or "", options)]
     if settings.get("version_command") is not None:
@@ -320,15 +322,15 @@ def check_program(settings: Mapping[str, Any], allowed: Sequence[str]) -> None:
     if not programs and not variables:
         return
     runs = [f"runs the program {' and '.join(map(repr, programs))}"] * bool(programs)
-    sets = [f"sets {shown(variables)}"] * bool(variables)
+    sets = [f"sets {variables_text(variables)}"] * bool(variables)
     raise InputError(
         f"densify={settings['name']} {' and '.join(runs + sets)}; if you trust it, "
-        + to_type([*programs, *variables], allowed)
+        + permission_advice([*programs, *variables], allowed)
     )
 
 
 def foreign_variables(variables: Mapping[str, Any], allowed: Sequence[str]) -> dict[str, Any]:
-    """List the ``variables`` that a configuration may not set: neither free, nor allowed, nor as they are already."""
+    """The ``variables`` that a configuration may not set: not free, not allowed, and not set to this value already."""
     return {
         name: value
         for name, value in variables.items()
@@ -336,22 +338,23 @@ def foreign_variables(variables: Mapping[str, Any], allowed: Sequence[str]) -> d
     }
 
 
-def shown(variables: Mapping[str, Any]) -> str:
+def variables_text(variables: Mapping[str, Any]) -> str:
     """Variables with their values, for a message."""
     return ", ".join(f"{name}={value!r}" for name, value in variables.items())
 
 
 def _check_launch(launch: Mapping[str, Any], allowed: Sequence[str]) -> None:
-    """Refuse lines for a shell, and what could become one in the script that Slurm runs."""
+    """Refuse lines for a shell, and values that could become one in the script that Slurm runs."""
     if launch.get("setup") and SHELL not in allowed:
         raise InputError(
             f"launch.setup runs {'; '.join(map(str, launch['setup']))!r} in a shell; if you trust it, "
-            + to_type([SHELL], allowed)
+            + permission_advice([SHELL], allowed)
         )
     options = {str(name).replace("-", "_"): value for name, value in (launch.get("sbatch") or {}).items()}
-    if (others := sorted(options.keys() - SBATCH_RESOURCES)) and SBATCH not in allowed:
+    if (not_resources := sorted(options.keys() - SBATCH_RESOURCES)) and SBATCH not in allowed:
         raise InputError(
-            f"launch.sbatch.{others[0]} chooses more than resources; if you trust it, " + to_type([SBATCH], allowed)
+            f"launch.sbatch.{not_resources[0]} chooses more than resources; if you trust it, "
+            + permission_advice([SBATCH], allowed)
         )
     texts = {f"launch.{name}": launch.get(name) for name in ("partition", "account", "qos")}
     texts |= {f"launch.sbatch.{name}": value for name, value in options.items()}

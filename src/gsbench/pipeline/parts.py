@@ -1,4 +1,4 @@
-"""The parts of a trial: what its configuration describes, as objects, with errors that name the key."""
+"""The parts of a trial: the objects that its configuration describes. Errors name the configuration's key."""
 
 import dataclasses
 import inspect
@@ -17,9 +17,9 @@ from gsbench.config.trust import (
     check_permissions,
     check_program,
     check_target,
-    homes_of,
     is_external,
     load_class,
+    packages_allowed_at,
     targets_in,
 )
 from gsbench.densify import Densifier
@@ -45,13 +45,14 @@ from gsbench.words import closest
 
 log = logging.getLogger(__name__)
 
-# Offers of rasterizers beyond the contract, by the attribute with which a densifier asks; and a refusal in words.
-ASKED_OF_RENDERS = {
+# Features of a render that not every rasterizer has: the densifier's attribute that asks for it -> (the rasterizer's
+# attribute that offers it, the error's words).
+OPTIONAL_FEATURES = {
     "needs_footprint": ("has_footprint", "needs the pixels that a Gaussian covers, and raster={} does not give them"),
     "needs_splitting_matrix": ("has_splitting_matrix", "needs splitting matrices, and raster={} does not give them"),
 }
 RESERVED = ("_target_", "name", "switches")  # keys of a group that are not options of its class
-METHODS = {
+REQUIRED_METHODS = {  # of a user's class, by the group that names it
     "init": ("needs_reference", "content", "run"),
     "densify": ("prepare", "begin", "observe", "refine", "after_step"),
     "raster": ("render",),
@@ -60,13 +61,13 @@ METHODS = {
 
 
 class Parts:
-    """Objects that the resolved configuration ``values`` describes; each is made when it is first asked for, and kept.
+    """The objects that the resolved configuration ``values`` describes. Each is made at its first use and kept.
 
-    Asking for one raises InputError that names a wrong key; a part of the user's own class runs its code then.
+    The first use raises InputError for a wrong key. It also runs the user's code if the class is the user's own.
     """
 
     def __init__(self, values: dict[str, Any]) -> None:
-        check_permissions(values)  # whatever file they came from
+        check_permissions(values)  # again: `values` may come from a config.yaml that nobody has composed
         self.values = values
         self.seed: int = values["seed"]
         self._allowed: list[str] = values["allow_targets"]
@@ -88,29 +89,29 @@ class Parts:
         values = self.values["init"]
         if values.get("threads") == "auto" and values["_target_"].startswith(OWN):  # else COLMAP takes all cores
             values = values | {"threads": self.threads}
-        made: Initializer = build("init", values, self._allowed)
-        return made
+        initializer: Initializer = build("init", values, self._allowed)
+        return initializer
 
     @cached_property
     def trainer(self) -> Densifier | External:
         """The trainer that the group densify describes: a densifier of gsbench's own trainer, or another program."""
-        made: Densifier | External = build("densify", self.values["densify"], self._allowed)
-        return made
+        trainer: Densifier | External = build("densify", self.values["densify"], self._allowed)
+        return trainer
 
     @property
     def densifier(self) -> Densifier:
-        """The densifier that edits the Gaussians where gsbench trains."""
+        """The densifier. Only for a trial that gsbench itself trains."""
         assert isinstance(self.trainer, Densifier)
         return self.trainer
 
     @property
     def program(self) -> External | None:
-        """The other program that trains, if one does."""
+        """The program that trains instead of gsbench; None where gsbench trains."""
         return self.trainer if isinstance(self.trainer, External) else None
 
     @cached_property
     def own_rasterizer(self) -> Rasterizer | None:
-        """The rasterizer where it is a class of the user's own; None where it goes by a name."""
+        """The user's own rasterizer; None where the configuration names one of gsbench's."""
         return build_own_rasterizer(self.values["raster"], self._allowed)
 
     @cached_property
@@ -120,7 +121,7 @@ class Parts:
 
     @cached_property
     def device(self) -> torch.device:
-        """The device of this machine that the trial runs on."""
+        """The device of this machine on which the trial runs."""
         return select_device(self.values["device"])
 
     @cached_property
@@ -132,15 +133,15 @@ class Parts:
     @cached_property
     def rasterizer(self) -> Rasterizer:
         """The rasterizer for ``device``."""
-        made = self.own_rasterizer
-        if made is None:
-            made = create_rasterizer(self.values["raster"]["name"], self.device, self.threads)
-        self._check_offers(made.name)
-        return made
+        rasterizer = self.own_rasterizer
+        if rasterizer is None:
+            rasterizer = create_rasterizer(self.values["raster"]["name"], self.device, self.threads)
+        self._check_features(rasterizer.name)
+        return rasterizer
 
     @cached_property
     def evaluator(self) -> Evaluator:
-        """The evaluator that measures the renders; looks for the weights of networks."""
+        """The evaluator that measures the renders. Making it looks for the weights of networks."""
         return make_evaluator(self.eval, self.device, self.metrics)
 
     @cached_property
@@ -151,39 +152,39 @@ class Parts:
 
     @property
     def measured_earlier(self) -> list[int]:
-        """The iterations before the last at which the test views are measured as well."""
+        """The iterations before the last at which the test views are measured too."""
         return sorted({step for step in self.eval.at if step < self.train.iterations})
 
     def check(self, here: bool) -> None:
-        """Refuse before any work what is known to fail; what was made for it stays.
+        """Raise InputError, which names the key, for what is known to fail. Call it before any work.
 
-        With ``here``, the trial will run on this machine, whose devices are known. Raises InputError naming the key.
+        With ``here`` the trial will run on this machine, so its devices and programs are checked too.
         """
         _ = self.initializer, self.trainer, self.metrics
         name, own = self.values["raster"]["name"], self.own_rasterizer
         if here and self.program is not None:
             self.program.executable()
         if own is not None or name != AUTO:
-            self._check_offers(name if own is None else own.name)
+            self._check_features(name if own is None else own.name)
         if here:
             device = self.device
             if own is None and name != AUTO:
                 resolve(name, device.type)
 
-    def _check_offers(self, raster: str) -> None:
-        check_offers(self.trainer, self.values["densify"]["name"], raster, self.own_rasterizer)
+    def _check_features(self, raster: str) -> None:
+        check_features(self.trainer, self.values["densify"]["name"], raster, self.own_rasterizer)
 
 
 def build(group: str, values: dict[str, Any], allow_targets: list[str]) -> Any:
     """The object that ``values`` of ``group`` (init, densify, raster, eval.extra.NAME) describes.
 
-    ``_target_`` names a class by its import path; the other keys are its arguments. gsbench's own classes hold them
-    against their annotations themselves; for a user's dataclass this is done here, before its code sees them. Raises
-    InputError naming the key that is unknown or wrong.
+    ``_target_`` names a class by its import path; the other keys are its arguments. gsbench's own classes check them
+    against their annotations. For a user's dataclass this is done here, before its code sees them. Raises InputError
+    naming the key that is unknown or wrong.
     """
     target = values["_target_"]
-    for place, named in targets_in(values, tuple(group.split("."))):
-        check_target(named, ".".join(place), allow_targets, homes_of(place))
+    for place, nested_target in targets_in(values, tuple(group.split("."))):
+        check_target(nested_target, ".".join(place), allow_targets, packages_allowed_at(place))
     external = group == "densify" and is_external(values)
     if external:
         check_program(values, allow_targets)
@@ -214,29 +215,32 @@ def build(group: str, values: dict[str, Any], allow_targets: list[str]) -> Any:
 
 
 def _check_fields(cls: type, target: str, options: dict[str, Any], group: str) -> None:
-    """Raise InputError for a setting that the user's class lacks, mostly one of the choice that it started from."""
-    known = [field.name for field in option_fields(cls)]
-    if strange := next((name for name in options if name not in known), None):
-        key = f"{group}.{strange}"
+    """Raise InputError for a setting that the user's class lacks.
+
+    Such a setting mostly belongs to the choice (``densify=adc``) whose class the user replaced.
+    """
+    fields = [field.name for field in option_fields(cls)]
+    if unknown := next((name for name in options if name not in fields), None):
+        key = f"{group}.{unknown}"
         raise InputError(
-            f"{key} is not a setting{closest(strange, known)} ({target} has: {', '.join(known) or 'none'}); remove it "
-            f"by ~{key}, or start from another choice, {group}=NAME"
+            f"{key} is not a setting{closest(unknown, fields)} ({target} has: {', '.join(fields) or 'none'}); remove "
+            f"it by ~{key}, or start from another choice, {group}=NAME"
         )
 
 
 def build_rasterizer(
     values: dict[str, Any], allow_targets: list[str], device: torch.device, threads: int | None = None
 ) -> Rasterizer:
-    """The rasterizer that ``values`` of the group raster describes: a class of the user's own, or one by name.
+    """The rasterizer that ``values`` of the group raster describes: the user's own class, or one of gsbench's by name.
 
-    Raises InputError where it cannot run on ``device``.
+    Raises InputError if it cannot run on ``device``.
     """
     own = build_own_rasterizer(values, allow_targets)
     return create_rasterizer(values["name"], device, threads) if own is None else own
 
 
 def build_own_rasterizer(values: dict[str, Any], allow_targets: list[str]) -> Rasterizer | None:
-    """The user's own rasterizer; None where ``values`` of the group raster name one of gsbench's."""
+    """The user's own rasterizer; None if ``values`` of the group raster name one of gsbench's."""
     if values.get("_target_") is None:
         return None
     rasterizer: Rasterizer = build("raster", values, allow_targets)
@@ -249,19 +253,19 @@ def build_own_rasterizer(values: dict[str, Any], allow_targets: list[str]) -> Ra
     return rasterizer
 
 
-def check_offers(densifier: Any, arm: str, raster: str, own: Any = None) -> None:
-    """Raise InputError where densify=``arm`` asks a render for something that raster=``raster`` does not give.
+def check_features(densifier: Any, arm: str, raster: str, own: Any = None) -> None:
+    """Raise InputError if densify=``arm`` needs a feature that raster=``raster`` lacks.
 
-    ``own`` is the rasterizer if it is a user's.
+    ``own`` is the rasterizer object if it is the user's.
     """
-    for asked, (offer, words) in ASKED_OF_RENDERS.items():
-        if getattr(densifier, asked, False) and not offers(raster, offer, own):
+    for need, (offer, words) in OPTIONAL_FEATURES.items():
+        if getattr(densifier, need, False) and not offers(raster, offer, own):
             able = " or ".join(f"raster={executor.name}" for executor in EXECUTORS if getattr(executor, offer))
             raise InputError(f"densify={arm} {words.format(raster)}; take {able}")
 
 
 def build_metrics(values: dict[str, Any], allow_targets: list[str]) -> dict[str, Metric]:
-    """The user's own metrics that the settings ``eval`` name. Raises InputError for one that cannot be used."""
+    """The user's own metrics that the settings ``eval`` name. Raises InputError for an unusable one."""
     metrics: dict[str, Metric] = {}
     for name, options in values.get("extra", {}).items():
         metrics[name] = build(f"eval.extra.{name}", options, allow_targets)
@@ -285,30 +289,39 @@ def _check_names(cls: Any, options: dict[str, Any], group: str) -> None:
 
 
 def locate(target: str, group: str, allow_targets: list[str]) -> type:
-    """The class at the import path ``package.module.Class``, which must be one that ``group`` can use."""
-    before = set(sys.modules)
-    found = load_class(target, group, allow_targets)
-    lacking = [method for method in METHODS[group.partition(".")[0]] if not callable(getattr(found, method, None))]
-    if not isinstance(found, type) or lacking:
+    """The class at the import path ``package.module.Class``. Raises InputError if ``group`` cannot use it.
+
+    Warns of code whose version the results cannot record.
+    """
+    loaded_before = set(sys.modules)
+    cls = load_class(target, group, allow_targets)
+    required = REQUIRED_METHODS[group.partition(".")[0]]
+    lacking = [method for method in required if not callable(getattr(cls, method, None))]
+    if not isinstance(cls, type) or lacking:
         without = f": it has no {', '.join(lacking)}()" if lacking else ""
         raise InputError(f"{group}._target_={target} is not a class for {group}{without}")
     if target.startswith(OWN):
-        return found
-    module, named = target.split(".")[0], {name.split(".")[0] for name in allow_targets}
-    if module_digest(module) is None:  # the first call notes the files as they are, while they are what runs
+        return cls
+    module, permitted = target.split(".")[0], {name.split(".")[0] for name in allow_targets}
+    # The first call keeps the digest of the files. It must come right after the import: later they may be edited, and
+    # the digest would be of code that does not run.
+    if module_digest(module) is None:
         log.warning("no file of %s was found: results do not record its version", target)
-    if unnamed := unnamed_modules(before, {module, *named}):
+    if unnamed := unnamed_modules(loaded_before, {module, *permitted}):
         words = ", ".join(unnamed)
         log.warning(
             "%s imports %s, and results do not record their versions: name them in allow_targets too", target, words
         )
-    return found
+    return cls
 
 
 def make_evaluator(
     options: EvalConfig, device: torch.device | str = "cpu", extra: Mapping[str, Metric] = MappingProxyType({})
 ) -> Evaluator:
-    """The evaluator that the settings ``eval`` describe, with the user's own metrics; looks for networks' weights."""
+    """The evaluator that the settings ``eval`` describe, with the user's own metrics ``extra``.
+
+    Looks for the weights of networks.
+    """
     weights = None if options.weights is None else Path(options.weights).expanduser()
     protocol = get_protocol(options.protocol)
     lpips, more = tuple(options.lpips), tuple(options.more)

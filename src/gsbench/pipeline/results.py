@@ -1,4 +1,4 @@
-"""Content of a finished trial's ``results.json``, from the results of its steps."""
+"""Content of a finished trial's ``results.json``, put together from the results of its steps."""
 
 import sys
 from collections.abc import Mapping
@@ -46,10 +46,10 @@ def results_of(
     entries: Mapping[str, Entry],
     code: Mapping[str, str],
 ) -> TrialRecord:
-    """The results of the trial with the configuration ``values``; ``entries`` are those of its steps, by stage.
+    """The results of the trial with the configuration ``values``.
 
-    ``capture`` are the photographs, ``raster`` the executor that rendered, ``code`` the rooms of gsbench that had a
-    part, with their states.
+    ``capture`` are the photographs, ``raster`` names the executor that rendered, ``entries`` are the steps' store
+    entries by stage. ``code`` maps the parts of gsbench's source that the steps used to their states.
     """
     init, trained, evaluated = entries[INIT.name], entries[TRAIN.name], entries[EVALUATE.name]
     training, evaluation = read_training(trained.path), read_evaluation(evaluated.path)
@@ -68,7 +68,7 @@ def results_of(
         iterations=training.iterations,
         metrics=evaluation.metrics,
         unavailable=evaluation.unavailable,
-        measured=manifest.created,  # of what came from the store: when it came there
+        measured=manifest.created,  # of an evaluation found in the store: when it was put there
         declared=_declared(values),
         awaited=evaluation.awaited,
         metric_facts=evaluation.facts,
@@ -110,12 +110,12 @@ def results_of(
         evaluated_from=training.evaluated_from,
     )
     if training.trained_by is not None:
-        return _by_program(results, training, training.trained_by)
+        return _trained_by_program(results, training, training.trained_by)
     return results if training.iterations else _without_training(results)
 
 
-def _by_program(results: TrialRecord, training: Training, trainer: Trainer) -> TrialRecord:
-    """The results of a training by another program, which may have left renders alone."""
+def _trained_by_program(results: TrialRecord, training: Training, trainer: Trainer) -> TrialRecord:
+    """The results of a training by another program, which may have left only renders and no model."""
     unknown = {}
     if training.evaluated_from == FROM_RENDERS:
         unknown["gaussians"] = RENDERS_ALONE
@@ -130,30 +130,33 @@ def _by_program(results: TrialRecord, training: Training, trainer: Trainer) -> T
 
 
 def _declared(values: dict[str, Any]) -> Declared | None:
-    """The metric that the verdict was declared to be about when the trial was run, and since when; else nothing."""
+    """The newest declaration of the trial's primary metric, which its verdict is about; None if there is none."""
     home = TrialFolder.of(values).home
     metric = values["eval"].get("primary")
-    said = [
+    declarations = [
         declaration
         for declaration in read_declarations(home)
         if not declaration.of_claims and declaration.primary == metric
     ]
-    return said[-1].summary() if said else None
+    return declarations[-1].summary() if declarations else None
 
 
 def _without_training(results: TrialRecord) -> TrialRecord:
-    """The results of a model that came as it is: what its training took is not known, rather than nothing."""
+    """The results of a model that came ready-made: its training time is unknown, not 0."""
     unknown = dict.fromkeys(("train_time", "total_time"), f"{MADE_ELSEWHERE}: not trained here")
     return replace(
         results,
         evaluated_from=FROM_MODEL,
-        seconds={stage: taken for stage, taken in results.seconds.items() if stage != TRAIN.name},
+        seconds={stage: seconds for stage, seconds in results.seconds.items() if stage != TRAIN.name},
         unavailable=results.unavailable | unknown,
     )
 
 
 def cloud_hash(init: Path) -> str:
-    """The hash of what an initialiser made: cameras, poses and points, or Gaussians. Its key is only of its inputs."""
+    """The hash of what an initialiser made: cameras, poses and points, or Gaussians.
+
+    The step's key cannot stand for it: that is a hash of the inputs only.
+    """
     files = read_manifest(init).outputs
     model = (f"{MODEL_FOLDER.as_posix()}/", GAUSSIANS_FILE)
     kept = {name: file.sha256 for name, file in files.items() if name.startswith(model)}
@@ -162,5 +165,5 @@ def cloud_hash(init: Path) -> str:
 
 def versions() -> dict[str, str]:
     """Versions of what a result depends on."""
-    found = {"python": sys.version.split()[0], "gsbench": __version__}
-    return found | {package: known for package in PACKAGES if (known := version_of(package)) is not None}
+    own = {"python": sys.version.split()[0], "gsbench": __version__}
+    return own | {package: version for package in PACKAGES if (version := version_of(package)) is not None}

@@ -1,4 +1,4 @@
-"""One trial: its steps in order, from its parts; and its way from configuration to ``results.json``."""
+"""One trial: its steps in order, and how it gets from a configuration to ``results.json``."""
 
 import logging
 import time
@@ -8,7 +8,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-import pycolmap  # noqa: F401 - here, so that what its import does to signals can be undone
+import pycolmap  # noqa: F401 - its import replaces signal handlers, which `take_signals_back` then restores
 import torch
 
 from gsbench.config.compose import Trial
@@ -22,7 +22,7 @@ from gsbench.pipeline.results import results_of
 from gsbench.pipeline.steps.evaluate import evaluate_step
 from gsbench.pipeline.steps.external import external_step
 from gsbench.pipeline.steps.init import init_step
-from gsbench.pipeline.steps.scene import CaptureSource, Views, ground_truth_step, masked, masked_step
+from gsbench.pipeline.steps.scene import CaptureSource, Views, ground_truth_step, masked_capture, masking_step
 from gsbench.pipeline.steps.train import train_step
 from gsbench.runs import layout
 from gsbench.runs.keys import EVALUATE, GROUND_TRUTH, INIT, TRAIN, Stage, Step
@@ -43,33 +43,34 @@ PUBLISHED_TRAINING = (
 
 
 class TrialSteps:
-    """A trial before, while and after its steps are built; each step's result is found in ``store`` under its key."""
+    """The steps of a trial. The result of each is kept in ``store`` under the step's key."""
 
-    photographs: Capture  # the user's photographs; known, as the next, once `steps` is past the making of photographs
-    capture: Capture  # what the steps look at: without what masks ignore
+    # `steps` sets these three as it goes.
+    photographs: Capture  # the photographs as the user gave them
+    capture: Capture  # the photographs as the steps see them: masked and transparent pixels are replaced
     views: Views
 
     def __init__(self, parts: Parts, store: Store) -> None:
         self.parts, self.store = parts, store
 
     def steps(self) -> Iterator[Step]:
-        """The steps in order. A caller that wants results builds each before it asks for the next.
+        """The steps in order. A caller that wants results builds each step before it asks for the next.
 
-        Keys chain without building, with one exception: the courtyard's photographs must be rendered before their
-        fingerprint is known, so where they are not in the store, theirs is the last step.
+        Keys are known without building, with one exception: the courtyard's photographs must be rendered before their
+        fingerprint is known. While they are missing from the store, the step that renders them is the last.
         """
         parts, store = self.parts, self.store
         source = CaptureSource(parts.scene)
-        made = source.step
-        if made is not None:
-            yield made
-            if store.find(made) is None:
+        capture_step = source.step
+        if capture_step is not None:
+            yield capture_step
+            if store.find(capture_step) is None:
                 return
-        self.capture = self.photographs = source.read(None if made is None else store.path(made))
-        replaced = masked_step(self.photographs, parts.scene.transparent)
-        if replaced is not None:
-            yield replaced
-            self.capture = masked(self.photographs, store.path(replaced))
+        self.capture = self.photographs = source.read(None if capture_step is None else store.path(capture_step))
+        masking = masking_step(self.photographs, parts.scene.transparent)
+        if masking is not None:
+            yield masking
+            self.capture = masked_capture(self.photographs, store.path(masking))
         reference = None
         if parts.initializer.needs_reference(self.capture):
             reference = init_step(store, self.capture, Sfm(threads=parts.threads))
@@ -85,10 +86,10 @@ class TrialSteps:
 
 
 def run_trial(trial: Trial, wait: bool = True) -> TrialRecord:
-    """Run the trial, or find it done; returns what ``results.json`` holds.
+    """Run the trial unless it is done; returns what ``results.json`` holds.
 
-    On failure ``failed.json`` and ``log.txt`` in the trial's folder say why, and the error is raised again. Where
-    another process runs this trial, waits for it, or raises BusyError if ``wait`` is False.
+    On failure, ``failed.json`` and ``log.txt`` in the trial's folder say why, and the error is raised again. If another
+    process runs this trial, this waits for it, or raises BusyError if ``wait`` is False.
     """
     take_signals_back()
     folder = trial.files
@@ -106,7 +107,7 @@ def run_trial(trial: Trial, wait: bool = True) -> TrialRecord:
 
 @contextmanager
 def _recorded_failures(values: dict[str, Any], folder: TrialFolder) -> Iterator[None]:
-    """Write down why the block failed; code of the trial that ends the process has failed, whatever its exit code."""
+    """Write ``failed.json`` if the block fails. Code that ends the process has failed, even with exit code 0."""
     try:
         with storage_errors(folder.runs):
             try:
@@ -126,18 +127,18 @@ def _recorded_failures(values: dict[str, Any], folder: TrialFolder) -> Iterator[
             seed=values["seed"],
             bad_input=isinstance(error, InputError),
         )
-        with suppress(OSError):  # on a full disk the error itself has to do
+        with suppress(OSError):  # a full disk: the raised error is all that the user gets
             write_json(folder.path / FAILED, {"status": "failed"} | failure.to_json())
         raise
 
 
 def _run(trial: Trial, folder: TrialFolder) -> TrialRecord:
-    """Build every step, show its files in the trial's folder, write the results."""
+    """Build every step, link its files into the trial's folder, write the results."""
     values = trial.values
     with _recorded_failures(values, folder):
         parts = Parts(values)
         parts.check(here=True)
-        _ = parts.rasterizer  # which may refuse this machine, before hours of work
+        _ = parts.rasterizer  # raises now, not after hours of work, if it cannot run on this machine
         torch.set_num_threads(parts.threads)
 
         def announce(stage: Stage, place: Path) -> None:
@@ -146,30 +147,31 @@ def _run(trial: Trial, folder: TrialFolder) -> TrialRecord:
         store = Store(folder.runs / layout.STORE, announce)
         write_text(folder.path / CONFIG, trial.yaml)
         (folder.path / FAILED).unlink(missing_ok=True)
-        pipeline = TrialSteps(parts, store)
+        trial_steps = TrialSteps(parts, store)
         entries: dict[str, Entry] = {}
         code: dict[str, str] = {}
-        for step in pipeline.steps():
+        for step in trial_steps.steps():
             if step.stage.name == TRAIN.name:
-                scene = pipeline.views.scene
+                scene = trial_steps.views.scene
                 log.info("%s: %d training and %d test views", folder.label, len(scene.train), len(scene.test))
             entries[step.stage.name] = entry = store.get(step)
             code |= step.code
             if step.stage is INIT:
                 link_or_copy(entry.path / REPORT_FILE, folder.path / layout.INIT_REPORT)
-        results = results_of(values, pipeline.capture, pipeline.views.scene, parts.rasterizer.name, entries, code)
+        results = results_of(values, trial_steps.capture, trial_steps.views.scene, parts.rasterizer.name, entries, code)
         published = _publish(folder.path, entries)
         made_of = {stage.name: entries[stage.name].path for stage in (INIT, TRAIN, GROUND_TRUTH, EVALUATE)}
-        again = folder.write_finished(values, results, source_files(pipeline.photographs, store), made_of, published)
+        sources = source_files(trial_steps.photographs, store)
+        was_done = folder.write_finished(values, results, sources, made_of, published)
         (folder.path / BUILDING).unlink(missing_ok=True)
     metrics = "  ".join(f"{key} {value:.4g}" for key, value in results.metrics.items())
     size = "" if results.num_gaussians is None else f"  {results.num_gaussians} Gaussians"
-    log.info("%s: %s%s%s", folder.label, metrics, size, "  (was done)" if again else "")
+    log.info("%s: %s%s%s", folder.label, metrics, size, "  (was done)" if was_done else "")
     return results
 
 
 def source_files(capture: Capture, store: Store) -> list[Path]:
-    """The user's files that a capture was read from; none for a scene that was made in the store."""
+    """The user's files from which a capture was read; none for a scene that gsbench made in the store."""
     if capture.images.resolve().is_relative_to(store.root.resolve()):
         return []
     images = [(capture.images / name).resolve() for name in capture.image_names]
@@ -178,7 +180,7 @@ def source_files(capture: Capture, store: Store) -> list[Path]:
 
 
 def _publish(folder: Path, entries: Mapping[str, Entry]) -> list[Path]:
-    """Show the steps' files in the trial's folder; returns what is shown."""
+    """Link the steps' files into the trial's folder, or copy them; returns the new paths."""
     init, trained, evaluated = (entries[stage.name].path for stage in (INIT, TRAIN, EVALUATE))
     links = {folder / name: trained / name for name in PUBLISHED_TRAINING if (trained / name).exists()}
     links[folder / layout.PER_VIEW] = evaluated / layout.PER_VIEW

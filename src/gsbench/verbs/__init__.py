@@ -1,4 +1,4 @@
-"""The verbs of the command line, one module each: ``main(argv, runs) -> exit code``, ``runs`` being the runs folder."""
+"""The verbs of the command line: modules with ``main(argv, runs) -> exit code``, where ``runs`` is the runs folder."""
 
 VERBS = {  # what each is for
     "fetch": "download public scenes: Mip-NeRF 360, Tanks and Temples, Deep Blending",

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from gsbench.analysis.results import TrialResult, read_experiment
-from gsbench.app.command import first_trials
+from gsbench.app.command import one_trial_per_scene
 from gsbench.claims.gate import BASELINE, NEW, Gate, ask, describe, first_worse, most_steps, result_of
 from gsbench.claims.stopping import Planned, run_looks
 from gsbench.errors import InputError, TrainingError
@@ -112,7 +112,7 @@ class Search:
 
 def _begin(options: argparse.Namespace, trees: WorkTrees, commits: Sequence[tuple[str, str, str]]) -> Search:
     """Look at the words, and declare the question of all steps before the first."""
-    first = first_trials("bisect", options.settings, options.metric)
+    first = one_trial_per_scene("bisect", options.settings, options.metric)
     some = next(iter(first.values()))
     for trial in first.values():
         place = trial.values["scene"].get("path")

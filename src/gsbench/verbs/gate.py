@@ -6,7 +6,7 @@ from pathlib import Path
 
 from gsbench.analysis.cells import select_trials
 from gsbench.analysis.results import TrialResult, group_by, read_experiment
-from gsbench.app.command import first_trials, run_trials
+from gsbench.app.command import one_trial_per_scene, run_trials
 from gsbench.claims.archive import unpack_archive
 from gsbench.claims.gate import NEW, NOT_DECIDED, PASSED, WORSE, Gate, ask, describe, deviations, result_of
 from gsbench.claims.stopping import Planned, run_looks
@@ -34,7 +34,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
     parser.add_argument("--seeds", type=int, help="the largest number of seeds; default: all that the archive has")
     add_where(parser)
     options = parser.parse_args(argv)
-    first = first_trials("gate", options.settings, options.metric)
+    first = one_trial_per_scene("gate", options.settings, options.metric)
     some = next(iter(first.values()))
     home = some.files.home
     with tempfile.TemporaryDirectory() as folder:

@@ -6,7 +6,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from gsbench.config.command_words import check_search_path, check_single, parse_word, search_path, typed_permissions
-from gsbench.config.compose import compose_whole, has_part
+from gsbench.config.compose import compose_whole, has_key
 from gsbench.config.hydra_entry import hydra_ready, run_main
 from gsbench.errors import InputError
 from gsbench.verbs.arguments import ArgumentParser
@@ -39,7 +39,7 @@ def _check(overrides: list[str], config_dir: Path | None, package: str | None) -
     check_single(overrides, "choose one whose configuration is shown")
     with hydra_ready():
         config = compose_whole([*search_path([config_dir] if config_dir else [], overrides), *overrides])
-    if package is not None and not has_part(config, package):
+    if package is not None and not has_key(config, package):
         raise InputError(f"--package {package}: there is no such part of the configuration")
 
 

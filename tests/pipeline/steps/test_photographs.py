@@ -14,7 +14,7 @@ from PIL import Image
 
 from gsbench.errors import InputError
 from gsbench.pipeline.steps import scene as scene_steps
-from gsbench.pipeline.steps.scene import CaptureSource, Views, ground_truth_step, masked, masked_step
+from gsbench.pipeline.steps.scene import CaptureSource, Views, ground_truth_step, masked_capture, masking_step
 from gsbench.runs.keys import INIT, Step
 from gsbench.runs.store import Store
 from gsbench.scene.masks import read_mask
@@ -60,8 +60,8 @@ def test_pixels_are_replaced_where_a_mask_or_a_colour_behind_them_asks_for_it(
     told: list[tuple[int, int]] = []
     monkeypatch.setattr(scene_steps, "progress", lambda title: nullcontext(lambda _, *counts: told.append(counts)))
     bare, masks = read_photos("own", str(photographs)), read_photos("own", str(photographs), masks="masks")
-    assert masked_step(bare, "black") is None  # as they are read anyway
-    steps = [masked_step(capture, behind) for capture, behind in ((bare, "white"), (masks, "white"), (masks, "black"))]
+    assert masking_step(bare, "black") is None  # as they are read anyway
+    steps = [masking_step(capture, behind) for capture, behind in ((bare, "white"), (masks, "white"), (masks, "black"))]
     assert len({step.key for step in steps if step is not None}) == 3
     for name, step in zip(("white", "both", "masks"), steps, strict=True):
         assert step is not None
@@ -73,11 +73,11 @@ def test_pixels_are_replaced_where_a_mask_or_a_colour_behind_them_asks_for_it(
     assert (read["white"][:, :15] == 255).all()
     assert (read["white"][:, 15:] == [10, 20, 30]).all()
     assert (read["both"][10:, :15] == 255).all()
-    found = masked(masks, tmp_path / "both")
+    found = masked_capture(masks, tmp_path / "both")
     assert found.images == tmp_path / "both" / "images"
     for name in masks.image_names:
         np.testing.assert_array_equal(read_mask(found.masks[name]), read_mask(masks.masks[name]))
-    assert masked(bare, tmp_path / "white").masks == {}
+    assert masked_capture(bare, tmp_path / "white").masks == {}
 
 
 def test_ground_truth_is_the_test_views_and_their_masks(tmp_path: Path, tiny_scene: Scene) -> None:

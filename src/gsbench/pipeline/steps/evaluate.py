@@ -1,4 +1,4 @@
-"""Evaluation: the test views rendered at 8 bits and measured by the protocol; the metrics read what the PNGs hold."""
+"""Evaluation: renders the test views at 8 bits, as the PNGs hold them, and measures them by the protocol."""
 
 from __future__ import annotations
 
@@ -38,34 +38,35 @@ from gsbench.train.trainer import snapshot_file
 if TYPE_CHECKING:
     from gsbench.pipeline.parts import Parts
 
-EXTRA = "eval.extra"  # where a configuration has the user's own metrics
-TIMED_RENDERS = 5  # of each view, for its speed
+EXTRA = "eval.extra"  # the setting that names the user's own metrics
+TIMED_RENDERS = 5  # of each view, to measure the speed
 
 
 def evaluate_step(views: Views, trained: Step, parts: Parts) -> Step:
-    """Render and measure the model of ``trained``, and its snapshots of earlier iterations; or renders as they are.
+    """The step that renders and measures the model of ``trained`` and its snapshots of earlier iterations.
 
-    ``eval.maps`` also pictures large Gaussians; ``eval.fps`` is the size at which the speed of rendering is measured.
+    Where another program left renders instead of a model, the step measures those. ``eval.maps`` adds a picture of the
+    large Gaussians; ``eval.fps`` is the image size at which the speed of rendering is measured.
     """
     evaluator, size, user = parts.evaluator, parts.eval.fps, parts.user_code
     inputs: dict[str, Any] = {
         "protocol": evaluator.protocol.id,
-        "unavailable": sorted(evaluator.unavailable),  # so that weights that arrive later are used
+        "unavailable": sorted(evaluator.unavailable),  # part of the key: weights that arrive later give a new result
         **_further_metrics(evaluator, user, size),
     }
     if parts.program is not None and not parts.program.leaves_model:
-        return step_of(EVALUATE, {"renders": trained.key} | inputs, _measuring(views, trained, parts), user)
+        return step_of(EVALUATE, {"renders": trained.key} | inputs, _build_from_renders(views, trained, parts), user)
     inputs |= {"train": trained.key, "maps": parts.eval.maps}
     if parts.measured_earlier:
         inputs["earlier"] = parts.measured_earlier
-    if parts.program is not None:  # the key of a training by another program knows nothing of the rendering
+    if parts.program is not None:  # the key of `trained` covers the rendering only if gsbench trained
         background = list(parts.train.background)
         inputs |= {"raster": rasterizer_inputs(parts.rasterizer, user), "background": background}
-    return step_of(EVALUATE, inputs, _rendering(views, trained, parts), user)
+    return step_of(EVALUATE, inputs, _build_from_model(views, trained, parts), user)
 
 
-def _rendering(views: Views, trained: Step, parts: Parts) -> Callable[[Path], None]:
-    """A build that renders the model of ``trained`` and measures that."""
+def _build_from_model(views: Views, trained: Step, parts: Parts) -> Callable[[Path], None]:
+    """A build function that renders the model of ``trained`` and measures the renders."""
     rasterizer, evaluator, device = parts.rasterizer, parts.evaluator, parts.device
 
     def build(folder: Path) -> None:
@@ -90,7 +91,7 @@ def _rendering(views: Views, trained: Step, parts: Parts) -> Callable[[Path], No
         with progress("evaluate") as report:
             per_view = measure(gaussians, "views", folder / RENDERS)
             for step in parts.measured_earlier:
-                if (snapshot := training / snapshot_file(step)).exists():  # else a limit of time came first
+                if (snapshot := training / snapshot_file(step)).exists():  # else train.max_seconds ended it before
                     model = read_ply(snapshot, device)
                     means = summarize(measure(model, f"iteration {step}", None), evaluator.unavailable)
                     at[str(step)] = Earlier(metrics=means, num_gaussians=len(model))
@@ -104,8 +105,8 @@ def _rendering(views: Views, trained: Step, parts: Parts) -> Callable[[Path], No
     return build
 
 
-def _measuring(views: Views, trained: Step, parts: Parts) -> Callable[[Path], None]:
-    """A build that measures the renders that another program left in ``trained``, as they are."""
+def _build_from_renders(views: Views, trained: Step, parts: Parts) -> Callable[[Path], None]:
+    """A build function that measures the renders that another program left in ``trained``."""
     evaluator = parts.evaluator
 
     def build(folder: Path) -> None:
@@ -123,7 +124,7 @@ def _measuring(views: Views, trained: Step, parts: Parts) -> Callable[[Path], No
 
 
 def _further_metrics(evaluator: Evaluator, user: UserCode, size: Sequence[int] | None) -> dict[str, Any]:
-    """The user's own metrics, ``eval.more`` and ``eval.fps`` as they enter a key; nothing where there are none."""
+    """The user's own metrics, ``eval.more`` and ``eval.fps`` as they enter a key; unset ones are left out."""
     own = {name: options_of("eval", metric, user, f"{EXTRA}.{name}") for name, metric in evaluator.extra.items()}
     further: dict[str, Any] = {"extra": own, "more": list(evaluator.more), "fps": size}
     return {name: value for name, value in further.items() if value}
@@ -132,16 +133,16 @@ def _further_metrics(evaluator: Evaluator, user: UserCode, size: Sequence[int] |
 def measure_speed(
     rasterizer: Rasterizer, gaussians: Gaussians, scene: Scene, background: torch.Tensor, size: Sequence[int]
 ) -> dict[str, float]:
-    """Renders a second of each test view at ``size`` (width, height) px: each rendered once, then timed."""
+    """The renders per second of each test view at ``size`` (width, height) px, after one render that is not timed."""
     speeds = {}
 
     def now() -> float:
-        if background.device.type == "cuda":  # renders are queued there
+        if background.device.type == "cuda":  # kernels run asynchronously there
             torch.cuda.synchronize(background.device)
         return time.perf_counter()
 
     for view in scene.test:
-        # The whole picture at another size, stretched if need be, so that the same Gaussians are in view.
+        # The whole picture is scaled, and stretched if `size` has another shape: the same Gaussians stay in view.
         camera = view.camera.resized(*size)
         with torch.no_grad():
             rasterizer.render(gaussians, camera, MAX_SH_DEGREE, background)
@@ -160,20 +161,24 @@ def _write_metrics(
     unavailable: Mapping[str, str] = MappingProxyType({}),
     at: Mapping[str, Earlier] = MappingProxyType({}),
 ) -> None:
-    """Write the metrics by view and as means; views with their nearest training views."""
+    """Write the metrics of each view and their means.
+
+    Each view's row also says how near the training views are, and which share of its pixels counts under masks.
+    """
     cameras, training = ([view.camera for view in views] for views in (scene.test, scene.train))
     near = nearest_training_cameras(cameras, training, scene.extent)
-    places = {view.name: place for view, place in zip(scene.test, near, strict=True)}  # no metrics: they are in no mean
+    # These columns are no metrics, so they are kept apart from `per_view`, of which the means are taken.
+    facts = {view.name: distances for view, distances in zip(scene.test, near, strict=True)}
     if any(view.mask is not None for view in [*scene.train, *scene.test]):
-        places = {view.name: places[view.name] | {COUNTED: view.counted} for view in scene.test}
-    write_per_view(folder / PER_VIEW, {view: dict(row) | places.get(view, {}) for view, row in per_view.items()})
+        facts = {view.name: facts[view.name] | {COUNTED: view.counted} for view in scene.test}
+    write_per_view(folder / PER_VIEW, {view: dict(row) | facts.get(view, {}) for view, row in per_view.items()})
     summary = summary_of(evaluator, per_view)
     summary = replace(summary, at=dict(at), unavailable=summary.unavailable | dict(unavailable))
     write_json(folder / METRICS, summary.to_json())
 
 
 def summary_of(evaluator: Evaluator, per_view: Mapping[str, Mapping[str, float]]) -> Evaluation:
-    """Summary of an evaluation: the means, what is missing and why, and the facts of a user's metrics."""
+    """Summary of an evaluation: the means, the missing metrics and why, and the facts about a user's metrics."""
     return Evaluation(
         metrics=summarize(per_view, evaluator.unavailable),
         unavailable=dict(evaluator.unavailable),
@@ -183,7 +188,7 @@ def summary_of(evaluator: Evaluator, per_view: Mapping[str, Mapping[str, float]]
 
 
 def draw_figures(folder: Path, renders: Path, scene: Scene, training: Path, gaussians: Gaussians) -> None:
-    """The voluminous Gaussians of the model, drawn over its first test view."""
+    """Draw the voluminous Gaussians of the model over its first test view."""
     folder.mkdir(exist_ok=True)
     with np.load(training / LINEAGE) as lineage:
         causes = torch.from_numpy(lineage["causes"][lineage["ids"]])  # [N]

@@ -1,4 +1,4 @@
-"""Training by another program: a command that gets the training views and leaves a model, or renders."""
+"""Training by another program: a command that gets the training views and leaves a model or renders."""
 
 from __future__ import annotations
 
@@ -36,17 +36,17 @@ from gsbench.words import readable_time
 if TYPE_CHECKING:
     from gsbench.pipeline.parts import Parts
 
-CONTRACT = 1  # raise when programs are given, or asked for, something else
-WORK = "work"  # in the folder of the build: what the program is given, and where it writes
+CONTRACT = 1  # raise it when the files that a program gets, or must leave, change
+WORK = "work"  # subfolder of the build: the program's inputs and outputs
 SECONDS_TO_TELL_VERSION = 120.0
-MAX_SAID = 200  # characters of a program that tells its version
-OWN_VARIABLES = "GSBENCH_"  # gsbench's settings, such as where photographs lie, are not handed on
+MAX_OUTPUT = 200  # characters of the version command's output that an error quotes
+OWN_VARIABLES = "GSBENCH_"  # prefix of gsbench's own settings, which the program does not get
 
 log = logging.getLogger(__name__)
 
 
 def external_step(views: Views, trainer: External, parts: Parts) -> Step:
-    """Let ``trainer`` train on the training views, from the cloud of the initialiser.
+    """The step in which ``trainer`` trains on the training views, from the cloud of the initialiser.
 
     Raises InputError for a capture with masks.
     """
@@ -71,10 +71,10 @@ def external_step(views: Views, trainer: External, parts: Parts) -> Step:
         places = {name: work / name for name in (DATA, TEST_CAMERAS, OUTPUT)}
         values = {name: str(place.resolve()) for name, place in places.items()} | trainer.options
         values |= {"iterations": iterations, "seed": seed, "device": str(device), "threads": threads}
-        placeless = {name: f"{{{name}}}" for name in places}  # the folders of a build mean nothing after it
+        placeholders = {name: f"{{{name}}}" for name in places}  # for the record: the build's folders vanish
         command = [executable, *(fill(word, values, "densify.command") for word in trainer.words[1:])]
         environment = environment_of(trainer, values)
-        said = check_version(trainer, values, environment)
+        version_output = check_version(trainer, values, environment)
         places[OUTPUT].mkdir(parents=True)
         write_training_views(places[DATA], scene.train, cloud)
         if trainer.needs_test_cameras:
@@ -88,7 +88,7 @@ def external_step(views: Views, trainer: External, parts: Parts) -> Step:
                 shutil.rmtree(places[place], ignore_errors=True)
         log.info("train: %s ended after %s", trainer.program, readable_time(ended.seconds))
         pattern = fill(trainer.result, values, "densify.result")
-        with what_it_left(trainer, log_file):
+        with naming_the_program(trainer, log_file):
             summary = take_result(trainer, pattern, views, places[OUTPUT], folder)
         shutil.rmtree(work)
         (folder / EVENTS).write_text("")
@@ -97,38 +97,39 @@ def external_step(views: Views, trainer: External, parts: Parts) -> Step:
             "num_init_points": len(cloud),
             "scene_extent": scene.extent,
             "seconds": ended.seconds,
-            # of a GPU's memory only the program itself could tell what it needed
+            # Only the program itself could measure its memory on a GPU.
             "peak_memory_mb": ended.peak_memory_mb if device.type == "cpu" else None,
             "machine": describe_machine(device),
             "checkout": own_checkout(),
             "trained_by": {
                 "program": trainer.program,
                 "version": trainer.version,
-                "said": said,
-                "command": [fill(word, values | placeless, "densify.command") for word in trainer.words],
+                "said": version_output,
+                "command": [fill(word, values | placeholders, "densify.command") for word in trainer.words],
             },
         }
         write_json(folder / TRAINING, summary)
 
-    stage = replace(TRAIN, version=1, resumable=False)  # it starts from the beginning, and is no training of ours
+    # Its own version: changes of gsbench's trainer do not concern it. A stopped program starts from the beginning.
+    stage = replace(TRAIN, version=1, resumable=False)
     return step_of(stage, inputs, build)
 
 
 def take_result(trainer: External, pattern: str, views: Views, output: Path, folder: Path) -> dict[str, Any]:
-    """Keep in ``folder`` what the program left in ``output``; what is to be said of it."""
+    """Keep in ``folder`` what the program left in ``output``; returns facts for the training's summary."""
     if not trainer.leaves_model:
         take_renders(output, pattern, trainer.by_order, views.scene.test, folder / RENDERS)
         return {"evaluated_from": FROM_RENDERS, "num_gaussians": None, "causes": {}}
     gaussians = take_model(output, pattern, folder / POINT_CLOUD)
-    lineage = Lineage(len(gaussians))  # of its Gaussians, nobody knows where they came from
+    lineage = Lineage(len(gaussians))  # without causes: which rule made a Gaussian is unknown here
     state: dict[str, Any] = {name: tensor.numpy() for name, tensor in lineage.state_dict().items()}
     np.savez_compressed(folder / LINEAGE, **state)
     return {"evaluated_from": FROM_MODEL, "num_gaussians": len(gaussians), "causes": lineage.causes_of_living()}
 
 
 @contextmanager
-def what_it_left(trainer: External, log_file: Path) -> Iterator[None]:
-    """Name the program, and where its log lies, in what is wrong with its result."""
+def naming_the_program(trainer: External, log_file: Path) -> Iterator[None]:
+    """Add the program's name and the path of its log to a TrainingError about its result."""
     try:
         yield
     except TrainingError as error:
@@ -136,11 +137,12 @@ def what_it_left(trainer: External, log_file: Path) -> Iterator[None]:
 
 
 def environment_of(trainer: External, values: Mapping[str, object]) -> dict[str, str]:
-    """The program's environment: that of gsbench without gsbench's own variables, and what the settings add."""
+    """The program's environment: gsbench's without its own variables, and what ``densify.environment`` adds."""
+    # Without SAFE_PATH, too: a train.py must find the modules beside it.
     inherited = {
         name: value
         for name, value in os.environ.items()
-        if not name.startswith(OWN_VARIABLES) and (name, value) != SAFE_PATH  # a train.py finds the modules beside it
+        if not name.startswith(OWN_VARIABLES) and (name, value) != SAFE_PATH
     }
     return inherited | {
         name: fill(text, values, f"densify.environment.{name}") for name, text in trainer.environment.items()
@@ -148,13 +150,17 @@ def environment_of(trainer: External, values: Mapping[str, object]) -> dict[str,
 
 
 def check_version(trainer: External, values: Mapping[str, object], environment: Mapping[str, str]) -> str | None:
-    """Run ``densify.version_command`` and return its line; raises `InputError` unless that contains the version."""
+    """Run ``densify.version_command`` and return its output on one line; None if there is no such command.
+
+    Raises `InputError` unless the output contains ``densify.version``.
+    """
     if trainer.version_command is None:
         return None
     key = "densify.version_command"
     command = [fill(word, values, key) for word in words_of(trainer.version_command, key)]
     try:
-        with tempfile.TemporaryDirectory(prefix="gsbench-version-") as empty:  # `python -c` imports from where it runs
+        # In an empty folder: `python -c` would import modules that lie in the current one.
+        with tempfile.TemporaryDirectory(prefix="gsbench-version-") as empty:
             done = subprocess.run(
                 command,
                 cwd=empty,
@@ -168,10 +174,10 @@ def check_version(trainer: External, values: Mapping[str, object], environment: 
             )
     except (OSError, subprocess.TimeoutExpired) as error:
         raise InputError(f"{key} cannot be run ({error})") from error
-    said = " ".join((done.stdout + done.stderr).split())
-    if trainer.version not in said:
+    output = " ".join((done.stdout + done.stderr).split())
+    if trainer.version not in output:
         raise InputError(
-            f"densify.version is {trainer.version!r}, but `{' '.join(command)}` says {said[:MAX_SAID]!r}: results are "
-            "kept by the version, so set densify.version to what it is"
+            f"densify.version is {trainer.version!r}, but `{' '.join(command)}` says {output[:MAX_OUTPUT]!r}: results "
+            "are kept by the version, so set densify.version to what it is"
         )
-    return said
+    return output

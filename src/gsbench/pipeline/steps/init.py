@@ -1,4 +1,4 @@
-"""Cameras and the first cloud: a COLMAP model and its report, shared by all trials with the same options."""
+"""Initialisation: cameras and the first cloud as a COLMAP model, shared by all trials with the same options."""
 
 from concurrent.futures import ThreadPoolExecutor
 from importlib.metadata import version
@@ -6,7 +6,7 @@ from pathlib import Path
 
 from gsbench.init.base import MODEL_FOLDER, Initializer
 from gsbench.logs import Progress, progress
-from gsbench.pipeline.steps.inputs import GSBENCH_ALONE, UserCode, options_of, split_of, step_of
+from gsbench.pipeline.steps.inputs import NO_USER_CODE, UserCode, options_of, split_hash, step_of
 from gsbench.runs.keys import INIT, Step
 from gsbench.runs.store import Store
 from gsbench.scene.images import read_image
@@ -19,12 +19,12 @@ def init_step(
     capture: Capture,
     initializer: Initializer,
     reference: Step | None = None,
-    user: UserCode = GSBENCH_ALONE,
+    user: UserCode = NO_USER_CODE,
 ) -> Step:
-    """The initialiser's step; ``reference`` is the one whose cameras stand in for those that did not come."""
+    """The initialiser's step. ``reference`` is the step that reconstructs cameras for a capture without them."""
     inputs = {
         "capture": capture.fingerprint,
-        "test": split_of(capture),
+        "test": split_hash(capture),
         "exact_poses": capture.exact_poses,
         "options": options_of("init", initializer, user),
         "content": initializer.content(),

@@ -1,4 +1,4 @@
-"""A picture of a trained model: its voluminous Gaussians drawn over a view."""
+"""A picture of a trained model: the outlines of its voluminous Gaussians drawn over a view."""
 
 import math
 from collections.abc import Sequence
@@ -15,8 +15,8 @@ from gsbench.raster.reference import project
 from gsbench.scene.camera import Camera
 
 OUTLINE_POINTS = 48
-MAX_OUTLINES = 1500  # the most voluminous; more would hide the picture
-MIN_OPACITY = 0.05  # fainter ones are not seen
+MAX_OUTLINES = 1500  # of the most voluminous Gaussians; more outlines would hide the picture
+MIN_OPACITY = 0.05  # fainter Gaussians are not seen
 FONT_SIZE, LINE_HEIGHT = 11, 14  # px, of the legend
 TEXT_COLOR = (255, 255, 255)
 
@@ -26,7 +26,7 @@ def draw_ellipsoids(
 ) -> Image.Image:
     """The view ``render`` [H, W, 3] with the outlines of the Gaussians above ``volume_threshold`` (cubed scene units).
 
-    An outline is the ellipsoid of one standard deviation, projected; its colour tells the rule that made the Gaussian
+    An outline is the projected ellipsoid of one standard deviation. Its colour tells the rule that made the Gaussian
     (``causes`` [N], see ``Cause``). At most the 1500 most voluminous are drawn. A legend stands below the view.
     """
     volumes = log_volume(gaussians.log_scales)  # [N]
@@ -45,13 +45,13 @@ def draw_ellipsoids(
         color = Cause(int(causes[index[member]])).color
         canvas.line([tuple(point) for point in outline.T.round().astype(int).tolist()], fill=color, width=1)
     drawn = [cause for cause in Cause if (causes[index[projected.index]] == int(cause)).any()]
-    large_ones = f"with a volume above {volume_threshold:g}"
-    title = f"Gaussians {large_ones}, by what made them:" if drawn else f"no Gaussian {large_ones} here"
+    condition = f"with a volume above {volume_threshold:g}"
+    title = f"Gaussians {condition}, by what made them:" if drawn else f"no Gaussian {condition} here"
     return _with_legend(image, title, drawn)
 
 
 def _with_legend(image: Image.Image, title: str, causes: Sequence[Cause]) -> Image.Image:
-    """The image above a line of words and one of each cause in its colour, wrapped to its width."""
+    """The image with a legend below: the title, and each cause in its colour, wrapped to the image's width."""
     words = [(word, TEXT_COLOR) for word in title.split()] + [(cause.words, cause.color) for cause in causes]
     font = ImageFont.load_default(FONT_SIZE)
     places: list[tuple[int, int]] = []

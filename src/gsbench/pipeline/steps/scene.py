@@ -1,4 +1,4 @@
-"""The photographs of a trial: as they come, as views of their final size, and the test views as they are kept."""
+"""The photographs of a trial: read from the user's folder, masked, resized to views, and the test views kept as PNG."""
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -13,7 +13,7 @@ from gsbench.files import file_sha256
 from gsbench.init.base import MODEL_FOLDER
 from gsbench.init.points import GREY, read_points
 from gsbench.logs import progress
-from gsbench.pipeline.steps.inputs import split_of, step_of
+from gsbench.pipeline.steps.inputs import split_hash, step_of
 from gsbench.runs.code import VIEWS_ROOMS, edited, states_of
 from gsbench.runs.keys import CAPTURE, GROUND_TRUTH, Step
 from gsbench.runs.layout import MASKS, VIEWS
@@ -41,9 +41,9 @@ from gsbench.system.resources import available_threads
 
 
 class CaptureSource:
-    """Source of the photographs of a scene: the user's folder, or a step before.
+    """The source of the photographs of a scene: the user's folder, or a step that makes them.
 
-    What is there is looked at once, however many trials ask.
+    The files are read once, however many trials ask.
     """
 
     def __init__(self, options: SceneConfig) -> None:
@@ -52,9 +52,9 @@ class CaptureSource:
 
     @cached_property
     def step(self) -> Step | None:
-        """The step that makes photographs, or a COLMAP model of the cameras in a file.
+        """The step that makes the photographs, or that makes a COLMAP model of the cameras in ``transforms.json``.
 
-        None for a scene that is read from the user's folder as it is.
+        None for a scene whose folder can be read directly.
         """
         if self.options.kind == "transforms":
             return _transforms_step(self._transforms)
@@ -117,10 +117,10 @@ def _transforms_step(transforms: Transforms) -> Step:
     return step_of(CAPTURE, inputs, build)
 
 
-def masked_step(capture: Capture, backdrop: Backdrop) -> Step | None:
-    """The step that replaces what masks ignore and what is transparent, before anything looks at it.
+def masking_step(capture: Capture, backdrop: Backdrop) -> Step | None:
+    """The step that replaces masked and transparent pixels before any other step sees them.
 
-    None for a capture without masks whose transparent pixels are black, as they are read anyway.
+    None for a capture without masks whose transparent pixels become black: images are read so anyway.
     """
     if not capture.masks and backdrop == "black":
         return None
@@ -143,24 +143,24 @@ def masked_step(capture: Capture, backdrop: Backdrop) -> Step | None:
     return step_of(CAPTURE, inputs, build)
 
 
-def masked(capture: Capture, folder: Path) -> Capture:
-    """The capture with what `masked_step` left in ``folder``."""
+def masked_capture(capture: Capture, folder: Path) -> Capture:
+    """The capture with the images and masks that `masking_step` left in ``folder``."""
     masks = {name: prepared_mask(folder, name) for name in capture.masks}
     return replace(capture, images=folder / IMAGES, masks=masks)
 
 
 class Views:
-    """Views of a trial, loaded when first asked for, and what they depend on."""
+    """The views of a trial, loaded at their first use, and what they depend on."""
 
     def __init__(self, store: Store, capture: Capture, init: Step, options: SceneConfig) -> None:
         self.store, self.capture, self.init, self.options = store, capture, init, options
 
     @property
     def inputs(self) -> dict[str, Any]:
-        """The inputs that the views depend on besides the cameras, which are those of ``init``."""
+        """The inputs on which the views depend, besides the cameras, which come from ``init``."""
         return {
             "capture": self.capture.fingerprint,
-            "test": split_of(self.capture),
+            "test": split_hash(self.capture),
             "downscale": self.options.downscale,
             "max_size": self.options.max_size,
             "resample": self.options.resample,
@@ -169,7 +169,7 @@ class Views:
 
     @cached_property
     def scene(self) -> Scene:
-        """Undistorted and shrunk; ``init`` must be built. Prepared images are cached beside the store's stages."""
+        """The undistorted and shrunk views; ``init`` must be built. Prepared images are cached in the store."""
         with progress("scene") as report:
             return load_scene(
                 self.capture,
@@ -180,13 +180,13 @@ class Views:
                 resample=self.options.resample,
                 principal_point=self.options.principal_point,
                 progress=report,
-                made_by=makers_of_views(),
+                made_by=view_versions(),
             )
 
 
 @cache
-def makers_of_views() -> dict[str, str | None]:
-    """Versions of what makes pixels of photographs: gsbench's rooms that are not as released, and packages.
+def view_versions() -> dict[str, str | None]:
+    """The versions of the code that makes the views' pixels: edited parts of gsbench's source, and packages.
 
     Pillow reads and shrinks images, pycolmap undistorts them.
     """
@@ -194,7 +194,7 @@ def makers_of_views() -> dict[str, str | None]:
 
 
 def ground_truth_step(views: Views) -> Step:
-    """Keep the test views as PNG files, and the masks of those that ignore some pixels."""
+    """The step that keeps the test views, and the masks of those that have one, as PNG files."""
 
     def build(folder: Path) -> None:
         for view in views.scene.test:

@@ -1,4 +1,4 @@
-"""Training: the model, its lineage, metrics and events."""
+"""Training: makes the model, its lineage, curves and events."""
 
 from __future__ import annotations
 
@@ -31,17 +31,20 @@ if TYPE_CHECKING:
 
 
 def train_step(views: Views, parts: Parts) -> Step:
-    """Train on the training views, from the cloud of the initialiser; keep the model where it is measured, too."""
+    """The step that trains on the training views, from the initialiser's cloud.
+
+    It also keeps snapshots of the model at the earlier iterations of ``eval.at``, for `evaluate_step`.
+    """
     densifier, rasterizer, options, seed = parts.densifier, parts.rasterizer, parts.train, parts.seed
     device, snapshot_at, user = parts.device, parts.measured_earlier, parts.user_code
     values = dataclasses.asdict(options)
-    of_model = {key: value for key, value in values.items() if key not in WITHOUT_EFFECT_ON_MODEL}
+    train_options = {key: value for key, value in values.items() if key not in WITHOUT_EFFECT_ON_MODEL}
     inputs: dict[str, Any] = {
         "scene": views.inputs,
         "init": views.init.key,
         "densify": options_of("densify", densifier, user),
         "raster": rasterizer_inputs(rasterizer, user),
-        "train": of_model,
+        "train": train_options,
         "seed": seed,
     }
     if snapshot_at:
@@ -80,9 +83,7 @@ def train_step(views: Views, parts: Parts) -> Step:
 
 
 def initial_gaussians(init: Path, device: torch.device) -> Gaussians:
-    """The Gaussians that training starts from: those that the initialiser left in the folder ``init``, or one for each
-    of its points.
-    """
+    """The Gaussians that training starts from: the initialiser's own in the folder ``init``, or one per point."""
     if (init / GAUSSIANS_FILE).exists():
         return read_ply(init / GAUSSIANS_FILE, device)
     cloud = read_cloud(init / MODEL_FOLDER)
