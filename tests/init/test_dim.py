@@ -20,7 +20,7 @@ from gsbench.init.networks import extract_and_match
 from gsbench.init.networks.extract_and_match import NetworkJob, at_low_resolution, choose_pairs, open_store
 from gsbench.init.networks.extractors import (
     SUPERPOINT_BORDER,
-    MutualNearest,
+    MutualNearestMatcher,
     build_extractor,
     build_matcher,
     extract_features,
@@ -336,7 +336,7 @@ class TestErrors:
         some = Features(
             np.zeros((3, 2), np.float32), np.eye(3, 8, dtype=np.float32), np.ones(3, np.float32), (9, 9), (9, 9)
         )
-        assert match(MutualNearest(0.9, CPU), some, some.strongest(0)).shape == (0, 2)
+        assert match(MutualNearestMatcher(0.9, CPU), some, some.strongest(0)).shape == (0, 2)
 
     @pytest.mark.parametrize(
         ("options", "message"),
@@ -370,7 +370,7 @@ def test_mutual_nearest_by_brute_force():
         row, column = np.sort(distance[i]), np.sort(distance[:, j])
         if distance[:, j].argmin() == i and row[0] <= 0.9 * row[1] and column[0] <= 0.9 * column[1]:
             expected.append((i, j))
-    matches = MutualNearest(0.9, CPU)(*sides)
+    matches = MutualNearestMatcher(0.9, CPU)(*sides)
     assert sorted(map(tuple, matches.tolist())) == expected
     assert len(expected) > 3
 

@@ -14,7 +14,7 @@ from gsbench.init import Sfm
 from gsbench.init.colmap.database import (
     create_database,
     database_counts,
-    guessed_groups,
+    unknown_camera_groups,
     verify_pairs,
     write_keypoints,
     write_matches,
@@ -31,7 +31,9 @@ SIFT = FeatureSettings(extractor="sift_kornia", matcher="mutual_nearest", max_im
 
 
 def new_database(path: Path, capture: Capture) -> list[str]:
-    return list(create_database(path, guessed_groups(capture.images, capture.image_names, "single", "PINHOLE", 300.0)))
+    return list(
+        create_database(path, unknown_camera_groups(capture.images, capture.image_names, "single", "PINHOLE", 300.0))
+    )
 
 
 @pytest.fixture(scope="module")

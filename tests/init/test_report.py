@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from gsbench.init import Sfm
 from gsbench.init.base import PoseErrors, Preparation, Timer
-from gsbench.init.colmap.job import Job, _finish
+from gsbench.init.colmap.job import ReconstructionJob, _finish
 from gsbench.init.colmap.reconstruct import similarity_to
 from gsbench.init.report import (
     compare_poses,
@@ -160,7 +160,7 @@ def test_where_two_cameras_are_common_nothing_is_compared_and_that_is_said(captu
     model, reference = model_of(CENTERS), model_of(CENTERS)
     for image_id in (3, 4):
         reference.deregister_frame(reference.images[image_id].frame_id)
-    work = Job(Sfm(), capture, tmp_path / "out", tmp_path / "work", None, Preparation())
+    work = ReconstructionJob(Sfm(), capture, tmp_path / "out", tmp_path / "work", None, Preparation())
     similarity = similarity_to(model, reference)
     report = _finish(work, "own", model, reference, similarity, Timer({}), {})
     assert report.pose_errors is None

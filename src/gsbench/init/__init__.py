@@ -1,4 +1,4 @@
-"""Initial clouds: from photographs, or from what came with them, to a COLMAP model on disk."""
+"""Initialisers, which make a COLMAP model with cameras and an initial point cloud from a capture."""
 
 from gsbench.init.base import (
     GAUSSIANS_FILE,

@@ -1,4 +1,4 @@
-"""Contract of an initialiser: it takes a capture, and gives a COLMAP model and a report."""
+"""Contract of an initialiser, which makes a COLMAP model and a report from a capture."""
 
 import json
 import time
@@ -16,16 +16,16 @@ from numpy.typing import NDArray
 from gsbench.logs import Progress, no_progress
 from gsbench.scene.types import Capture
 
-MODEL_FOLDER = Path("sparse", "0")  # below the output folder: where COLMAP users and 3DGS trainers look
-OWN_GAUGE_FOLDER = Path("sparse_own_gauge", "0")  # the same model as its own mapper scaled it, before alignment
-WORK_FOLDER = "work"  # below the output folder, while a run lasts
+MODEL_FOLDER = Path("sparse", "0")  # below the output folder: where COLMAP users and 3DGS trainers look for a model
+OWN_GAUGE_FOLDER = Path("sparse_own_gauge", "0")  # the same model in the mapper's gauge, before alignment
+WORK_FOLDER = "work"  # below the output folder, during a run
 REPORT_FILE = "report.json"
-GAUSSIANS_FILE = "gaussians.ply"  # optional: the Gaussians to start from, where there is more than points
+GAUSSIANS_FILE = "gaussians.ply"  # only if training starts from given Gaussians instead of points
 PICTURE_FILE = "cloud.png"  # the cloud and its cameras from above
-MIN_IMAGES = 3  # two views have no third that could contradict a wrong geometry
+MIN_IMAGES = 3  # with two views, no third one can reveal a wrong geometry
 Poses = Literal["shared", "own"]
 PointsFrom = Literal["all", "train"]
-Seed = Annotated[int, Interval(ge=0, le=2**31 - 1)]  # COLMAP takes no larger one
+Seed = Annotated[int, Interval(ge=0, le=2**31 - 1)]  # COLMAP accepts no larger seed
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Timer:
 
     @contextmanager
     def phase(self, name: str) -> Iterator[None]:
-        """Time what happens within the context; a phase may come again."""
+        """Time the code within the context. The seconds of a repeated phase add up."""
         start = time.perf_counter()
         yield
         self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
@@ -64,9 +64,9 @@ class PointCloud:
 
 
 def read_cloud(model_dir: Path) -> PointCloud:
-    """The points of the COLMAP model in ``model_dir``, ordered by their ids (so the order is reproducible).
+    """The points of the COLMAP model in ``model_dir``, ordered by their ids for reproducibility.
 
-    Raises ``InputError`` where the folder holds no readable model.
+    Raises ``InputError`` if the folder holds no readable model.
     """
     from gsbench.scene.colmap import model_points, read_model
 
@@ -75,10 +75,10 @@ def read_cloud(model_dir: Path) -> PointCloud:
 
 @dataclass(frozen=True)
 class PoseErrors:
-    """Camera poses against the reference, after the best similarity: centres in reference units, rotations in degrees.
+    """Errors of camera poses against a reference, after alignment by a similarity.
 
-    ``exact`` says that the reference is the truth and not another estimate; the ``_relative`` value is divided by the
-    reference's scene extent.
+    Centres are in reference units, rotations in degrees. ``exact`` says that the reference is the truth, not another
+    estimate. The ``_relative`` value is divided by the reference's scene extent.
     """
 
     num_images: int
@@ -86,22 +86,22 @@ class PoseErrors:
     center_rmse: float  # the absolute trajectory error (ATE)
     center_mean: float
     center_max: float
-    center_rmse_relative: float | None  # None where the extent is 0
+    center_rmse_relative: float | None  # None if the extent is 0
     rotation_mean_deg: float
     rotation_max_deg: float
 
 
 @dataclass(frozen=True)
 class Gauge:
-    """Volume threshold in raw model units, expressed in a model's unit of length.
+    """The meaning of the volume threshold V_th in the unit of length of one model.
 
-    COLMAP scales each model as it likes, so one threshold selects different Gaussians in another model of a scene.
+    COLMAP models have an arbitrary scale, so one threshold selects different Gaussians in two models of a scene.
     """
 
     scene_extent: float  # 3DGS's cameras_extent of the training cameras, in the model's units
     scale_to_reference: float | None  # reference units per unit of the model; None without a reference
-    volume_threshold: float  # V_th, the paper's
-    threshold_over_extent_cubed: float | None  # V_th / extent³, comparable between gauges; None where the extent is 0
+    volume_threshold: float  # the paper's V_th
+    threshold_over_extent_cubed: float | None  # V_th / extent³, comparable between gauges; None if the extent is 0
     threshold_radius: float  # radius of the sphere of volume V_th, in the model's units
     threshold_radius_over_extent: float | None
     threshold_in_reference: float | None  # V_th as a volume in reference units
@@ -109,10 +109,10 @@ class Gauge:
 
 @dataclass(frozen=True)
 class TrainingPoints:
-    """Record of a cloud in which test views have no say (``init.points_from``): what is left of it.
+    """Record of a cloud made from the training views alone (``init.points_from``).
 
-    ``removed`` is the share that is gone of the ``total`` points of all views (negative where more came); both are None
-    where test photographs were never matched, so that nobody knows how many there would have been.
+    ``removed`` is the share of the ``total`` points of all views that was dropped, negative if points were added. Both
+    are None if test photographs were never matched, so that the total is unknown.
     """
 
     choice: PointsFrom
@@ -126,24 +126,24 @@ class InitReport:
     """Results of an initialiser; `to_dict` is the content of ``report.json``."""
 
     init: str
-    poses: str  # shared: the reference's; own: estimated here
+    poses: str  # shared: those of the reference; own: estimated in this run
     num_images: int
     num_registered: int
     unregistered: tuple[str, ...]
     num_points: int
-    mean_reprojection_error: float | None  # px; None where no point has an observation
-    mean_track_length: float | None  # images that see a point
+    mean_reprojection_error: float | None  # px; None if no point has an observation
+    mean_track_length: float | None  # images that see a point; None if no point has an observation
     focal_lengths: tuple[float, ...]  # px, one for each camera
     gauge: Gauge  # of the written model
     seconds: Mapping[str, float]
     settings: Mapping[str, Any]
     versions: Mapping[str, str]
-    own_gauge: Gauge | None = None  # of the model before its alignment to the reference; None where nothing was aligned
-    pose_errors: PoseErrors | None = None  # None without a reference, and where the reference's poses were taken over
+    own_gauge: Gauge | None = None  # of the model before its alignment to the reference; None if it was not aligned
+    pose_errors: PoseErrors | None = None  # None without a reference, or if the poses are those of the reference
     warnings: tuple[str, ...] = ()
     counts: Mapping[str, int] = field(default_factory=dict)  # features, pairs, verified pairs, inlier matches
-    mapped_by: str | None = None  # the way that placed the cameras (init.mapper); None where they were given
-    training_points: TrainingPoints | None = None  # None where all views made the points
+    mapped_by: str | None = None  # the mapping strategy that placed the cameras (init.mapper); None if they were given
+    training_points: TrainingPoints | None = None  # None if all views contributed points
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values for JSON."""
@@ -156,7 +156,7 @@ class InitReport:
 
 @dataclass(frozen=True)
 class Preparation:
-    """Preparation before COLMAP: its time, its counts and settings for the report, and what deserves a warning."""
+    """Time, counts, settings and warnings of the preparation before COLMAP, for the report."""
 
     seconds: Mapping[str, float] = field(default_factory=dict)
     counts: Mapping[str, int] = field(default_factory=dict)
@@ -165,10 +165,10 @@ class Preparation:
 
 
 class Initializer(ABC):
-    """Makes cameras and a first cloud of points for a capture. A dataclass: its fields are the options.
+    """Makes cameras and an initial point cloud for a capture. Subclasses are dataclasses whose fields are the settings.
 
     Examples:
-        Where only the points are new, `PlacedCloud` brings ``run``: cameras, report and picture.
+        If only the points are new, derive from `PlacedCloud`. Its ``run`` adds cameras, report and picture.
 
         >>> from gsbench.init.placed import PlacedCloud
         >>> @dataclass(frozen=True, kw_only=True)
@@ -188,14 +188,14 @@ class Initializer(ABC):
         gsbench.errors.InputError: init.side must be a whole number, got 'four'
     """
 
-    name: ClassVar[str]  # as reports call it
+    name: ClassVar[str]  # the name in reports
 
     def needs_reference(self, capture: Capture) -> bool:
         """Return whether `run` needs a ``reference`` model for this capture because it came without cameras."""
         return False
 
     def content(self) -> str | None:
-        """The hashes of files that options name, on which the result depends beside the options and the capture."""
+        """The hashes of files that settings name, if the result depends on the files' content."""
         return None
 
     @abstractmethod
@@ -210,6 +210,6 @@ class Initializer(ABC):
         """Write the model to `MODEL_FOLDER`, the report to `REPORT_FILE` and a picture to `PICTURE_FILE`.
 
         All are below ``output_dir``. The cameras have the sizes of the files in ``capture.images``. ``reference`` is a
-        COLMAP model of the same files whose cameras stand in for those that the capture came with. ``work_dir`` may
-        keep what a later run can use again. Raises ``InputError`` where the capture does not give a model.
+        COLMAP model of the same files whose cameras replace those of the capture. ``work_dir`` may keep files that a
+        later run can reuse. Raises ``InputError`` if no model can be made from the capture.
         """

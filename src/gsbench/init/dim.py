@@ -1,6 +1,6 @@
-"""Deep image matching: features and matches from networks, geometry from COLMAP; and kornia's SIFT on the same path.
+"""Deep image matching: features and matches from networks, geometry from COLMAP. kornia's SIFT takes the same path.
 
-The weights files of the extractors and of LightGlue stand here with their names, sources, licences and checksums.
+The tables below list the weights files of the extractors and of LightGlue.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ ALIKED_WEIGHTS: dict[str, WeightsFile] = {
 
 LIGHTGLUE_WEIGHTS: dict[str, WeightsFile] = {
     extractor: WeightsFile(
-        # the first is the name under which kornia and cvg/LightGlue keep it in the torch hub cache (sic: "-pth")
+        # kornia and cvg/LightGlue use the first name, with "-pth", in the torch hub cache
         names=(f"{extractor}_lightglue_v0-1_arxiv-pth", f"{extractor}_lightglue.pth"),
         url=f"https://github.com/cvg/LightGlue/releases/download/v0.1_arxiv/{extractor}_lightglue.pth",
         sha256=None,
@@ -86,20 +86,21 @@ LIGHTGLUE_WEIGHTS: dict[str, WeightsFile] = {
 Extractor = Literal["superpoint", "aliked", "disk"]
 Matcher = Literal["lightglue", "mutual_nearest"]
 AlikedModel = Literal["n16", "n16rot", "n32", "t16"]
-# detection scores are not comparable between extractors; these are deep-image-matching's (superpoint) and the authors'
+# Detection scores are not comparable between extractors. The thresholds and radii are deep-image-matching's for
+# superpoint, the authors' for the others.
 KEYPOINT_THRESHOLDS = {"superpoint": 0.0005, "aliked": 0.2, "disk": 0.0}
 NMS_RADII = {"superpoint": 3, "aliked": 2, "disk": 2}  # px
 
 
 @dataclass(frozen=True, kw_only=True)
 class FeatureInitializer(ColmapInitializer):
-    """Features and matches from outside COLMAP, verified and mapped or triangulated by it.
+    """Base of initialisers with features and matches from outside COLMAP, which verifies and maps or triangulates them.
 
-    Sizes are in px of the image files' longest side. Features and matches are kept in the ``work_dir`` of `run`, by
-    image and by pair, so a killed run goes on there.
+    ``max_image_size`` is in px of the longest side. Features and matches are stored in the ``work_dir`` of `run`, by
+    image and by pair, so an interrupted run continues there.
     """
 
-    pairs: Pairing | Literal["lowres"] = "exhaustive"  # type: ignore[assignment]  # one way more than SIFT has
+    pairs: Pairing | Literal["lowres"] = "exhaustive"  # type: ignore[assignment]  # SIFT has no "lowres"
     max_keypoints: PositiveInt = 2048
     max_image_size: Annotated[int, Ge(MIN_DETECTION_SIZE)] = 1600
     max_ratio: Annotated[float, Interval(gt=0, le=1)] = 0.95
@@ -111,9 +112,9 @@ class FeatureInitializer(ColmapInitializer):
 
     @abstractmethod
     def find_weights(self) -> tuple[Path | None, Path | None]:
-        """Checked weights files of the extractor and of the matcher, None where they need none.
+        """Checked weights files of the extractor and the matcher, None for one without weights.
 
-        Raises ``MissingWeights``.
+        Raises ``MissingWeights`` if a file is missing.
         """
 
     def check(self, capture: Capture, reference: Path | None) -> None:
@@ -149,7 +150,7 @@ class FeatureInitializer(ColmapInitializer):
 
 @dataclass(frozen=True, kw_only=True)
 class Dim(FeatureInitializer):
-    """Deep image matching: SuperPoint, ALIKED or DISK features, matched by LightGlue or as mutual nearest ones."""
+    """Deep image matching: SuperPoint, ALIKED or DISK features, matched by LightGlue or mutual nearest neighbours."""
 
     name: ClassVar[str] = "dim"
 
@@ -207,7 +208,7 @@ class Dim(FeatureInitializer):
 
 @dataclass(frozen=True, kw_only=True)
 class SiftKornia(FeatureInitializer):
-    """kornia's SIFT, which needs no weights, through the path of `Dim`: a stand-in beside it, never called DIM."""
+    """kornia's SIFT, which needs no weights, through the same steps as `Dim`. It is a substitute, not the same."""
 
     name: ClassVar[str] = "sift_kornia"
 

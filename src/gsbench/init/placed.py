@@ -1,4 +1,4 @@
-"""Points under reference cameras: those that came with them, points drawn at random, and the base of such starts."""
+"""Initialisers that keep the reference cameras: with the points of the data set, or with random points."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 class GivenCameras(Initializer):
-    """Base of initialisers, dataclasses, that take the reference's cameras and make the points alone."""
+    """Base of initialisers that keep the reference's cameras and only make points. Subclasses are dataclasses."""
 
     def __post_init__(self) -> None:
         check_settings(self, "init")
@@ -39,7 +39,7 @@ class GivenCameras(Initializer):
         reference: Path | None = None,
         work_dir: Path | None = None,
     ) -> InitReport:
-        """Write model and report; ``work_dir`` is not used. ``InputError`` where there are no cameras."""
+        """Write model and report; ``work_dir`` is not used. Raises ``InputError`` if there are no cameras."""
         if reference is None and capture.model is None:
             raise InputError(
                 f"init={self.name} needs cameras and scene {capture.name} came without: make them with init=sfm first"
@@ -48,8 +48,8 @@ class GivenCameras(Initializer):
         return run_with_progress(_build, (self, capture, output_dir, reference), progress, what=self.name)
 
     @abstractmethod
-    def fill(self, model: pycolmap.Reconstruction, capture: Capture, work: Path) -> TrainingPoints | None:
-        """Give the reference ``model`` its points, in the isolated process; ``work`` is a folder for that time."""
+    def set_points(self, model: pycolmap.Reconstruction, capture: Capture, work: Path) -> TrainingPoints | None:
+        """Set the points of the reference ``model``; runs in the isolated process. ``work`` is a temporary folder."""
 
 
 def _build(job: tuple[GivenCameras, Capture, Path, Path | None], progress: Progress) -> InitReport:
@@ -62,7 +62,7 @@ def _build(job: tuple[GivenCameras, Capture, Path, Path | None], progress: Progr
         model = load_reference(capture, reference)
     assert model is not None
     with timer.phase("place"):
-        training_points = initializer.fill(model, capture, output_dir / WORK_FOLDER)
+        training_points = initializer.set_points(model, capture, output_dir / WORK_FOLDER)
     settings: dict[str, Any] = asdict(initializer)  # type: ignore[call-overload]
     result = report.make_report(
         initializer.name,
@@ -81,16 +81,16 @@ def _build(job: tuple[GivenCameras, Capture, Path, Path | None], progress: Progr
 
 @dataclass(frozen=True, kw_only=True)
 class Dataset(GivenCameras):
-    """Takes over the capture's model: restricted to its selected images, cameras scaled to the files.
+    """Uses the capture's own model, restricted to the selected images, with cameras scaled to the files.
 
-    ``points_from=train`` leaves what two training views see, where it is, in their colours.
+    ``points_from=train`` keeps the points that at least two training views see, in the colours of those views.
     """
 
     name: ClassVar[str] = "dataset"
 
     points_from: PointsFrom = "all"
 
-    def fill(self, model: pycolmap.Reconstruction, capture: Capture, work: Path) -> TrainingPoints | None:
+    def set_points(self, model: pycolmap.Reconstruction, capture: Capture, work: Path) -> TrainingPoints | None:
         from gsbench.init.colmap.database import readable_images
         from gsbench.init.colmap.reconstruct import keep_training_points
 
@@ -107,13 +107,13 @@ class Dataset(GivenCameras):
 
 
 class PlacedCloud(GivenCameras):
-    """Base of `Random` and `Ply`: the reference's cameras, and a cloud that the subclass, a dataclass, makes."""
+    """Base of initialisers that put a new cloud under the reference's cameras. Subclasses are dataclasses."""
 
     def needs_reference(self, capture: Capture) -> bool:
         """Return whether `run` needs a ``reference`` because the capture came without cameras."""
         return capture.model is None
 
-    def fill(self, model: pycolmap.Reconstruction, capture: Capture, work: Path) -> TrainingPoints | None:
+    def set_points(self, model: pycolmap.Reconstruction, capture: Capture, work: Path) -> TrainingPoints | None:
         import pycolmap
 
         cloud = self.cloud(capture, model)
@@ -124,7 +124,7 @@ class PlacedCloud(GivenCameras):
 
     @abstractmethod
     def cloud(self, capture: Capture, model: pycolmap.Reconstruction) -> PointCloud:
-        """The points, given the reference ``model``; runs in the isolated process."""
+        """The points for the reference ``model``; runs in the isolated process."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -156,7 +156,8 @@ class Random(PlacedCloud):
 class Carved(Random):
     """`Random` without the points that fewer than ``seen_by`` training cameras have in view.
 
-    ``count`` are drawn, so fewer remain. The idea is that of Faster-GS: what nobody sees costs, and trains nothing.
+    ``count`` points are drawn, so fewer remain. The idea is from Faster-GS: points that no camera sees cost time and
+    train nothing.
     """
 
     name: ClassVar[str] = "carved"
@@ -164,17 +165,17 @@ class Carved(Random):
     seen_by: PositiveInt = 1
 
     def cloud(self, capture: Capture, model: pycolmap.Reconstruction) -> PointCloud:
-        whole = super().cloud(capture, model)
-        cameras = np.zeros(self.count, dtype=np.int64)  # that see a point
+        cloud = super().cloud(capture, model)
+        num_cameras = np.zeros(self.count, dtype=np.int64)  # [P] that have a point in view
         for name in capture.train_names:
-            cameras[in_view(whole.points, name, model)[0]] += 1
-        kept = cameras >= self.seen_by
+            num_cameras[points_in_view(cloud.points, name, model)[0]] += 1
+        kept = num_cameras >= self.seen_by
         if not kept.any():
             raise InputError(
                 f"init=carved: of {self.count} points none is in view of {self.seen_by} training cameras of scene "
                 f"{capture.name}; take more (init.count), a smaller box (init.size) or fewer cameras (init.seen_by)"
             )
-        return PointCloud(whole.points[kept], whole.colors[kept])
+        return PointCloud(cloud.points[kept], cloud.colors[kept])
 
 
 def random_cloud(center: np.ndarray, half_edge: float, count: int, seed: int) -> PointCloud:
@@ -184,10 +185,10 @@ def random_cloud(center: np.ndarray, half_edge: float, count: int, seed: int) ->
     return PointCloud(points, generator.integers(0, 256, (count, 3), dtype=np.uint8))
 
 
-def in_view(points: Array, name: str, model: pycolmap.Reconstruction) -> tuple[NDArray[np.int64], Array, Array]:
-    """The ``points`` [P, 3] that the image ``name`` has in view: their indices [V], pixels [V, 2] and distances [V].
+def points_in_view(points: Array, name: str, model: pycolmap.Reconstruction) -> tuple[NDArray[np.int64], Array, Array]:
+    """Indices [V], pixels [V, 2] and distances [V] of the ``points`` [P, 3] that project into the image ``name``.
 
-    All three are empty for an image that the model does not place. Occlusion is not looked for.
+    All three are empty if the image has no pose in the model. Occlusion is ignored.
     """
     image = model.find_image_with_name(name)
     if image is None or not image.has_pose:

@@ -1,4 +1,4 @@
-"""Files as the start of a training: points of any origin (laser scans, multi-view stereo), and trained models."""
+"""Initialisers that start from a file: points of any origin (laser scans, multi-view stereo), or a trained model."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from gsbench.errors import InputError
 from gsbench.files import file_sha256, require_regular
 from gsbench.init.base import GAUSSIANS_FILE, InitReport, PointCloud, Seed
 from gsbench.init.colmap.alignment import Array
-from gsbench.init.placed import PlacedCloud, in_view
+from gsbench.init.placed import PlacedCloud, points_in_view
 from gsbench.logs import Progress, no_progress
 from gsbench.parsing import one_line
 from gsbench.scene.types import Capture
@@ -30,11 +30,11 @@ TEXT_SUFFIXES = (".xyz", ".txt", ".csv", ".pts")
 
 
 def read_points(path: Path) -> tuple[Array, NDArray[np.uint8] | None]:
-    """Points [P, 3] float64 and their colours [P, 3], None where the file has none; the suffix says its form.
+    """Points [P, 3] float64 and their colours [P, 3], None if the file has no colours; the suffix tells the format.
 
-    ``.ply``: vertices with x, y, z in any order and type, text or binary; colours as whole numbers or in [0, 1].
-    Text: columns x, y, z, and perhaps red, green, blue. Raises ``InputError`` for a file that cannot be
-    read, holds no point, or a coordinate or colour that is no finite number.
+    A ``.ply`` file, text or binary, has vertices with x, y, z in any order and type, and colours as whole numbers or in
+    [0, 1]. A text file has the columns x, y, z, optionally followed by red, green, blue. Raises ``InputError`` for a
+    file that cannot be read, holds no point, or has a coordinate or colour that is not a finite number.
     """
     suffix = path.suffix.lower()
     require_regular(path)
@@ -45,7 +45,7 @@ def read_points(path: Path) -> tuple[Array, NDArray[np.uint8] | None]:
             points, colors = _columns(np.loadtxt(path, delimiter="," if suffix == ".csv" else None, ndmin=2))
         else:
             raise ValueError(f"known are .ply, {', '.join(TEXT_SUFFIXES)}")
-    except Exception as error:  # readers raise anything on a damaged file, numpy even what Python's tokenizer raises
+    except Exception as error:  # readers may raise any exception on a damaged file, numpy even tokenizer errors
         raise InputError(f"{path}: not a readable file of points ({one_line(str(error))})") from error
     if len(points) == 0:
         raise InputError(f"{path}: holds no point")
@@ -81,21 +81,21 @@ def _columns(table: NDArray[np.generic]) -> tuple[Array, NDArray[np.generic] | N
 
 
 def _eight_bits(colors: NDArray[np.generic]) -> NDArray[np.uint8]:
-    """Colours as 0 to 255: 16-bit ones divided, floats in [0, 1] multiplied."""
+    """Colours from 0 to 255: 16-bit values are divided by 257, floats in [0, 1] multiplied by 255."""
     values = colors.astype(np.float64)
     if colors.dtype.kind == "f" and values.max() <= 1.0:
         values = values * 255
     elif values.max() > 255:
-        values = values / 257  # 65535 to 255
+        values = values / 257  # 65535 becomes 255
     return values.round().clip(0, 255).astype(np.uint8)
 
 
-GREY = 128  # of points that no training photograph shows, where the file has no colours
+GREY = 128  # for points without a colour in the file that no training photograph shows
 
 
 @dataclass(frozen=True, kw_only=True)
-class CloudOfFile(PlacedCloud):
-    """Base of initialisers whose points stand in the file ``path``."""
+class CloudFromFile(PlacedCloud):
+    """Base of initialisers that read their points from the file ``path``."""
 
     path: AnyPath
 
@@ -109,16 +109,16 @@ class CloudOfFile(PlacedCloud):
         return Path(self.path).expanduser()
 
     def content(self) -> str:
-        """sha256 of the file: what the result depends on beside the options."""
+        """The sha256 of the file."""
         return file_sha256(self.file)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Points(CloudOfFile):
-    """The points of a file under the reference cameras, in whose gauge they must lie.
+class Points(CloudFromFile):
+    """The points of a file, which must have the coordinates of the reference cameras.
 
-    ``max_points`` keeps so many at random. Colours that the file lacks come from the nearest training camera's
-    photograph that a point falls into.
+    At most ``max_points`` random points are kept. If the file has no colours, a point's colour comes from the
+    photograph of the nearest training camera that has it in view.
     """
 
     name: ClassVar[str] = "points"
@@ -142,10 +142,10 @@ class Points(CloudOfFile):
 
 
 def seen_colors(points: Array, capture: Capture, model: pycolmap.Reconstruction) -> NDArray[np.int16]:
-    """Colours [P, 3] of ``points`` in the photograph of the nearest training camera that they fall into; -1 in none.
+    """Colours [P, 3] of ``points`` in the photograph of the nearest training camera that has them in view, else -1.
 
-    What stands between is not looked for: the nearest camera is the least likely to have something there. Pixels that
-    a mask ignores give no colour.
+    Occlusion is ignored; the nearest camera is the least likely to be occluded. Pixels that a mask ignores give no
+    colour.
     """
     from gsbench.scene.images import read_image
     from gsbench.scene.masks import read_mask
@@ -153,11 +153,11 @@ def seen_colors(points: Array, capture: Capture, model: pycolmap.Reconstruction)
     colors = np.full((len(points), 3), -1, dtype=np.int16)
     nearest = np.full(len(points), np.inf)
     for name in capture.train_names:
-        seen, pixels, distance = in_view(points, name, model)
+        seen, pixels, distance = points_in_view(points, name, model)
         if name in capture.masks and len(seen):
             column, row = pixels.astype(np.int64).T
-            counts = read_mask(capture.masks[name])[row, column]  # [V]
-            seen, pixels, distance = seen[counts], pixels[counts], distance[counts]
+            counted = read_mask(capture.masks[name])[row, column]  # [V]
+            seen, pixels, distance = seen[counted], pixels[counted], distance[counted]
         nearer = distance < nearest[seen]
         kept, (column, row) = seen[nearer], pixels[nearer].astype(np.int64).T
         if len(kept):
@@ -167,10 +167,10 @@ def seen_colors(points: Array, capture: Capture, model: pycolmap.Reconstruction)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Ply(CloudOfFile):
-    """The Gaussians of a 3DGS PLY file, under the reference cameras; they must lie in the gauge of those.
+class Ply(CloudFromFile):
+    """The Gaussians of a 3DGS PLY file, which must have the coordinates of the reference cameras.
 
-    The model holds their means and colours as points; the training starts from the Gaussians themselves, kept beside.
+    The model holds their means and colours as points. Training starts from the Gaussians in `GAUSSIANS_FILE`.
     """
 
     name: ClassVar[str] = "ply"

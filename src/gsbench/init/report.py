@@ -1,4 +1,4 @@
-"""The report on a model: what it holds, how far its poses are from the reference, what V_th means, and its picture."""
+"""The report on a model: its content, pose errors against the reference, the meaning of V_th, and a picture."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ if TYPE_CHECKING:
     import pycolmap
 
 SIDE, MARGIN = 960, 60  # px
-MAX_POINTS = 200_000  # drawn; more would only hide each other
-VISIBLE_SHARE = 0.98  # of the points; stray ones far off must not shrink the rest to a dot
-FLATNESS = 0.5  # third over second singular value of the camera centres: below it they lie in a plane
-ROUND = 0.05  # second over first: below it they lie on a line
+MAX_POINTS = 200_000  # drawn; more would only cover each other
+VISIBLE_SHARE = 0.98  # of the points: distant outliers must not shrink the rest to a dot
+PLANE_RATIO = 0.5  # third over second singular value of the camera centres: below it they lie in a plane
+LINE_RATIO = 0.05  # second over first: below it they lie on a line
 VIEW_LINE = 0.06  # length of the lines of sight, as a share of the picture's side
 CAMERA_COLOR = (214, 39, 40)
 
@@ -43,13 +43,13 @@ def draw_cloud(model: pycolmap.Reconstruction, path: Path, title: str) -> None:
     centers = np.array([image.projection_center() for image in images]).reshape(-1, 3)
     rotations = np.array([image.cam_from_world().rotation.matrix() for image in images]).reshape(-1, 3, 3)
     axes = view_from_above(centers, rotations, points)  # [3, 3]
-    order = np.argsort(points @ axes[2], kind="stable")  # the highest are drawn last
+    order = np.argsort(points @ axes[2], kind="stable")  # the highest points are drawn last, over lower ones
     flat, flat_centers = points[order] @ axes[:2].T, centers @ axes[:2].T  # [P, 2], [V, 2]
     low, high = _limits(flat, flat_centers)
     scale = (SIDE - 2 * MARGIN) / (high - low).max()  # px for a unit of the model
 
-    def pixels(places: Array) -> Array:
-        return SIDE / 2 + (places - (low + high) / 2) * scale * (1, -1)
+    def pixels(positions: Array) -> Array:
+        return SIDE / 2 + (positions - (low + high) / 2) * scale * (1, -1)
 
     canvas = np.full((SIDE, SIDE, 3), 255, dtype=np.uint8)
     columns, rows = np.floor(pixels(flat)).astype(np.int64).T  # [P] each
@@ -73,13 +73,13 @@ def draw_cloud(model: pycolmap.Reconstruction, path: Path, title: str) -> None:
 def view_from_above(centers: Array, rotations: Array, points: Array) -> Array:
     """Unit vectors [3, 3] right, away and up, in world coordinates.
 
-    Up is the normal of the plane that the camera centres [V, 3] lie in, else the mean of the images' upward directions;
-    its sign is that of the images' upward direction or, for cameras that look down, puts cameras above ``points``.
-    ``rotations`` [V, 3, 3] are world to camera.
+    Up is the normal of the plane of the camera centres [V, 3] or, if they lie in no plane, the mean of the images'
+    upward directions. The normal's sign agrees with the images' upward directions; for cameras that look down, it puts
+    the cameras above ``points``. ``rotations`` [V, 3, 3] are world to camera.
     """
     image_up = -rotations[:, 1].mean(axis=0)  # [3]: y points down in the image
     _, spread, directions = np.linalg.svd(centers - centers.mean(axis=0), full_matrices=False)
-    in_plane = len(centers) >= 3 and spread[1] > ROUND * spread[0] and spread[2] < FLATNESS * spread[1]
+    in_plane = len(centers) >= 3 and spread[1] > LINE_RATIO * spread[0] and spread[2] < PLANE_RATIO * spread[1]
     up = directions[2] if in_plane else image_up
     towards = image_up
     if abs(up @ image_up) < 0.5 and len(points) > 0:
@@ -102,16 +102,16 @@ def _limits(flat: Array, centers: Array) -> tuple[Array, Array]:
     return low - margin, high + margin
 
 
-REGISTERED_SHARE = 0.9  # below this share of the images is a warning
-ROTATION_WARNING_DEG = 2.0  # sound models stay below 0.5; wrong ones that register every image reach 20 and more
+REGISTERED_SHARE = 0.9  # the report warns if fewer of the images have a pose
+ROTATION_WARNING_DEG = 2.0  # correct models stay below 0.5; wrong ones that register every image reach 20 and more
 CENTER_WARNING = 0.05  # of the reference's scene extent
-REPROJECTION_WARNING_PX = 1.5  # sound models of SIFT are below 0.7 px, of learned features below 1.2 px
-FIELD_OF_VIEW_DEG = (5.0, 150.0)  # of the longest side; an estimate outside of it is nonsense
+REPROJECTION_WARNING_PX = 1.5  # correct models stay below 0.7 px with SIFT, below 1.2 px with learned features
+FIELD_OF_VIEW_DEG = (5.0, 150.0)  # plausible range, along the longest side
 FEW_POINTS = 100
 
 
 def training_extent(model: pycolmap.Reconstruction, capture: Capture) -> float:
-    """3DGS's ``cameras_extent`` of the capture's training images that the model places; 0 where it places none."""
+    """3DGS's ``cameras_extent`` of the training images with a pose in the model, or 0 if there are none."""
     poses = poses_by_name(model)
     centers = np.array([poses[name][0] for name in capture.train_names if name in poses]).reshape(-1, 3)
     if len(centers) == 0:
@@ -140,7 +140,7 @@ def compare_poses(
     reference_extent: float,
     exact: bool,
 ) -> PoseErrors:
-    """Errors of the poses of ``model``, moved by ``similarity``, over the images that both place."""
+    """Pose errors of ``model`` after ``similarity``, over the images that have a pose in both models."""
     centers, rotations, reference_centers, reference_rotations = common_poses(model, reference)
     distances = np.linalg.norm(similarity(centers) - reference_centers, axis=1)  # [N]
     angles = rotation_angles(transformed_rotations(similarity, rotations), reference_rotations)  # [N]
@@ -174,7 +174,7 @@ def make_report(
     warnings: Sequence[str] = (),
     training_points: TrainingPoints | None = None,
 ) -> InitReport:
-    """The report on ``model`` as it is written; ``packages`` are those whose installed versions it states."""
+    """The report on ``model``, with the installed versions of ``packages``."""
     placed = set(poses_by_name(model))
     observed = any(point.track.length() > 0 for point in model.points3D.values())
     report = InitReport(
@@ -209,7 +209,7 @@ def write_result(model: pycolmap.Reconstruction, report: InitReport, output_dir:
 
 
 def find_warnings(report: InitReport, model: pycolmap.Reconstruction) -> tuple[str, ...]:
-    """List the reasons to doubt a model, each in one line; that all images are placed is no proof."""
+    """List the reasons to doubt a model, one line each. A model can be wrong although all its images have poses."""
     found = []
     if report.num_registered < REGISTERED_SHARE * report.num_images:
         missing = ", ".join(report.unregistered[:5]) + (" …" if len(report.unregistered) > 5 else "")

@@ -21,9 +21,11 @@ from gsbench.system.isolate import run_with_progress
 if TYPE_CHECKING:
     from gsbench.init.colmap.database import DatabaseTask
 
-DEFAULT_PEAK_THRESHOLD = 0.02 / 3  # COLMAP's defaults
+# COLMAP's defaults
+DEFAULT_PEAK_THRESHOLD = 0.02 / 3
 DEFAULT_EDGE_THRESHOLD = 10.0
-DENSE_PEAK_THRESHOLD = 0.02 / 12  # together: 2.9 times the points on low-contrast ground, at a lower error
+# Together they give 2.9 times the points on low-contrast ground, at a lower error.
+DENSE_PEAK_THRESHOLD = 0.02 / 12
 DENSE_EDGE_THRESHOLD = 20.0
 
 
@@ -31,8 +33,8 @@ DENSE_EDGE_THRESHOLD = 20.0
 class Sfm(ColmapInitializer):
     """SIFT, matching and incremental mapping by COLMAP.
 
-    Sizes are in px of the image files' longest side: larger images are shrunk for detection, and keypoints come back at
-    the files' size. With one seed and ``mapper_threads=1`` two runs give the same model bit for bit.
+    ``max_image_size`` is in px of the longest side. Larger images are shrunk for detection, and keypoints are scaled
+    back to the files' size. With the same seed and ``mapper_threads=1`` two runs give the same model bit for bit.
     """
 
     name: ClassVar[str] = "sfm"
@@ -69,7 +71,7 @@ class Sfm(ColmapInitializer):
 
 @dataclass(frozen=True, kw_only=True)
 class SfmDense(Sfm):
-    """`Sfm` with loose detection thresholds, for many more points: an offline stand-in beside deep image matching."""
+    """`Sfm` with loose detection thresholds, for many more points: a substitute for deep image matching."""
 
     name: ClassVar[str] = "sfm_dense"
     is_own_reference: ClassVar[bool] = False
@@ -81,10 +83,10 @@ class SfmDense(Sfm):
 
 @dataclass(frozen=True, kw_only=True)
 class Jittered(Sfm):
-    """`Sfm`, then ``copies`` more of each point, of its colour, shifted at random.
+    """`Sfm` with ``copies`` randomly shifted copies of each point, in the point's colour.
 
-    A shift is normal with standard deviation ``shift`` times the distance to the point's nearest neighbour. The copies
-    have no tracks, so errors and track lengths of the report are those of the points themselves.
+    The shift is normal with standard deviation ``shift`` times the distance to the point's nearest neighbour. Copies
+    have no tracks, so the report's errors and track lengths are those of the original points.
     """
 
     name: ClassVar[str] = "jittered"
@@ -116,8 +118,8 @@ def _add_copies(job: tuple[Jittered, InitReport, Path], progress: Progress) -> I
     points = [model.points3D[index] for index in sorted(model.points3D)]
     colors = np.array([point.color for point in points])  # [P, 3]
     copies = shifted_copies(np.array([point.xyz for point in points]), options.copies, options.shift, options.seed)
-    for index, place in enumerate(copies):
-        model.add_point3D(place, pycolmap.Track(), colors[index % len(colors)])
+    for index, position in enumerate(copies):
+        model.add_point3D(position, pycolmap.Track(), colors[index % len(colors)])
     counts = {**report.counts, "shifted_copies": len(copies)}
     result = replace(report, num_points=model.num_points3D(), counts=counts)
     write_result(model, result, output_dir)
@@ -125,11 +127,10 @@ def _add_copies(job: tuple[Jittered, InitReport, Path], progress: Progress) -> I
 
 
 def shifted_copies(points: Array, copies: int, shift: float, seed: int) -> Array:
-    """``copies`` times all of ``points`` [P, 3], one after another, each shifted within its neighbourhood: [copies P,
-    3]."""
+    """Shifted copies [copies P, 3] of ``points`` [P, 3]; each repetition holds all points in their order."""
     from scipy.spatial import cKDTree  # takes a while to load
 
-    distances, _ = cKDTree(points).query(points, k=2)  # [P, 2], the first is the point itself
+    distances, _ = cKDTree(points).query(points, k=2)  # [P, 2], the first neighbour is the point itself
     spread = shift * distances[:, 1:]  # [P, 1] world units
     noise = np.random.default_rng(seed).standard_normal((copies, len(points), 3))
     return (points + spread * noise).reshape(-1, 3)

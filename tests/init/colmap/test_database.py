@@ -28,7 +28,7 @@ def images(tmp_path: Path) -> Path:
 def database(images: Path, tmp_path: Path) -> Path:
     """Cameras and images without features; the names are given in no order."""
     made.create_database(
-        tmp_path / "database.db", made.guessed_groups(images, list(SIZES)[::-1], "single", "SIMPLE_RADIAL", None)
+        tmp_path / "database.db", made.unknown_camera_groups(images, list(SIZES)[::-1], "single", "SIMPLE_RADIAL", None)
     )
     return tmp_path / "database.db"
 
@@ -42,12 +42,12 @@ def database(images: Path, tmp_path: Path) -> Path:
     ],
 )
 def test_who_shares_a_camera(images: Path, sharing: str, expected: list[set[str]]) -> None:
-    groups = made.guessed_groups(images, list(SIZES), sharing, "SIMPLE_RADIAL", None)
+    groups = made.unknown_camera_groups(images, list(SIZES), sharing, "SIMPLE_RADIAL", None)
     assert [set(names) for _, names in groups] == expected
     for camera, names in groups:
         assert (camera.width, camera.height) == SIZES[names[0]]
         assert (camera.focal_length, camera.has_prior_focal_length) == (1.2 * 40, False)
-    known = made.guessed_groups(images, list(SIZES), sharing, "SIMPLE_RADIAL", 51.0)
+    known = made.unknown_camera_groups(images, list(SIZES), sharing, "SIMPLE_RADIAL", 51.0)
     assert all((camera.focal_length, camera.has_prior_focal_length) == (51.0, True) for camera, _ in known)
 
 
@@ -189,7 +189,7 @@ def test_the_references_cameras_are_known_and_have_its_placed_images() -> None:
     for number, (name, camera) in enumerate([("d", 1), ("c", 2), ("b", 1), ("a", 2)], start=1):
         image = pycolmap.Image(name=name, camera_id=camera, image_id=number)
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
-    groups = made.reference_groups(model)
+    groups = made.reference_camera_groups(model)
     assert [names for _, names in groups] == [["a", "c"], ["b", "d"]]
     assert [(camera.mean_focal_length(), camera.width) for camera, _ in groups] == [(60.0, 80), (50.0, 40)]
     assert all(camera.has_prior_focal_length for camera, _ in groups)

@@ -18,12 +18,12 @@ from gsbench.init.colmap.database import (
     assume_focal_lengths,
     cameras_without_prior,
     create_database,
-    guessed_groups,
+    unknown_camera_groups,
     verify_pairs,
     write_keypoints,
     write_matches,
 )
-from gsbench.init.colmap.mapping import Mapped, map_images
+from gsbench.init.colmap.mapping import MappingResult, map_images
 from gsbench.init.colmap.reconstruct import poses_by_name, verification_options
 from gsbench.logs import no_progress
 
@@ -50,7 +50,7 @@ def small_baseline(folder: Path, spread: float = 0.2, turn: float = 0.0) -> tupl
         names.append(name)
         centers[name], seen[name], keypoints[name] = center, np.flatnonzero(inside), pixels[inside].astype(np.float32)
     database = folder / "database.db"
-    create_database(database, guessed_groups(folder / "images", names, "single", "SIMPLE_RADIAL", None))
+    create_database(database, unknown_camera_groups(folder / "images", names, "single", "SIMPLE_RADIAL", None))
     write_keypoints(database, keypoints)
     matches = {}
     for i, first in enumerate(names):
@@ -62,7 +62,7 @@ def small_baseline(folder: Path, spread: float = 0.2, turn: float = 0.0) -> tupl
     return database, centers
 
 
-def mapped(database: Path, mapper: Any) -> Mapped:
+def mapped(database: Path, mapper: Any) -> MappingResult:
     images = database.parent / "images"
     return map_images(database, images, database.parent / "out", Sfm(mapper=mapper), no_progress)
 
@@ -75,9 +75,9 @@ def test_a_small_baseline_without_a_focal_length_is_placed_by_another_way(tmp_pa
     result = mapped(database, "auto")
     assert result.model.num_reg_images() == 9
     assert result.tried[0] == ("incremental", 0)
-    assert result.way != "incremental"
+    assert result.strategy != "incremental"
     (warning,) = result.warnings
-    assert result.way in warning
+    assert result.strategy in warning
     ours = poses_by_name(result.model)
     names = sorted(truth)
     similarity = align_poses(
@@ -95,7 +95,7 @@ def test_a_small_baseline_without_a_focal_length_is_placed_by_another_way(tmp_pa
 def test_the_global_mapper_alone(tmp_path: Path) -> None:
     database, _ = small_baseline(tmp_path)
     result = mapped(database, "global")
-    assert (result.way, result.model.num_reg_images(), result.warnings) == ("global", 9, ())
+    assert (result.strategy, result.model.num_reg_images(), result.warnings) == ("global", 9, ())
 
 
 def test_where_the_defaults_do_nothing_else_is_tried(tmp_path: Path) -> None:
@@ -163,14 +163,16 @@ def test_ways_are_tried_until_one_places_nine_of_ten(
     names = [f"{k}.png" for k in range(10)]
     for name in names:
         Image.new("RGB", (40, 30)).save(tmp_path / "images" / name)
-    create_database(tmp_path / "database.db", guessed_groups(tmp_path / "images", names, "single", "PINHOLE", 30.0))
+    create_database(
+        tmp_path / "database.db", unknown_camera_groups(tmp_path / "images", names, "single", "PINHOLE", 30.0)
+    )
     monkeypatch.setattr(mapping, "_is_plausible", lambda model: True)
     ways = [(f"way {k}", lambda sizes=sizes: [Model(*size) for size in sizes]) for k, sizes in enumerate(found)]
-    monkeypatch.setattr(mapping._Mapper, "ways", lambda mapper: iter(ways))
+    monkeypatch.setattr(mapping._Mapper, "strategies", lambda mapper: iter(ways))
     result = mapped(tmp_path / "database.db", "auto")
     assert (result.model.num_reg_images(), result.model.num_points3D()) == best
     place = next(k for k, sizes in enumerate(found) if best in sizes)
-    assert (result.way, result.models) == (f"way {place}", len(found[place]))
+    assert (result.strategy, result.models) == (f"way {place}", len(found[place]))
     assert result.tried == tuple((f"way {k}", max(sizes, default=(0, 0))[0]) for k, sizes in enumerate(found[:tried]))
     assert bool(result.warnings) == (tried > 1)
     for sizes, said in (([], "found no pair of images"), ([(2, 99)], "placed only 2 of 10 images")):
@@ -186,13 +188,13 @@ def test_the_ways_of_a_mapper(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, m
     calls: list[tuple[object, ...]] = []
     monkeypatch.setattr(mapping, "cameras_without_prior", lambda database: not prior)
     own = mapping._Mapper
-    monkeypatch.setattr(own, "with_focal_lengths", lambda _, factor: calls.append(("assumed", factor)) or [])
+    monkeypatch.setattr(own, "with_assumed_focal_lengths", lambda _, factor: calls.append(("assumed", factor)) or [])
     monkeypatch.setattr(
         own, "incremental", lambda _, found, angle=None: calls.append(("incremental", found, angle)) or []
     )
-    monkeypatch.setattr(own, "at_once", lambda made: calls.append(("global", made.database)) or [])
+    monkeypatch.setattr(own, "global_mapping", lambda made: calls.append(("global", made.database)) or [])
     database = tmp_path / "a.db"
-    ways = list(own(database, tmp_path, tmp_path / "out", Sfm(mapper=mapper), no_progress, 9).ways())
+    ways = list(own(database, tmp_path, tmp_path / "out", Sfm(mapper=mapper), no_progress, 9).strategies())
     for _, run in ways:
         run()
     assumed = [] if prior else [("assumed", factor) for factor in mapping.FOCAL_FACTORS]
@@ -225,7 +227,7 @@ def test_mapping_tells_its_progress_from_none_to_all(tmp_path: Path, monkeypatch
     assert [model.images for model in mapper.incremental(tmp_path / "a.db")] == [2, 2]
     assert told == [("map", done, 3) for done in (0, 1, 2, 3, 3, 3)]
     told.clear()
-    assert [model.images for model in mapper.at_once()] == [3]
+    assert [model.images for model in mapper.global_mapping()] == [3]
     assert told == [("map", 0, 3), ("map", 3, 3)]
 
 

@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 
 from gsbench.init import MODEL_FOLDER, Sfm
 from gsbench.init.base import Timer
-from gsbench.init.colmap.database import DatabaseTask, create_database, guessed_groups
+from gsbench.init.colmap.database import DatabaseTask, create_database, unknown_camera_groups
 from gsbench.init.colmap.pairs import best_pairs
-from gsbench.init.colmap.sift import deal, divide, extract_sift, match_sift
+from gsbench.init.colmap.sift import distribute_parts, divide_pairs, extract_sift, match_sift
 from gsbench.logs import no_progress
 from gsbench.scene.types import Capture
 
@@ -27,8 +27,8 @@ pairs_of_some_images = st.integers(2, 40).flatmap(
 
 @given(pairs_of_some_images, st.integers(1, 9), st.integers(1, 5))
 def test_every_pair_is_matched_once(pairs: set[tuple[int, int]], block: int, processes: int):
-    parts = divide(sorted(pairs), block)
-    shares = deal(parts, processes)
+    parts = divide_pairs(sorted(pairs), block)
+    shares = distribute_parts(parts, processes)
     assert sorted(pair for share in shares for part in share for pair in part) == sorted(pairs)
     assert all(len(part) <= block * block for part in parts)
     assert 1 <= len(shares) <= processes
@@ -36,9 +36,9 @@ def test_every_pair_is_matched_once(pairs: set[tuple[int, int]], block: int, pro
 
 def test_shares_are_about_equal_and_parts_hold_few_images():
     pairs = list(itertools.combinations(range(1, 101), 2))
-    parts = divide(pairs, 10)
+    parts = divide_pairs(pairs, 10)
     assert max(len({image for pair in part for image in pair}) for part in parts) <= 2 * 10
-    sizes = [sum(map(len, share)) for share in deal(parts, 4)]
+    sizes = [sum(map(len, share)) for share in distribute_parts(parts, 4)]
     assert max(sizes) - min(sizes) <= 10 * 10
 
 
@@ -50,7 +50,7 @@ def features(bare_photos: Capture, tmp_path_factory: pytest.TempPathFactory) -> 
     names = [f"IMG {index} (1).png" for index in range(len(bare_photos.image_names))]
     for name, original in zip(names, bare_photos.image_names, strict=True):
         shutil.copy(bare_photos.images / original, folder / "images" / name)
-    create_database(folder / "database.db", guessed_groups(folder / "images", names, "single", "PINHOLE", 300.0))
+    create_database(folder / "database.db", unknown_camera_groups(folder / "images", names, "single", "PINHOLE", 300.0))
     extract_sift(folder / "database.db", folder / "images", names, Sfm(), 1, no_progress)
     return folder / "database.db", list(itertools.combinations(names, 2))
 

@@ -1,1 +1,1 @@
-"""Structure from motion by COLMAP: database, matching, reconstruction, alignment."""
+"""Structure from motion with COLMAP: database, matching, reconstruction and alignment."""

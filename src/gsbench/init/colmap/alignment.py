@@ -1,4 +1,4 @@
-"""The similarity between two sets of camera poses, and the errors that remain after it."""
+"""Similarity transforms between two sets of camera poses."""
 
 from dataclasses import dataclass
 
@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 RANSAC_TRIALS = 500
-# 2.5 sigma, as in least median of squares; a median absolute deviation times 1.4826 estimates sigma.
+# 2.5 sigma, as in least median of squares; the median absolute deviation times 1.4826 estimates sigma.
 INLIER_FACTOR = 2.5 * 1.4826
-COLLINEAR_RATIO = 1e-2  # second over first singular value of the centres: below it they are too near to a line
+COLLINEAR_RATIO = 1e-2  # second over first singular value of the centres: below it they count as collinear
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,12 +40,12 @@ def fit_similarity(source: Array, target: Array) -> Similarity:
 def align_poses(
     source_centers: Array, source_rotations: Array, target_centers: Array, target_rotations: Array
 ) -> Similarity:
-    """The similarity from one model's cameras to another's, little moved by cameras that are wrong.
+    """The similarity that maps the cameras of one model to those of another, robust to wrong cameras.
 
     Centres are [N, 3] and rotations (world to camera) [N, 3, 3], in the same order of cameras, N >= 3. The similarity
-    is fitted to the centres: the least median of squared residuals over seeded triples, then least squares over its
-    inliers. Centres on a line leave the rotation about it open, so there the rotation comes from the cameras' own
-    orientations. Raises ``ValueError`` where the centres of one side coincide.
+    is fitted to the centres, by the least median of squared residuals over random triples, then by least squares over
+    the inliers. Collinear centres leave the rotation about their line open; then the rotation comes from the cameras'
+    orientations. Raises ``ValueError`` if the centres of one model coincide.
     """
     if len(source_centers) < 3:
         raise ValueError(f"a similarity needs at least 3 common cameras, got {len(source_centers)}")
@@ -65,21 +65,19 @@ def align_poses(
 
 
 def rotation_angles(first: Array, second: Array) -> Array:
-    """Angles [N] in degrees between rotations [N, 3, 3].
-
-    Uses the chord ``|A - B| = 2 sqrt(2) sin(angle / 2)``, which stays accurate near 0 where the trace formula does not.
-    """
-    chords = np.linalg.norm(first - second, axis=(1, 2))  # Frobenius
+    """Angles [N] in degrees between rotations [N, 3, 3]."""
+    # The chord |A - B| = 2 sqrt(2) sin(angle / 2) is accurate near an angle of 0, the trace formula is not.
+    chords = np.linalg.norm(first - second, axis=(1, 2))  # Frobenius norm
     return np.degrees(2 * np.arcsin(np.clip(chords / (2 * np.sqrt(2)), 0.0, 1.0)))
 
 
 def transformed_rotations(similarity: Similarity, rotations: Array) -> Array:
-    """World-to-camera rotations [N, 3, 3] of the same cameras after ``similarity`` moved the world."""
+    """World-to-camera rotations [N, 3, 3] of the same cameras after ``similarity`` has transformed the world."""
     return rotations @ similarity.rotation.T
 
 
 def _least_median_fit(source: Array, target: Array) -> Similarity:
-    generator = np.random.default_rng(0)  # the trials are a search, not a result: one fixed seed
+    generator = np.random.default_rng(0)  # a fixed seed: the triples only guide the search
     best, best_median = fit_similarity(source, target), np.inf
     best_median = float(np.median(np.linalg.norm(best(source) - target, axis=1)))
     for _ in range(RANSAC_TRIALS):
@@ -97,7 +95,7 @@ def _least_median_fit(source: Array, target: Array) -> Similarity:
 def _fit_with_orientations(
     source: Array, source_rotations: Array, target: Array, target_rotations: Array
 ) -> Similarity:
-    """Rotation from the mean of the cameras' orientations (chordal), then scale and translation from the centres."""
+    """Fit the rotation to the cameras' orientations (chordal mean), then scale and translation to the centres."""
     u, _, vt = np.linalg.svd((np.swapaxes(target_rotations, 1, 2) @ source_rotations).sum(axis=0))
     rotation = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
     rotated = (source - source.mean(axis=0)) @ rotation.T

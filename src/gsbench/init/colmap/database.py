@@ -1,4 +1,4 @@
-"""COLMAP's database: cameras first, then images with keypoints and matches from whatever extractor."""
+"""COLMAP's database: creating it with cameras and images, and adding keypoints and matches of any extractor."""
 
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
@@ -17,18 +17,18 @@ from gsbench.scene.images import image_size, read_image
 from gsbench.scene.types import Capture
 
 COLMAP_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
-VERIFY_CALLS = 20  # COLMAP reports no progress within a call, so it is called for a twentieth of the pairs
+VERIFY_CALLS = 20  # COLMAP reports no progress within a call, so the pairs are divided over several calls
 MIN_PAIRS_PER_CALL = 50
 
 
-Groups = Sequence[tuple[pycolmap.Camera, Sequence[str]]]  # each camera with the names of its images
+CameraGroups = Sequence[tuple[pycolmap.Camera, Sequence[str]]]  # each camera with the names of its images
 
 
 @dataclass(frozen=True)
 class DatabaseTask:
-    """Database to be filled, with cameras and images in it, and the pairs of images to be matched.
+    """A database with cameras and images, to be filled with matches, and the pairs of images to match.
 
-    ``images`` is a folder with the same names as the capture's in which COLMAP can read every file.
+    ``images`` is a folder with the names of the capture in which COLMAP can read every file.
     """
 
     database: Path
@@ -40,10 +40,10 @@ class DatabaseTask:
 
 
 def readable_images(images: Path, names: Sequence[str], work_dir: Path) -> Path:
-    """A folder with the same ``names`` in which COLMAP can read every image.
+    """A folder in which COLMAP can read every image, under the same ``names``.
 
-    It is ``images`` itself unless some have a format that COLMAP lacks (WebP). Else it is made below ``work_dir``:
-    links to the files, and for those PNG content, which COLMAP recognises whatever the name says.
+    This is ``images`` if COLMAP can read all formats. Otherwise (WebP) it is a new folder below ``work_dir`` with links
+    to the readable files and PNG copies of the others. COLMAP recognises PNG content under any file name.
     """
     unreadable = [name for name in names if Path(name).suffix.lower() not in COLMAP_SUFFIXES]
     if not unreadable:
@@ -51,17 +51,17 @@ def readable_images(images: Path, names: Sequence[str], work_dir: Path) -> Path:
     folder = work_dir / "images"
     shutil.rmtree(folder, ignore_errors=True)
     for name in names:
-        copy = folder / name
-        copy.parent.mkdir(parents=True, exist_ok=True)
+        target = folder / name
+        target.parent.mkdir(parents=True, exist_ok=True)
         if name in unreadable:
-            Image.fromarray(read_image(images / name)).save(copy, format="PNG")
+            Image.fromarray(read_image(images / name)).save(target, format="PNG")
         else:
-            copy.symlink_to((images / name).resolve())
+            target.symlink_to((images / name).resolve())
     return folder
 
 
 def colmap_masks(masks: Mapping[str, Path], work_dir: Path) -> Path | None:
-    """A folder below ``work_dir`` of links to the masks of images by name, as COLMAP names them; None for no masks."""
+    """A folder below ``work_dir`` with links to the masks, named as COLMAP expects; None if there are no masks."""
     if not masks:
         return None
     folder = work_dir / "masks"
@@ -73,29 +73,30 @@ def colmap_masks(masks: Mapping[str, Path], work_dir: Path) -> Path | None:
     return folder
 
 
-def reference_groups(reference: pycolmap.Reconstruction) -> list[tuple[pycolmap.Camera, list[str]]]:
-    """The reference's cameras, taken as known, each with the images that have a pose, in order of their names."""
+def reference_camera_groups(reference: pycolmap.Reconstruction) -> list[tuple[pycolmap.Camera, list[str]]]:
+    """The reference's cameras, as known ones, each with the sorted names of its images that have a pose."""
     groups: dict[int, list[str]] = {}
     for image in reference.images.values():
         if image.has_pose:
             groups.setdefault(image.camera_id, []).append(image.name)
     result = []
     for camera_id, names in sorted(groups.items(), key=lambda group: min(group[1])):
-        known = reference.cameras[camera_id]
-        camera = rescaled_camera(known, known.width, known.height, camera_id=0)  # a copy, as the database renumbers it
+        original = reference.cameras[camera_id]
+        # A copy, because the database gives it another id.
+        camera = rescaled_camera(original, original.width, original.height, camera_id=0)
         camera.has_prior_focal_length = True
         result.append((camera, sorted(names)))
     return result
 
 
-def guessed_groups(
+def unknown_camera_groups(
     images: Path, names: Sequence[str], sharing: str, model: str, focal_length: float | None
 ) -> list[tuple[pycolmap.Camera, list[str]]]:
-    """Cameras to be estimated, each with its images.
+    """Cameras to be estimated, each with the names of its images.
 
-    ``sharing``: ``single`` is one camera for all images of a size, ``per_folder`` the same within each sub-folder,
-    ``per_image`` one for each. The focal length in pixels is ``focal_length``, else EXIF's of the group's first image,
-    else 1.2 x the longest side (COLMAP's guess).
+    ``sharing`` is ``single`` for one camera for all images of a size, ``per_folder`` for one for each size in each
+    sub-folder, or ``per_image``. The initial focal length in px is ``focal_length``, else from the EXIF data of the
+    group's first image, else 1.2 x the longest side (COLMAP's default).
     """
     groups: dict[tuple[object, ...], list[str]] = {}
     for name in names:
@@ -115,11 +116,11 @@ def guessed_groups(
     return result
 
 
-def create_database(path: Path, groups: Groups) -> dict[str, int]:
-    """A new database with cameras and images but no features; returns the image ids, which follow the sorted names.
+def create_database(path: Path, groups: CameraGroups) -> dict[str, int]:
+    """Create a database with cameras and images but no features; returns the image ids by name.
 
-    With the ids fixed here, extraction and matching give the same database on any number of threads. Each camera is in
-    a rig of its own.
+    The ids follow the sorted names. Because they are fixed here, extraction and matching give the same database on any
+    number of threads. Each camera gets its own rig.
     """
     path.unlink(missing_ok=True)
     camera_ids: dict[str, int] = {}
@@ -145,10 +146,7 @@ def create_database(path: Path, groups: Groups) -> dict[str, int]:
 
 
 def write_keypoints(path: Path, keypoints: Mapping[str, NDArray[np.float32]]) -> None:
-    """Add ``keypoints`` [K, 2] by image name.
-
-    They are in pixels of the image file in COLMAP's convention: the centre of the first pixel is (0.5, 0.5).
-    """
+    """Add ``keypoints`` [K, 2] by image name, in px of the image file; the centre of the first pixel is (0.5, 0.5)."""
     with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
         image_ids = {image.name: image.image_id for image in database.read_all_images()}
         for name, points in keypoints.items():
@@ -158,7 +156,7 @@ def write_keypoints(path: Path, keypoints: Mapping[str, NDArray[np.float32]]) ->
 
 
 def write_matches(path: Path, matches: Mapping[tuple[str, str], NDArray[np.uint32]]) -> None:
-    """Add ``matches`` [M, 2], indices of keypoints of the first and second image, by pairs of image names."""
+    """Add ``matches`` [M, 2] by pairs of image names: indices of keypoints in the first and the second image."""
     with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
         image_ids = {image.name: image.image_id for image in database.read_all_images()}
         for (first, second), indices in matches.items():
@@ -170,7 +168,7 @@ def write_matches(path: Path, matches: Mapping[tuple[str, str], NDArray[np.uint3
 def verify_pairs(
     path: Path, pairs: Sequence[tuple[str, str]], options: pycolmap.TwoViewGeometryOptions, progress: Progress
 ) -> None:
-    """COLMAP's geometric verification of the matches of ``pairs``, which are in the database."""
+    """Run COLMAP's geometric verification on the stored matches of ``pairs``."""
     list_file = path.with_suffix(".pairs.txt")
     size = max(len(pairs) // VERIFY_CALLS, MIN_PAIRS_PER_CALL)
     progress("verify", 0, len(pairs))
@@ -184,15 +182,15 @@ def verify_pairs(
 
 
 def cameras_without_prior(path: Path) -> bool:
-    """Return whether some camera's focal length is a guess, neither given nor in the EXIF data."""
+    """Return whether the focal length of at least one camera is neither given nor in the EXIF data."""
     with pycolmap.Database.open(path) as database:
         return any(not camera.has_prior_focal_length for camera in database.read_all_cameras())
 
 
 def assume_focal_lengths(path: Path, factor: float) -> list[tuple[str, str]]:
-    """Set each guessed focal length to ``factor`` times the longest side, as one that is known.
+    """Set each unknown focal length to ``factor`` times the longest side, and mark it as known.
 
-    Drops what was verified under the guess, and returns the pairs of names that have matches.
+    Drops the geometries that were verified before, and returns the pairs of image names that have matches.
     """
     with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
         for camera in database.read_all_cameras():
@@ -205,21 +203,23 @@ def assume_focal_lengths(path: Path, factor: float) -> list[tuple[str, str]]:
         pair_ids, matches = database.read_all_matches()
         database.clear_two_view_geometries()
         ids = [
-            pycolmap.pair_id_to_image_pair(pair) for pair, found in zip(pair_ids, matches, strict=True) if len(found)
+            pycolmap.pair_id_to_image_pair(pair_id)
+            for pair_id, indices in zip(pair_ids, matches, strict=True)
+            if len(indices)
         ]
     return sorted((names[first], names[second]) for first, second in ids)
 
 
 def write_pairs(path: Path, pairs: Sequence[tuple[str, str]]) -> None:
-    """COLMAP's list of image pairs, one pair of names on a line; they hold no spaces (`image_ids_as_names`)."""
+    """Write COLMAP's list of image pairs, two names on each line; names must have no spaces (`image_ids_as_names`)."""
     path.write_text("".join(f"{first} {second}\n" for first, second in pairs), encoding="utf-8")
 
 
 @contextmanager
 def image_ids_as_names(path: Path) -> Iterator[dict[str, str]]:
-    """Name the images by their ids within the context; gives the new names by the old ones.
+    """Rename the images to their ids within the context; yields the new names by the old ones.
 
-    COLMAP's pair lists are divided at spaces, which the names of photographs often contain.
+    COLMAP splits the lines of its pair lists at spaces, and names of photographs often contain spaces.
     """
     ids = image_ids(path)
     rename_images(path, {image_id: str(image_id) for image_id in ids.values()})
@@ -236,7 +236,7 @@ def image_ids(path: Path) -> dict[str, int]:
 
 
 def rename_images(path: Path, names: Mapping[int, str]) -> None:
-    """Give the database's images other names, by their ids."""
+    """Rename the database's images; ``names`` are the new names by image id."""
     with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
         for image in database.read_all_images():
             image.name = names[image.image_id]
@@ -244,20 +244,21 @@ def rename_images(path: Path, names: Mapping[int, str]) -> None:
 
 
 def strongest_descriptors(path: Path, name: str, count: int) -> NDArray[np.uint8]:
-    """The descriptors [K, 128] of an image's ``count`` features of the largest scales, largest first."""
+    """The descriptors [K, 128] of the ``count`` features with the largest scales of an image, largest first."""
     image_id = image_ids(path)[name]
     with pycolmap.Database.open(path) as database:
         keypoints, descriptors = database.read_keypoints(image_id), database.read_descriptors(image_id).data
     if len(keypoints) == 0:
         return np.zeros((0, descriptors.shape[1]), dtype=np.uint8)
-    scales = np.abs(keypoints[:, 2] * keypoints[:, 5] - keypoints[:, 3] * keypoints[:, 4])  # of the affine shape
+    # The determinant of a keypoint's affine shape orders keypoints as their scales do.
+    scales = np.abs(keypoints[:, 2] * keypoints[:, 5] - keypoints[:, 3] * keypoints[:, 4])  # [K]
     return np.asarray(descriptors)[np.argsort(-scales, kind="stable")[:count]]
 
 
 def database_counts(path: Path) -> dict[str, int]:
     """Count the features, matched and verified pairs and inlier matches of the database."""
     with pycolmap.Database.open(path) as database:
-        _, inliers = database.read_two_view_geometry_num_inliers()  # pairs that failed are there too, with 0
+        _, inliers = database.read_two_view_geometry_num_inliers()  # includes rejected pairs, with 0 inliers
         return {
             "features": database.num_keypoints(),
             "pairs_matched": database.num_matched_image_pairs(),

@@ -1,6 +1,6 @@
-"""Base of initialisers that end in COLMAP: their options, checks, preparation, and the job in a process of its own.
+"""Base of initialisers that end in COLMAP: their settings, checks, preparation and the isolated process.
 
-A subclass adds a database of verified matches.
+A subclass fills a database with verified matches.
 """
 
 from __future__ import annotations
@@ -46,24 +46,23 @@ LOG_FILE = "colmap.log"
 CameraSharing = Literal["single", "per_folder", "per_image"]
 CameraModel = Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"]
 Intrinsics = Literal["estimate", "reference"]
-MIN_DETECTION_SIZE = 32  # px: below it no detector finds anything
+MIN_DETECTION_SIZE = 32  # px: detectors find nothing in smaller images
 
 
 @dataclass(frozen=True, kw_only=True)
 class ColmapInitializer(Initializer):
-    """Base of `Sfm`, `SfmDense`, `Dim` and `SiftKornia`, with the options that they share.
+    """Base of `Sfm`, `SfmDense`, `Dim` and `SiftKornia`, with the settings that they share.
 
-    With ``poses=shared`` the points are triangulated under the reference cameras; with ``poses=own`` cameras and points
-    are estimated and then, where a reference exists, moved into its gauge by a similarity (``align``).
+    With ``poses=shared``, points are triangulated under the reference cameras. With ``poses=own``, cameras and points
+    are estimated; if there is a reference and ``align`` is set, a similarity then moves them into its gauge.
 
-    Unless ``points_from`` is ``all``, test views have no part in the points: under given cameras their photographs are
-    not looked at; where cameras are estimated, all photographs make these, and of the points those of the training
-    views are kept.
+    With ``points_from=train``, test views contribute no points. Under given cameras their photographs are not read. If
+    cameras are estimated, all photographs are used for the cameras, and only points of training views are kept.
 
-    The reference's cameras are those of the ``reference`` given to `run`, else those that came with the capture.
+    The reference is the ``reference`` given to `run`, else the model that came with the capture.
     """
 
-    is_own_reference: ClassVar[bool] = False  # with poses=shared and no reference: estimate the poses here
+    is_own_reference: ClassVar[bool] = False  # estimates the poses itself if poses=shared and there is no reference
 
     poses: Poses = "shared"
     align: bool = True
@@ -73,7 +72,7 @@ class ColmapInitializer(Initializer):
     intrinsics: Intrinsics = "estimate"
     pairs: Pairing = "exhaustive"
     overlap: Annotated[int, Interval(ge=1, le=60)] = 10
-    min_inliers: Annotated[int, Ge(7)] = 15  # a fundamental matrix takes seven
+    min_inliers: Annotated[int, Ge(7)] = 15  # a fundamental matrix needs seven
     min_inlier_ratio: Fraction = 0.0
     mapper: Literal["auto", "incremental", "global"] = "auto"
     min_model_size: Annotated[int, Ge(2)] = 3
@@ -88,38 +87,38 @@ class ColmapInitializer(Initializer):
 
     @abstractmethod
     def fill_database(self, task: DatabaseTask, progress: Progress, timer: Timer) -> dict[str, int]:
-        """Write features, matches and verified geometries; runs in the isolated process. Returns counts to report."""
+        """Write features, matches and verified geometries, in the isolated process. Returns counts for the report."""
 
     @property
     def num_threads(self) -> int:
-        """``threads`` as a number; ``auto`` is the cores that this process may use."""
+        """``threads`` as a number; ``auto`` is the number of cores that this process may use."""
         return available_cores() if self.threads == "auto" else self.threads
 
     def packages(self) -> tuple[str, ...]:
-        """The packages whose versions the report states."""
+        """The packages whose versions are in the report."""
         return ("pycolmap", "numpy")
 
     @property
-    def takes_reference_cameras(self) -> bool:
-        """Return whether the cameras (intrinsics at least) are the reference's where there is one."""
+    def uses_reference_cameras(self) -> bool:
+        """Return whether at least the intrinsics are taken from the reference, if there is one."""
         return self.poses == "shared" or self.intrinsics == "reference"
 
     def select_images(self, capture: Capture, reference: pycolmap.Reconstruction | None) -> list[str]:
-        """The sorted names of the images to be used: all, or those of the reference where its cameras are taken."""
-        if reference is None or not self.takes_reference_cameras:
+        """The sorted names of the images to use: all, or the images of the reference if its cameras are used."""
+        if reference is None or not self.uses_reference_cameras:
             return sorted(capture.image_names)
         names = sorted(image.name for image in reference.images.values() if image.has_pose)
-        test = set(capture.test_names) if self.leaves_out(reference) else set()
-        return [name for name in names if name not in test]
+        ignored = set(capture.test_names) if self.ignores_test_photographs(reference) else set()
+        return [name for name in names if name not in ignored]
 
-    def leaves_out(self, reference: pycolmap.Reconstruction | None) -> bool:
-        """Return whether test photographs are not even looked at, which are not needed where the cameras are given."""
+    def ignores_test_photographs(self, reference: pycolmap.Reconstruction | None) -> bool:
+        """Return whether test photographs are not read at all: given cameras do not need them."""
         return self.points_from != "all" and self.poses == "shared" and reference is not None
 
     def needs_reference(self, capture: Capture) -> bool:
         """Return whether `run` needs a ``reference`` because the capture came without cameras."""
-        shared_without = self.poses == "shared" and not self.is_own_reference
-        return capture.model is None and (shared_without or self.intrinsics == "reference")
+        needs_poses = self.poses == "shared" and not self.is_own_reference
+        return capture.model is None and (needs_poses or self.intrinsics == "reference")
 
     def run(
         self,
@@ -129,21 +128,21 @@ class ColmapInitializer(Initializer):
         reference: Path | None = None,
         work_dir: Path | None = None,
     ) -> InitReport:
-        """Write model and report, as `Initializer` says.
+        """Write model and report (see `Initializer.run`).
 
-        ``work_dir`` keeps features and matches for a later run; without it they are kept within ``output_dir`` until
-        the run succeeds, so that a killed run goes on there.
+        ``work_dir`` keeps features and matches for a later run. Without it, they are kept in ``output_dir`` until the
+        run succeeds, so that an interrupted run continues there.
 
-        Raises ``InputError`` where the photos or settings do not give a model.
+        Raises ``InputError`` if no model can be made from the photographs with these settings.
         """
         self.check(capture, reference)
         output_dir.mkdir(parents=True, exist_ok=True)
         work = output_dir / WORK_FOLDER if work_dir is None else work_dir
         work.mkdir(parents=True, exist_ok=True)
         preparation = self.prepare(capture, work, reference, progress)
-        from gsbench.init.colmap.job import Job, build_model
+        from gsbench.init.colmap.job import ReconstructionJob, build_model
 
-        job = Job(self, capture, output_dir, work, reference, preparation)
+        job = ReconstructionJob(self, capture, output_dir, work, reference, preparation)
         report = run_with_progress(build_model, job, progress, what=self.name, log=output_dir / LOG_FILE)
         if work_dir is None:
             shutil.rmtree(work)
@@ -152,7 +151,7 @@ class ColmapInitializer(Initializer):
         return report
 
     def check(self, capture: Capture, reference: Path | None) -> None:
-        """Raise ``InputError``, before any work, where this capture cannot be initialised like this."""
+        """Raise ``InputError``, before any work, if this capture cannot be initialised with these settings."""
         if len(capture.image_names) < MIN_IMAGES:
             raise InputError(
                 f"scene {capture.name} has {counted(len(capture.image_names), 'image')}: {self.name} needs at least "
@@ -165,5 +164,5 @@ class ColmapInitializer(Initializer):
             )
 
     def prepare(self, capture: Capture, work_dir: Path, reference: Path | None, progress: Progress) -> Preparation:
-        """Work to be done before COLMAP starts; none, unless overridden."""
+        """Do the work that comes before COLMAP; none by default."""
         return Preparation()

@@ -1,4 +1,4 @@
-"""Reconstruction of a reported COLMAP model from photographs. Calls native code that can abort: run it isolated."""
+"""Reconstruction of a COLMAP model with its report. It calls native code that can abort: run it isolated."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Job:
-    """One run of an initialiser, as it is handed to the isolated process."""
+class ReconstructionJob:
+    """Inputs of one run of an initialiser in its isolated process."""
 
     options: ColmapInitializer
     capture: Capture
@@ -36,23 +36,23 @@ class Job:
     preparation: Preparation
 
 
-def build_model(job: Job, progress: Progress) -> InitReport:
-    """Cameras, features, matches, model, report. Calls native code that can abort: run it isolated."""
+def build_model(job: ReconstructionJob, progress: Progress) -> InitReport:
+    """Make cameras, features, matches, model and report. Calls native code that can abort: run it isolated."""
     pycolmap.logging.minloglevel = int(pycolmap.logging.Level.WARNING)
     options, capture = job.options, job.capture
     timer = Timer(dict(job.preparation.seconds))
     reference = reconstruct.load_reference(capture, job.reference)
     database = job.work_dir / "database.db"
-    seen = capture.train_names if options.leaves_out(reference) else capture.image_names
-    images = colmap_database.readable_images(capture.images, seen, job.work_dir)
-    if reference is not None and options.takes_reference_cameras:
-        cameras = colmap_database.reference_groups(reference)
+    used = capture.train_names if options.ignores_test_photographs(reference) else capture.image_names
+    images = colmap_database.readable_images(capture.images, used, job.work_dir)
+    if reference is not None and options.uses_reference_cameras:
+        groups = colmap_database.reference_camera_groups(reference)
     else:
-        cameras = colmap_database.guessed_groups(
+        groups = colmap_database.unknown_camera_groups(
             images, capture.image_names, options.camera, options.camera_model, options.focal_length
         )
-    placed = colmap_database.create_database(database, cameras)
-    names = [name for name in placed if name in set(seen)]
+    image_ids = colmap_database.create_database(database, groups)
+    names = [name for name in image_ids if name in set(used)]
     pairs = reconstruct.select_pairs(names, options)
     task = colmap_database.DatabaseTask(database, images, names, pairs, capture, job.work_dir)
     counts = options.fill_database(task, progress, timer)
@@ -66,8 +66,9 @@ def build_model(job: Job, progress: Progress) -> InitReport:
     if options.poses == "shared" and reference is not None:
         with timer.phase("triangulate"):
             model = reconstruct.triangulate(database, images, scratch, reference, names, options, progress)
-        left = TrainingPoints(options.points_from, model.num_points3D(), None, None)
-        points = left if options.leaves_out(reference) else None
+        points = None
+        if options.ignores_test_photographs(reference):
+            points = TrainingPoints(options.points_from, model.num_points3D(), None, None)
         return _finish(job, "shared", model, reference, None, timer, counts, points=points)
     with timer.phase("map"):
         mapped = mapping.map_images(database, images, scratch, options, progress)
@@ -80,17 +81,17 @@ def build_model(job: Job, progress: Progress) -> InitReport:
 
 
 def _finish(
-    job: Job,
+    job: ReconstructionJob,
     poses: str,
     model: pycolmap.Reconstruction,
     reference: pycolmap.Reconstruction | None,
     similarity: Similarity | None,
     timer: Timer,
     counts: Mapping[str, int],
-    mapped: mapping.Mapped | None = None,
+    mapped: mapping.MappingResult | None = None,
     points: TrainingPoints | None = None,
 ) -> InitReport:
-    """Align the model where it has poses of its own, write it, and report."""
+    """Align the model if its poses were estimated, write it, and make the report."""
     options, capture = job.options, job.capture
     warnings = [*job.preparation.warnings, *(() if mapped is None else mapped.warnings)]
     pose_errors, own_gauge, scale = None, None, 1.0 if poses == "shared" else None
@@ -118,7 +119,7 @@ def _finish(
         own_gauge=own_gauge,
         pose_errors=pose_errors,
         counts=counts,
-        mapped_by=None if mapped is None else mapped.way,
+        mapped_by=None if mapped is None else mapped.strategy,
         warnings=warnings,
         training_points=points,
     )

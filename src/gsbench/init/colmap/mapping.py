@@ -1,8 +1,8 @@
-"""Mapping of a database of verified matches: cameras and points, by the first of several ways that succeeds.
+"""Mapping: cameras and points from a database of verified matches, by the first of several strategies that succeeds.
 
-COLMAP's defaults want an initial pair that sees points under 16 degrees. Forward-facing captures of a small baseline
-and without a known focal length have none; other ways of the same library place them. Everything here calls native
-code that can abort the process: run it isolated.
+COLMAP's defaults need an initial pair that sees points under 16 degrees. Forward-facing captures with a small baseline
+have no such pair; COLMAP's global mapper, smaller angles or assumed focal lengths can still place them. Everything here
+calls native code that can abort the process: run it isolated.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ from gsbench.logs import Progress
 if TYPE_CHECKING:
     from gsbench.init.colmap.initializer import ColmapInitializer
 
-SMALL_ANGLE_DEG = 2.0  # of the initial pair; COLMAP's default is 16
+SMALL_ANGLE_DEG = 2.0  # triangulation angle of the initial pair; COLMAP's default is 16
 FOCAL_FACTORS = (0.75, 1.0, 1.4)  # focal length over the longest side: lenses of 27, 36 and 50 mm on 35 mm film
-MIN_ANGLE_DEG = 0.5  # median over points of the widest angle that sees one; below it depth is a guess
+MIN_ANGLE_DEG = 0.5  # median over points of the widest triangulation angle; below it depth is not determined
 NO_PAIR = (
     "structure from motion found no pair of images to start from: the photos need more overlap (60 % and more "
     "between neighbours), more texture, or a focal length (init.focal_length, px)"
@@ -37,41 +37,46 @@ NO_PAIR = (
 
 
 @dataclass(frozen=True)
-class Mapped:
-    """The best model, how many models that way gave, and what was tried: the images that each way placed."""
+class MappingResult:
+    """The best model, its strategy, the number of models of that strategy, and the images that each strategy placed."""
 
     model: pycolmap.Reconstruction
     models: int
-    way: str
-    tried: tuple[tuple[str, int], ...]
+    strategy: str
+    tried: tuple[tuple[str, int], ...]  # strategies in order, each with the number of images that it placed
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """The warnings of a report where COLMAP's defaults were not enough; one line, or none."""
+        """One line for the report if COLMAP's defaults were not enough, else none."""
         if len(self.tried) < 2:
             return ()
-        others = ", ".join(f"{way} {count}" for way, count in self.tried)
-        return (f"cameras come from the way {self.way!r}, since COLMAP's defaults placed too few (images: {others})",)
+        counts = ", ".join(f"{strategy} {count}" for strategy, count in self.tried)
+        return (
+            f"cameras come from the way {self.strategy!r}, since COLMAP's defaults placed too few (images: {counts})",
+        )
 
 
-def map_images(database: Path, images: Path, output: Path, options: ColmapInitializer, progress: Progress) -> Mapped:
-    """Cameras and points from the matches in ``database``; of several models the one with the most images.
+def map_images(
+    database: Path, images: Path, output: Path, options: ColmapInitializer, progress: Progress
+) -> MappingResult:
+    """Estimate cameras and points from the matches in ``database``; returns the model with the most images.
 
-    ``auto`` goes from COLMAP's incremental mapper to one that starts from smaller angles, to the global mapper and to
-    assumed focal lengths, until a way places `REGISTERED_SHARE` of the images; else the best of all counts.
+    With ``mapper=auto``, the strategies are COLMAP's incremental mapper, the same from a smaller initial angle, the
+    global mapper, and assumed focal lengths. The first that places `REGISTERED_SHARE` of the images ends the search,
+    and the best model so far wins.
 
-    Raises InputError where no model with at least `MIN_IMAGES` images comes out.
+    Raises InputError if no model has at least `MIN_IMAGES` images.
     """
     with pycolmap.Database.open(database) as opened:
         total = opened.num_images()
     best: tuple[pycolmap.Reconstruction, int, str] | None = None
     tried: list[tuple[str, int]] = []
-    for way, run in _Mapper(database, images, output, options, progress, total).ways():
+    for strategy, run in _Mapper(database, images, output, options, progress, total).strategies():
         models = [model for model in run() if _is_plausible(model)]
-        largest = max(models, key=_size, default=None)
-        tried.append((way, 0 if largest is None else largest.num_reg_images()))
-        if largest is not None and (best is None or _size(largest) > _size(best[0])):
-            best = largest, len(models), way
+        largest = max(models, key=_model_size, default=None)
+        tried.append((strategy, 0 if largest is None else largest.num_reg_images()))
+        if largest is not None and (best is None or _model_size(largest) > _model_size(best[0])):
+            best = largest, len(models), strategy
         if best is not None and best[0].num_reg_images() >= REGISTERED_SHARE * total:
             break
     if best is None:
@@ -81,7 +86,7 @@ def map_images(database: Path, images: Path, output: Path, options: ColmapInitia
             f"structure from motion placed only {best[0].num_reg_images()} of {total} images: the photos need more "
             "overlap, more texture, or a focal length (init.focal_length, px)"
         )
-    return Mapped(*best, tuple(tried))
+    return MappingResult(*best, tuple(tried))
 
 
 Models = Sequence[pycolmap.Reconstruction]
@@ -89,7 +94,7 @@ Models = Sequence[pycolmap.Reconstruction]
 
 @dataclass(frozen=True)
 class _Mapper:
-    """COLMAP's mappers on one database of ``total`` images."""
+    """COLMAP's mappers, applied to one database of ``total`` images."""
 
     database: Path
     images: Path
@@ -98,8 +103,8 @@ class _Mapper:
     progress: Progress
     total: int
 
-    def ways(self) -> Iterator[tuple[str, Callable[[], Models]]]:
-        """The ways that ``init.mapper`` allows, in the order of trying, each with what runs it."""
+    def strategies(self) -> Iterator[tuple[str, Callable[[], Models]]]:
+        """The strategies that ``init.mapper`` allows, in the order of trying: names and functions."""
         mapper = self.options.mapper
         if mapper in ("auto", "incremental"):
             yield "incremental", lambda: self.incremental(self.database)
@@ -109,16 +114,16 @@ class _Mapper:
                 lambda: self.incremental(self.database, SMALL_ANGLE_DEG),
             )
         if mapper in ("auto", "global"):
-            yield "global", self.at_once
+            yield "global", self.global_mapping
         if mapper == "auto" and cameras_without_prior(self.database):
             for factor in FOCAL_FACTORS:
-                yield f"focal length {factor:g} x the longest side", partial(self.with_focal_lengths, factor)
+                yield f"focal length {factor:g} x the longest side", partial(self.with_assumed_focal_lengths, factor)
 
     def incremental(self, database: Path, initial_angle: float | None = None) -> Models:
-        """Image by image, from a pair that sees points under ``initial_angle`` degrees (None: COLMAP's default)."""
+        """Map image by image, from a pair that sees points under ``initial_angle`` degrees (None: COLMAP's default)."""
         registered = 0
 
-        def one_more() -> None:
+        def count_image() -> None:
             nonlocal registered
             registered += 1
             self.progress("map", min(registered, self.total), self.total)
@@ -126,11 +131,11 @@ class _Mapper:
         options = pipeline_options(self.options)
         if initial_angle is not None:
             options.mapper.init_min_tri_angle = initial_angle
-        run = partial(pycolmap.incremental_mapping, database, next_image_callback=one_more)
+        run = partial(pycolmap.incremental_mapping, database, next_image_callback=count_image)
         return self._run(run, options)
 
-    def at_once(self) -> Models:
-        """All images together, by COLMAP's global mapper."""
+    def global_mapping(self) -> Models:
+        """Map all images together, with COLMAP's global mapper."""
         options = pycolmap.GlobalPipelineOptions()
         options.num_threads = self.options.mapper_threads
         options.random_seed = self.options.seed
@@ -140,8 +145,11 @@ class _Mapper:
         adjustment.refine_extra_params = self.options.intrinsics == "estimate"
         return self._run(partial(pycolmap.global_mapping, self.database), options)
 
-    def with_focal_lengths(self, factor: float) -> Models:
-        """Incrementally, with unknown focal lengths taken as ``factor`` times the longest side, and verified anew."""
+    def with_assumed_focal_lengths(self, factor: float) -> Models:
+        """Map image by image after setting unknown focal lengths to ``factor`` times the longest side.
+
+        The pairs are verified again under these focal lengths.
+        """
         copy = self.database.with_name(f"assumed-{factor:g}.db")
         shutil.copy(self.database, copy)
         verify_pairs(copy, assume_focal_lengths(copy, factor), verification_options(self.options), self.progress)
@@ -161,19 +169,19 @@ def _empty(folder: Path) -> Path:
     return folder
 
 
-def _size(model: pycolmap.Reconstruction) -> tuple[int, int]:
+def _model_size(model: pycolmap.Reconstruction) -> tuple[int, int]:
     return model.num_reg_images(), model.num_points3D()
 
 
 def _is_plausible(model: pycolmap.Reconstruction) -> bool:
-    """Return whether points are seen under angles that tell their depth; copies of one photograph give none."""
+    """Return whether triangulation angles determine the depth of points; copies of one photograph have none."""
     centers = {image.image_id: image.projection_center() for image in model.images.values() if image.has_pose}
     angles = [_widest_angle(point, centers) for point in model.points3D.values() if point.track.length() > 1]
     return bool(angles) and float(np.median(angles)) >= MIN_ANGLE_DEG
 
 
 def _widest_angle(point: pycolmap.Point3D, centers: dict[int, np.ndarray]) -> float:
-    """The widest angle between two rays to a point, in degrees."""
+    """The widest angle between two rays from a point to its cameras, in degrees."""
     rays = np.array([centers[element.image_id] for element in point.track.elements]) - point.xyz  # [T, 3]
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     return float(np.degrees(np.arccos(np.clip(rays @ rays.T, -1, 1)).max()))

@@ -1,8 +1,9 @@
-"""Pairs of images to be matched: all, those near in their order, or those whose few strongest features agree.
+"""Pairs of images to match: all pairs, neighbours in the order of names, or pairs proposed by a preview.
 
-For the last, Wu, "Towards Linear-time Incremental Structure from Motion" (3DV 2013), matches the largest
-features first and leaves out pairs in which few of them agree. Here the agreement ranks each image's partners, and the
-best are kept: what a pair of distant views adds to a track, its nearer views mostly hold already.
+The preview matches only the strongest features of each image, after Wu, "Towards Linear-time Incremental Structure from
+Motion" (3DV 2013), who skips pairs in which few of the largest features match. Here the number of such matches ranks
+the partners of each image, and the best partners are kept. Pairs of distant views are dropped with little loss, because
+nearer views already contain most of their tracks.
 """
 
 from collections.abc import Callable, Sequence
@@ -27,7 +28,7 @@ def exhaustive_pairs(count: int) -> list[Pair]:
 
 
 def sequential_pairs(count: int, overlap: int) -> list[Pair]:
-    """Pair each image with the next ``overlap`` ones, and those 1, 2, 4, … 2^(overlap - 1) further on, as COLMAP does.
+    """Pair each image with the next ``overlap`` images and those 1, 2, 4, … 2^(overlap - 1) further on, as COLMAP does.
 
     Examples:
         >>> sequential_pairs(6, 3)
@@ -37,18 +38,18 @@ def sequential_pairs(count: int, overlap: int) -> list[Pair]:
     return sorted((i, i + step) for i in range(count) for step in steps if i + step < count)
 
 
-ALL_PAIRS_UP_TO = 30  # images: 435 pairs take no longer than a preview is worth
+ALL_PAIRS_UP_TO = 30  # images, 435 pairs: a preview would not pay off
 STRONGEST = 256  # features of an image in the preview
-PARTNERS = 24  # of each image: 98 % of the points of all pairs and more, on the scenes that were tried
-SQUARED_RATIO = 0.8**2  # of the distances to best and second-best match
-QUANTUM = 512.0  # a descriptor of unit length in whole numbers, as COLMAP's SIFT has them
+PARTNERS = 24  # of each image: gave at least 98 % of the points of all pairs on the dense captures that were tried
+SQUARED_RATIO = 0.8**2  # of the distances to the best and the second-best match
+QUANTUM = 512.0  # scale that turns descriptors of unit length into whole numbers, as in COLMAP's SIFT
 
 
 def best_pairs(descriptors: Sequence[NDArray[np.generic]], partners: int = PARTNERS) -> list[Pair]:
-    """Pair each image with the ``partners`` that agree best with it; sorted pairs (i, j), i < j.
+    """Pair each image with the ``partners`` images with the most matches; returns sorted pairs (i, j), i < j.
 
-    ``descriptors`` are those of each image's strongest features [K, D], at most `STRONGEST` of which are read: whole
-    numbers, or floats of unit length. Of equal partners those nearer in the order of images come first.
+    ``descriptors`` [K, D] belong to each image's strongest features, of which at most `STRONGEST` are used. They are
+    whole numbers, or floats of unit length. Among equal partners, those nearer in the order of images come first.
     """
     agreement = count_agreements(descriptors)
     agreement += agreement.T
@@ -61,9 +62,9 @@ def best_pairs(descriptors: Sequence[NDArray[np.generic]], partners: int = PARTN
 
 
 def proposed_pairs(names: Sequence[str], strongest: Callable[[str], NDArray[np.generic]]) -> list[tuple[str, str]]:
-    """The pairs of the images ``names`` that ``pairs=auto`` matches: all pairs of a few, of more the `best_pairs`.
+    """The pairs that ``pairs=auto`` matches: all pairs of up to `ALL_PAIRS_UP_TO` images, else the `best_pairs`.
 
-    ``strongest`` gives the descriptors of an image's strongest features.
+    ``strongest`` returns the descriptors of an image's strongest features.
     """
     if len(names) <= ALL_PAIRS_UP_TO:
         pairs = exhaustive_pairs(len(names))
@@ -73,15 +74,15 @@ def proposed_pairs(names: Sequence[str], strongest: Callable[[str], NDArray[np.g
 
 
 def count_agreements(descriptors: Sequence[NDArray[np.generic]]) -> NDArray[np.int64]:
-    """Count the features of images i < j that are each other's nearest and pass the ratio test; [N, N], upper triangle.
+    """Count mutual nearest neighbours that pass the ratio test between images i < j; [N, N], upper triangle.
 
-    Descriptors are whole numbers here, and their products stay below 2^24: exact in float32, so every machine and any
-    number of threads count the same.
+    Descriptors are whole numbers here, and their products stay below 2^24. They are exact in float32, so the counts are
+    the same on every machine and with any number of threads.
     """
     count = len(descriptors)
     width = max(part.shape[1] for part in descriptors)
     table = np.zeros((count, STRONGEST, width), dtype=np.float32)
-    squares = np.full((count, STRONGEST), np.inf, dtype=np.float32)  # of what is not there: never the nearest
+    squares = np.full((count, STRONGEST), np.inf, dtype=np.float32)  # infinite for empty rows: never the nearest
     for index, part in enumerate(descriptors):
         strongest = part[:STRONGEST].astype(np.float32)
         if part.dtype.kind == "f":
@@ -91,7 +92,7 @@ def count_agreements(descriptors: Sequence[NDArray[np.generic]]) -> NDArray[np.i
     agreements = np.zeros((count, count), dtype=np.int64)
     rows = np.arange(STRONGEST)
     for i in range(count - 1):
-        products = table[i] @ table[i + 1 :].reshape(-1, width).T  # one large product: small ones are slow
+        products = table[i] @ table[i + 1 :].reshape(-1, width).T  # one large product is faster than many small ones
         distances = squares[i][:, None] + squares[i + 1 :].reshape(-1) - 2 * products
         distances = distances.reshape(STRONGEST, -1, STRONGEST)  # [S, J, S]
         nearest = distances.argmin(axis=2)  # [S, J]

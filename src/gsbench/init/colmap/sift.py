@@ -1,10 +1,10 @@
-"""COLMAP's own SIFT: features, and matches verified on several cores by processes, never by threads. Run it isolated.
+"""COLMAP's SIFT: extraction, and matching on several cores by processes instead of threads. Run it isolated.
 
-Two threads of COLMAP's matcher in one process are not safe. The nearest-neighbour search (faiss) calls a BLAS that
-pycolmap's wheels carry built for one thread and without locks, so two calls at the same moment can spoil each other's
-numbers: rarely, and mostly on a busy machine, a pair loses some or most of its matches. One thread in a process of its
-own matches to the bit. The pairs are divided so that few images are needed at a time, because a call builds a search
-index for each of its images anew, which costs more than matching a pair.
+COLMAP's matcher is not safe with two threads in one process. Its nearest-neighbour search (faiss) calls a BLAS that
+pycolmap's wheels build for one thread and without locks. Two simultaneous calls can corrupt each other's numbers:
+rarely, and mostly on a busy machine, a pair loses some or most of its matches. With one thread for each process,
+matches are repeatable to the bit. Each call builds a search index for each of its images, which costs more than
+matching a pair, so the pairs are divided into parts with few images.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ from gsbench.system.isolate import run_with_progress
 if TYPE_CHECKING:
     from gsbench.init.sfm import Sfm
 
-IMAGES_PER_CALL = 8  # COLMAP reports no progress within a call, so it is called for a few images at a time, …
-IMAGES_PER_THREAD = 2  # … and for more where many threads want work
+IMAGES_PER_CALL = 8  # COLMAP reports no progress within a call, so it is called for a few images at a time
+IMAGES_PER_THREAD = 2  # least number in a call, so that all threads have work
 
 
 def extract_sift(
@@ -42,9 +42,9 @@ def extract_sift(
     progress: Progress,
     masks: Path | None = None,
 ) -> None:
-    """Detect and describe keypoints in the images ``names``, which are in the database.
+    """Detect and describe keypoints in the database's images ``names``.
 
-    ``masks`` is a folder of masks as COLMAP names them: there are no keypoints where they are black.
+    ``masks`` is a folder of masks, named as COLMAP expects. Black pixels get no keypoints.
     """
     options = pycolmap.FeatureExtractionOptions()
     options.use_gpu = False
@@ -58,21 +58,21 @@ def extract_sift(
     if masks is not None:
         reading.mask_path = masks
     progress("extract", 0, len(names))
-    size = max(IMAGES_PER_CALL, IMAGES_PER_THREAD * threads)
-    for start in range(0, len(names), size):
-        part = list(names[start : start + size])
+    batch_size = max(IMAGES_PER_CALL, IMAGES_PER_THREAD * threads)
+    for start in range(0, len(names), batch_size):
+        batch = list(names[start : start + batch_size])
         pycolmap.extract_features(
             database,
             images,
-            image_names=part,
+            image_names=batch,
             reader_options=reading,
             extraction_options=options,
             device=pycolmap.Device.cpu,
         )
-        progress("extract", start + len(part), len(names))
+        progress("extract", start + len(batch), len(names))
 
 
-MAX_BLOCK = 16  # images on each side of a part; more would report progress too seldom
+MAX_BLOCK = 16  # images on each side of a part; with more, progress would be reported too rarely
 PARTS_PER_PROCESS = 6  # enough that processes end at about the same time
 FEATURE_TABLES = ("keypoints", "descriptors")
 MATCH_TABLES = ("matches", "two_view_geometries")
@@ -82,14 +82,14 @@ IdPair = tuple[int, int]
 
 @dataclass(frozen=True)
 class MatchingJob:
-    """Job of one matching process: ``parts``, lists of pairs of image ids, whose matches go into ``result``.
+    """Inputs of one matching process: ``parts`` are lists of pairs of image ids, whose matches go into ``result``.
 
-    ``features`` is the database with keypoints and descriptors, ``empty`` the same without them and with images that
-    are named by their ids (COLMAP's pair lists are divided at spaces, which names of photographs often contain).
+    ``features`` is the database with keypoints and descriptors. ``template`` is a copy without them, whose images are
+    named by their ids, because COLMAP splits the lines of its pair lists at spaces.
     """
 
     features: Path
-    empty: Path
+    template: Path
     result: Path
     parts: list[list[IdPair]]
     sift: Sfm
@@ -104,18 +104,18 @@ def match_sift(
 ) -> None:
     """Match ``pairs`` of image names and verify them.
 
-    The result depends neither on the number of processes nor on how the pairs are divided: a pair's matches are a
-    function of its descriptors, and its RANSAC starts from the seed.
+    The result does not depend on the number of processes or on the division into parts: a pair's matches depend on its
+    descriptors alone, and its RANSAC starts from the seed.
     """
     folder = database.parent / "matching"
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir()
     ids = image_ids(database)
-    parts = divide([(ids[first], ids[second]) for first, second in pairs], _block_size(len(ids), processes))
+    parts = divide_pairs([(ids[first], ids[second]) for first, second in pairs], _block_size(len(ids), processes))
     _copy_without_features(database, folder / "empty.db")
     jobs = [
         MatchingJob(database, folder / "empty.db", folder / f"matches-{index}.db", share, sift)
-        for index, share in enumerate(deal(parts, processes))
+        for index, share in enumerate(distribute_parts(parts, processes))
     ]
     progress("match", 0, len(pairs))
     if len(jobs) == 1:
@@ -128,21 +128,21 @@ def match_sift(
 
 
 def match_parts(job: MatchingJob, progress: Progress) -> None:
-    """Match and verify the parts of ``job`` one after the other. Calls native code that can abort: run it isolated."""
+    """Match and verify the parts of ``job`` one after another. Calls native code that can abort: run it isolated."""
     pycolmap.logging.minloglevel = int(pycolmap.logging.Level.WARNING)
     options = pycolmap.FeatureMatchingOptions()
     options.use_gpu = False
-    options.num_threads = 1  # see the head of this file
+    options.num_threads = 1  # see the module's docstring
     options.guided_matching = job.sift.guided_matching
     options.sift.max_ratio = job.sift.max_ratio
     options.sift.cross_check = job.sift.cross_check
     pairing = pycolmap.ImportedPairingOptions()
     pairing.match_list_path = job.result.with_suffix(".pairs.txt")
-    shutil.copyfile(job.empty, job.result)
+    shutil.copyfile(job.template, job.result)
     done, total = 0, sum(map(len, job.parts))
     part_database = job.result.with_suffix(".part.db")
     for part in job.parts:
-        shutil.copyfile(job.empty, part_database)
+        shutil.copyfile(job.template, part_database)
         _insert(part_database, job.features, FEATURE_TABLES, sorted({image for pair in part for image in pair}))
         write_pairs(pairing.match_list_path, [(str(first), str(second)) for first, second in part])
         pycolmap.match_image_pairs(
@@ -158,13 +158,13 @@ def match_parts(job: MatchingJob, progress: Progress) -> None:
         progress("match", done, total)
 
 
-def divide(pairs: Sequence[IdPair], block: int) -> list[list[IdPair]]:
-    """Parts of ``pairs`` that hold few images each: ``block`` neighbours against ``block`` neighbours.
+def divide_pairs(pairs: Sequence[IdPair], block: int) -> list[list[IdPair]]:
+    """Divide ``pairs`` into parts with few images: pairs between ``block`` neighbours and ``block`` neighbours.
 
-    Parts that come out thin, as those of few pairs do, are put together up to the size of a full one.
+    Small parts are merged up to the size of a full part.
 
     Examples:
-        >>> divide([(1, 2), (1, 3), (1, 4), (2, 3), (2, 4), (3, 4)], 2)
+        >>> divide_pairs([(1, 2), (1, 3), (1, 4), (2, 3), (2, 4), (3, 4)], 2)
         [[(1, 2)], [(1, 3), (1, 4), (2, 3), (2, 4)], [(3, 4)]]
     """
     blocks: dict[tuple[int, int], list[IdPair]] = {}
@@ -179,8 +179,8 @@ def divide(pairs: Sequence[IdPair], block: int) -> list[list[IdPair]]:
     return parts
 
 
-def deal(parts: Sequence[list[IdPair]], processes: int) -> list[list[list[IdPair]]]:
-    """Shares of about as many pairs for each process; fewer shares where there are fewer parts."""
+def distribute_parts(parts: Sequence[list[IdPair]], processes: int) -> list[list[list[IdPair]]]:
+    """Distribute parts over processes, with about equal numbers of pairs; a process gets at least one part."""
     shares: list[list[list[IdPair]]] = [[] for _ in range(max(1, min(processes, len(parts))))]
     for part in sorted(parts, key=len, reverse=True):
         min(shares, key=lambda share: sum(map(len, share))).append(part)
@@ -188,7 +188,7 @@ def deal(parts: Sequence[list[IdPair]], processes: int) -> list[list[list[IdPair
 
 
 def _block_size(images: int, processes: int) -> int:
-    """Images on a side of a part, so that all pairs of ``images`` fall into `PARTS_PER_PROCESS` for each process."""
+    """Images on each side of a part such that all pairs of ``images`` make `PARTS_PER_PROCESS` parts per process."""
     blocks = math.ceil(math.sqrt(2 * PARTS_PER_PROCESS * processes))  # k blocks of images make k (k + 1) / 2 parts
     return min(max(math.ceil(images / blocks), 2), MAX_BLOCK)
 
@@ -197,11 +197,11 @@ def _match_in_processes(jobs: Sequence[MatchingJob], count: int, progress: Progr
     matched = [0] * len(jobs)
 
     def run(index: int) -> None:
-        def all_together(phase: str, done: int, total: int | None, note: str = "") -> None:
+        def report_sum(phase: str, done: int, total: int | None, note: str = "") -> None:
             matched[index] = done
             progress(phase, sum(matched), count)
 
-        run_with_progress(match_parts, jobs[index], all_together, what="matching")
+        run_with_progress(match_parts, jobs[index], report_sum, what="matching")
 
     with ThreadPoolExecutor(len(jobs)) as pool:
         list(pool.map(run, range(len(jobs))))
@@ -218,10 +218,10 @@ def _copy_without_features(database: Path, target: Path) -> None:
 
 
 def _insert(target: Path, source: Path, tables: Sequence[str], images: Sequence[int] | None = None) -> None:
-    """Add the rows of ``tables`` of one database to another's; ``images``: only those of these images."""
-    chosen = "" if images is None else f" WHERE image_id IN ({', '.join(map(str, images))})"
+    """Copy the rows of ``tables`` from one database to another, of all images or only of the ids ``images``."""
+    condition = "" if images is None else f" WHERE image_id IN ({', '.join(map(str, images))})"
     with closing(sqlite3.connect(target)) as connection:
         connection.execute("ATTACH DATABASE ? AS source", (str(source),))
         with connection:
             for table in tables:
-                connection.execute(f"INSERT INTO main.{table} SELECT * FROM source.{table}{chosen}")
+                connection.execute(f"INSERT INTO main.{table} SELECT * FROM source.{table}{condition}")

@@ -1,1 +1,1 @@
-"""Features and matches by networks."""
+"""Extraction and matching of local features by networks."""

@@ -1,4 +1,4 @@
-"""The networks' part of deep image matching: features of every image and matches of every pair, into the store."""
+"""The networks' part of deep image matching, which stores the features of all images and the matches of all pairs."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ from gsbench.words import some_of
 if TYPE_CHECKING:
     from gsbench.init.colmap.initializer import ColmapInitializer
 
-CACHE_BYTES = 1 << 30  # of descriptors held in memory while pairs are matched
-# deep-image-matching's `matching_lowres`, its default way to choose pairs (pairs_generator.py, state of December 2024)
+CACHE_BYTES = 1 << 30  # of descriptors kept in memory while pairs are matched
+# deep-image-matching's `matching_lowres`, its default choice of pairs (pairs_generator.py, state of December 2024)
 LOWRES_SIZE = 1000  # px
 LOWRES_KEYPOINTS = 2048
-LOWRES_FILTER = 0.3  # least score of a match
-LOWRES_MATCHES = 20  # a pair with more is matched at full size
+LOWRES_FILTER = 0.3  # lowest score of a match
+LOWRES_MATCHES = 20  # pairs with more matches are matched at full size
 
 
 @dataclass(frozen=True)
 class NetworkJob:
-    """Inputs of the isolated process; the weights are checked files, None where none are needed."""
+    """Inputs of the isolated process. The weights are checked files, or None if a network needs none."""
 
     options: ColmapInitializer
     settings: FeatureSettings
@@ -55,9 +55,9 @@ def open_store(job: NetworkJob) -> FeatureStore:
 
 
 def extract_and_match(job: NetworkJob, progress: Progress) -> Preparation:
-    """Fill the store with what is not there yet, and tell what it took.
+    """Compute the features and matches that the store does not have yet, and report on the work.
 
-    Raises ``InputError`` where no image has a keypoint or no pair a match.
+    Raises ``InputError`` if no image has a keypoint, or no pair has a match.
     """
     options, capture = job.options, job.capture
     torch.set_num_threads(options.num_threads)
@@ -71,7 +71,7 @@ def extract_and_match(job: NetworkJob, progress: Progress) -> Preparation:
         empty = _extract_all(job, store, names, device, progress)
     if len(empty) == len(names):
         raise InputError(f"{options.name}: no keypoint in any image: lower init.keypoint_threshold or check the photos")
-    if options.pairs == "lowres":  # type: ignore[comparison-overlap]  # `Dim` has one way more than SIFT
+    if options.pairs == "lowres":  # type: ignore[comparison-overlap]  # a choice of `FeatureInitializer` alone
         with timer.phase("preselect"):
             small = at_low_resolution(job)
             _extract_all(small, open_store(small), names, device, progress)
@@ -79,7 +79,7 @@ def extract_and_match(job: NetworkJob, progress: Progress) -> Preparation:
     candidates, pairs = len(pairs), choose_pairs(job, names, pairs)
     with timer.phase("match"):
         without = _match_all(job, store, pairs, device, progress)
-    if len(without) == len(pairs):  # where no pair was selected, too
+    if len(without) == len(pairs):  # also true if no pair was selected
         raise InputError(f"{options.name}: no pair of images has a match: the photos need more overlap or texture")
     warnings = []
     if empty:
@@ -103,7 +103,7 @@ def extract_and_match(job: NetworkJob, progress: Progress) -> Preparation:
 
 
 def choose_pairs(job: NetworkJob, names: Sequence[str], pairs: list[tuple[str, str]]) -> list[tuple[str, str]]:
-    """Choose the ``pairs`` to be matched, once the features of the images ``names`` are in the store."""
+    """The pairs to match, chosen by the stored features of the images ``names``."""
     if job.options.pairs == "auto":
         store = open_store(job)
         return proposed_pairs(names, lambda name: store.require_features(name).strongest(STRONGEST).descriptors)
@@ -114,7 +114,7 @@ def choose_pairs(job: NetworkJob, names: Sequence[str], pairs: list[tuple[str, s
 
 
 def at_low_resolution(job: NetworkJob) -> NetworkJob:
-    """The same job on small images, for a look at which pairs overlap."""
+    """The same job on small images, to find the pairs that overlap."""
     settings = replace(
         job.settings,
         max_image_size=min(job.settings.max_image_size, LOWRES_SIZE),
@@ -125,7 +125,7 @@ def at_low_resolution(job: NetworkJob) -> NetworkJob:
 
 
 def choose_device(name: str) -> torch.device:
-    """The torch device of that name, ``auto`` being the GPU if there is one; ``InputError`` if there is none such."""
+    """The torch device ``name``; ``auto`` is the GPU if there is one. Raises ``InputError`` for a missing device."""
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     try:
@@ -139,7 +139,7 @@ def choose_device(name: str) -> torch.device:
 def _extract_all(
     job: NetworkJob, store: FeatureStore, names: Sequence[str], device: torch.device, progress: Progress
 ) -> list[str]:
-    """Features of all images into the store; returns the names of those without any."""
+    """Store the features of all images; returns the names of images without features."""
     settings, empty = job.settings, []
     extractor = None
     progress("extract", 0, len(names))
@@ -161,7 +161,7 @@ def _extract_all(
 def _match_all(
     job: NetworkJob, store: FeatureStore, pairs: Sequence[tuple[str, str]], device: torch.device, progress: Progress
 ) -> list[tuple[str, str]]:
-    """Matches of all pairs into the store; returns the pairs without a match."""
+    """Store the matches of all pairs; returns the pairs without a match."""
     settings = job.settings
     matcher, without = None, []
     read = _cached_reader(store, pairs)
@@ -179,7 +179,7 @@ def _match_all(
 
 
 def _cached_reader(store: FeatureStore, pairs: Sequence[tuple[str, str]]) -> Callable[[str], Features]:
-    """`FeatureStore.require_features` that keeps as many images as `CACHE_BYTES` hold."""
+    """`FeatureStore.require_features` with a cache of about `CACHE_BYTES` of descriptors."""
     if not pairs:
         return store.require_features
     example = store.require_features(pairs[0][0])

@@ -1,4 +1,4 @@
-"""The networks: extractors of local features and matchers, chosen by name and built with their weights."""
+"""Extractors of local features and matchers, built by name with their weights."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -17,9 +17,9 @@ from gsbench.scene.options import downscaled_size
 from gsbench.system.install import install_command
 from gsbench.weights import MissingWeights, load_state
 
-GPU_MEMORY_MEND = "lower init.max_image_size or init.max_keypoints, or set init.device=cpu"
-SUPERPOINT_BORDER = 4  # px without keypoints, as in deep-image-matching; its network has no margin of its own
-LIGHTGLUE_DETECTOR_PREFIX = "keypoint_detector."  # of SuperPoint within a LightGlue checkpoint of transformers
+GPU_MEMORY_HINT = "lower init.max_image_size or init.max_keypoints, or set init.device=cpu"
+SUPERPOINT_BORDER = 4  # px without keypoints, as in deep-image-matching
+LIGHTGLUE_DETECTOR_PREFIX = "keypoint_detector."  # of SuperPoint's tensors in a LightGlue checkpoint of transformers
 
 
 class Extractor(Protocol):
@@ -32,9 +32,9 @@ class Extractor(Protocol):
 
 
 def build_extractor(settings: FeatureSettings, weights: Path | None, device: torch.device) -> Extractor:
-    """The extractor with its network on ``device``; ``weights`` is the checked file, None for one without weights.
+    """The extractor with its network on ``device``; ``weights`` is the checked file, or None if it needs none.
 
-    Raises ``MissingWeights`` where the file does not fit the network.
+    Raises ``MissingWeights`` if the file does not fit the network.
     """
     return _BUILDERS[settings.extractor](settings, weights, device)
 
@@ -44,7 +44,7 @@ def extract_features(
 ) -> Features:
     """The ``max_keypoints`` strongest features of an image file, shrunk to ``max_image_size`` px for the network.
 
-    Raises ``InputError`` where the image cannot be read or the device runs out of memory.
+    Raises ``InputError`` if the image cannot be read or the device runs out of memory.
     """
     pixels = read_image(path)  # [H, W, 3]
     height, width = pixels.shape[:2]
@@ -57,7 +57,7 @@ def extract_features(
             keypoints, descriptors, scores = (part.float().cpu() for part in extractor(image.to(device)))
     except torch.OutOfMemoryError as error:
         size = f"{network_size[0]}x{network_size[1]}"
-        raise InputError(f"{path.name}: {device} ran out of memory at {size} px: {GPU_MEMORY_MEND}") from error
+        raise InputError(f"{path.name}: {device} ran out of memory at {size} px: {GPU_MEMORY_HINT}") from error
     order = torch.sort(scores, descending=True, stable=True).indices[:max_keypoints]
     return Features(
         keypoints[order].numpy(), descriptors[order].numpy(), scores[order].numpy(), network_size, (width, height)
@@ -65,7 +65,7 @@ def extract_features(
 
 
 def load_into(network: torch.nn.Module, state: Mapping[str, torch.Tensor], path: Path) -> None:
-    """Load ``state`` into ``network``: every parameter must be there in its shape, buffers may be absent."""
+    """Load ``state`` into ``network``. It must hold every parameter in its shape; buffers may be absent."""
     try:
         missing, unexpected = network.load_state_dict(dict(state), strict=False)
     except RuntimeError as error:
@@ -109,10 +109,10 @@ def _superpoint(settings: FeatureSettings, weights: Path | None, device: torch.d
         height, width = image.shape[-2:]
         output = network(_gray(image))  # reads the first channel only
         size = torch.tensor([width, height], device=image.device)
-        # The output is relative; its own post-processing cuts to whole px after the division, one too few at 5 % of
-        # the columns of some widths. Keypoints are whole px, so rounding restores them.
+        # The output is relative to the size, and keypoints are whole px, so rounding restores them. The processor of
+        # transformers truncates instead, and is one px too low in 5 % of the columns of some widths.
         keypoints = (output.keypoints[0] * size).round()  # [K, 2]
-        # border removal is done here: the network's own looks at the right and bottom border in the wrong unit
+        # The network's own border removal is off, because it tests the right and bottom borders in the wrong unit.
         inside = ((keypoints >= SUPERPOINT_BORDER) & (keypoints < size - SUPERPOINT_BORDER)).all(dim=1)
         keep = inside & output.mask[0].bool()
         return keypoints[keep], output.descriptors[0][keep], output.scores[0][keep]
@@ -168,14 +168,14 @@ def _sift_kornia(settings: FeatureSettings, weights: Path | None, device: torch.
 
     def extract(image: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         frames, responses, descriptors = network(_gray(image)[:, :1])
-        filled = laf_is_filled(frames)[0]  # [K]: an image with few extrema leaves slots empty
+        filled = laf_is_filled(frames)[0]  # [K]: slots stay empty in an image with few extrema
         return frames[0, filled, :, 2], descriptors[0, filled], responses[0, filled]
 
     return extract
 
 
 def _gray(image: torch.Tensor) -> torch.Tensor:
-    """Luma by ITU-R BT.601, in three equal channels [1, 3, H, W]."""
+    """The luma of ITU-R BT.601 in three equal channels [1, 3, H, W]."""
     weights = image.new_tensor([0.299, 0.587, 0.114])[None, :, None, None]
     return (image * weights).sum(dim=1, keepdim=True).expand(-1, 3, -1, -1)
 
@@ -197,17 +197,17 @@ class Matcher(Protocol):
 def build_matcher(settings: FeatureSettings, weights: Path | None, device: torch.device) -> Matcher:
     """The matcher named in ``settings``; ``weights`` is LightGlue's checked file.
 
-    Raises ``MissingWeights`` where the file does not fit the network.
+    Raises ``MissingWeights`` if the file does not fit the network.
     """
     if settings.matcher == "mutual_nearest":
-        return MutualNearest(settings.max_ratio, device)
+        return MutualNearestMatcher(settings.max_ratio, device)
     assert weights is not None
     return LightGlueMatcher(settings.extractor, settings.filter_threshold, weights, device)
 
 
 @dataclass(frozen=True)
-class MutualNearest:
-    """Descriptors that are each other's nearest and pass the ratio test both ways."""
+class MutualNearestMatcher:
+    """Matches descriptors that are each other's nearest neighbour and pass the ratio test in both directions."""
 
     max_ratio: float
     device: torch.device
@@ -223,19 +223,23 @@ class MutualNearest:
 
 
 class LightGlueMatcher:
-    """kornia's LightGlue with weights for the features of one extractor."""
+    """kornia's LightGlue, with weights for the features of one extractor."""
 
     def __init__(self, extractor: str, filter_threshold: float, weights: Path, device: torch.device) -> None:
         from kornia.feature import LightGlue
 
-        unnamed: Any = None  # a named one would download its weights
+        # Without a name of features, kornia does not download weights.
+        no_name: Any = None
         layout = {key: value for key, value in LightGlue.features[extractor].items() if key != "weights"}
-        self.network = LightGlue(unnamed, filter_threshold=filter_threshold, **layout)
+        self.network = LightGlue(no_name, filter_threshold=filter_threshold, **layout)
         state = load_state(weights)
-        for layer in range(self.network.conf.n_layers):  # the published files name the layers by their kind first
+        # The published files name a layer "self_attn.0", kornia's network "transformers.0.self_attn".
+        for layer in range(self.network.conf.n_layers):
             for kind in ("self_attn", "cross_attn"):
                 old, new = f"{kind}.{layer}.", f"transformers.{layer}.{kind}."
-                state = {name.replace(old, new) if name.startswith(old) else name: v for name, v in state.items()}
+                state = {
+                    name.replace(old, new) if name.startswith(old) else name: tensor for name, tensor in state.items()
+                }
         load_into(self.network, state, weights)
         self.network.to(device).eval()
         self.device = device
@@ -254,11 +258,11 @@ class LightGlueMatcher:
 
 
 def match(matcher: Matcher, first: Features, second: Features) -> NDArray[np.uint32]:
-    """Matches [M, 2]; raises ``InputError`` where the device runs out of memory."""
+    """The matches [M, 2] of two images; raises ``InputError`` if the device runs out of memory."""
     if len(first.keypoints) == 0 or len(second.keypoints) == 0:
         return np.empty((0, 2), dtype=np.uint32)
     try:
         return matcher(first, second)
     except torch.OutOfMemoryError as error:
         count = max(len(first.keypoints), len(second.keypoints))
-        raise InputError(f"matching of {count} keypoints ran out of memory: {GPU_MEMORY_MEND}") from error
+        raise InputError(f"matching of {count} keypoints ran out of memory: {GPU_MEMORY_HINT}") from error

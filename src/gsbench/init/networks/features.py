@@ -1,7 +1,7 @@
-"""Local features of one image, with the image sizes that give them a meaning, and the settings they depend on.
+"""Local features of an image, the settings that they depend on, and a store of features and matches on disk.
 
-They are kept on disk, one file for each image and each pair, so that a killed run goes on where it was. A file's name
-is the hash of all that its content depends on: the image's bytes, the settings, the weights.
+The store has one file for each image and each pair, so that an interrupted run continues from there. A file's name is
+a hash of everything that its content depends on: the image's bytes, the mask, the settings and the weights.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from gsbench.files import atomic, file_sha256
 class Features:
     """Features of one image, strongest first.
 
-    ``keypoints`` [K, 2] float32 are px of the image as the network saw it, the centre of its first pixel being (0, 0);
-    `colmap_keypoints` are the same in px of the file. ``descriptors`` are [K, D] float32, ``scores`` [K] float32.
+    ``keypoints`` [K, 2] float32 are in px of the image at the network's size, with the centre of the first pixel at
+    (0, 0). `colmap_keypoints` are in px of the file. ``descriptors`` are [K, D] float32, ``scores`` [K] float32.
     """
 
     keypoints: NDArray[np.float32]
@@ -38,12 +38,12 @@ class Features:
 
     @property
     def colmap_keypoints(self) -> NDArray[np.float32]:
-        """Keypoints [K, 2] in px of the file, the centre of its first pixel being (0.5, 0.5), as COLMAP has it."""
+        """Keypoints [K, 2] in px of the file, with the centre of the first pixel at (0.5, 0.5), as in COLMAP."""
         scale = np.array(self.file_size, dtype=np.float64) / self.network_size
         return ((self.keypoints.astype(np.float64) + 0.5) * scale).astype(np.float32)
 
     def within(self, mask: NDArray[np.bool_]) -> Features:
-        """The features on pixels that count in ``mask`` [H, W], which is of the file's size."""
+        """The features on pixels that count in ``mask`` [H, W], which has the file's size."""
         height, width = mask.shape
         columns, rows = np.floor(self.colmap_keypoints).astype(np.int64).T  # [K] each
         kept = mask[rows.clip(0, height - 1), columns.clip(0, width - 1)]
@@ -63,7 +63,7 @@ class Features:
 
 @dataclass(frozen=True, kw_only=True)
 class FeatureSettings:
-    """Extractor and matcher by name with their settings; a field that one of them does not read has no effect on it."""
+    """Names and settings of an extractor and a matcher, each of which ignores the fields that it does not read."""
 
     extractor: str
     matcher: str
@@ -72,11 +72,11 @@ class FeatureSettings:
     keypoint_threshold: float = 0.0
     nms_radius: int = 0  # px
     aliked_model: str = "n16"
-    filter_threshold: float = 0.0  # of LightGlue
-    max_ratio: float = 1.0  # of mutual nearest neighbours
+    filter_threshold: float = 0.0  # LightGlue only
+    max_ratio: float = 1.0  # mutual nearest neighbours only
 
     def extraction(self) -> dict[str, object]:
-        """The part that features depend on."""
+        """The settings that features depend on."""
         values: dict[str, object] = {
             "extractor": self.extractor,
             "max_image_size": self.max_image_size,
@@ -89,21 +89,21 @@ class FeatureSettings:
         return values
 
     def matching(self) -> dict[str, object]:
-        """The part that matches depend on beside the features."""
+        """The settings that matches depend on, in addition to the features."""
         if self.matcher == "lightglue":
             return {"matcher": self.matcher, "filter_threshold": self.filter_threshold}
         return {"matcher": self.matcher, "max_ratio": self.max_ratio}
 
 
 KEY_DIGITS = 24
-FORMAT_VERSION = 1  # to be raised when the same settings give other features
+FORMAT_VERSION = 1  # to be raised when the same settings give different features
 
 
 class FeatureStore:
     """Store of features and matches below ``folder``: ``features/<key>.npz`` and ``matches/<key>.npy``.
 
-    ``extraction`` and ``matching`` are the settings (plain values) that features and matches depend on, ``masks`` those
-    of images by name.
+    ``extraction`` and ``matching`` are the settings (plain values) that features and matches depend on. ``masks`` are
+    mask files by image name.
     """
 
     def __init__(
@@ -121,22 +121,22 @@ class FeatureStore:
         self._image_key = cache(self._hash_image)
 
     def features_path(self, name: str) -> Path:
-        """The file of the features of the image ``name``."""
+        """The features file of the image ``name``."""
         return self.folder / "features" / f"{self._image_key(name)}.npz"
 
     def matches_path(self, first: str, second: str) -> Path:
-        """The file of the matches of a pair of images."""
+        """The matches file of a pair of images."""
         key = _key([FORMAT_VERSION, self._image_key(first), self._image_key(second), self._matching])
         return self.folder / "matches" / f"{key}.npy"
 
     def read_features(self, name: str) -> Features | None:
-        """The stored features; None where there are none, or a damaged file."""
+        """The stored features, or None if the file is missing or damaged."""
         try:
             with np.load(self.features_path(name), allow_pickle=False) as data:
                 width, height, file_width, file_height = (int(side) for side in data["sizes"])
                 arrays = data["keypoints"], data["descriptors"], data["scores"]
                 return Features(*arrays, (width, height), (file_width, file_height))
-        except Exception:  # noqa: BLE001  numpy raises anything on a damaged file, which is then made anew
+        except Exception:  # noqa: BLE001  numpy may raise any exception on a damaged file; the file is then made again
             return None
 
     def write_features(self, name: str, features: Features) -> None:
@@ -151,10 +151,10 @@ class FeatureStore:
             )
 
     def read_matches(self, first: str, second: str) -> NDArray[np.uint32] | None:
-        """The stored matches [M, 2] of a pair; None where there are none, or a damaged file."""
+        """The stored matches [M, 2] of a pair, or None if the file is missing or damaged."""
         try:
             matches = np.load(self.matches_path(first, second), allow_pickle=False)
-        except Exception:  # noqa: BLE001  as above
+        except Exception:  # noqa: BLE001  as in `read_features`
             return None
         return matches if matches.ndim == 2 and matches.shape[1] == 2 else None
 
@@ -164,14 +164,14 @@ class FeatureStore:
             np.save(file, matches)
 
     def require_features(self, name: str) -> Features:
-        """The stored features, which must be there."""
+        """The stored features; raises ``GsbenchError`` if they are missing."""
         features = self.read_features(name)
         if features is None:
             raise GsbenchError(f"the stored features of {name} are gone from {self.folder}: run again")
         return features
 
     def require_matches(self, first: str, second: str) -> NDArray[np.uint32]:
-        """The stored matches [M, 2], which must be there."""
+        """The stored matches [M, 2] of a pair; raises ``GsbenchError`` if they are missing."""
         matches = self.read_matches(first, second)
         if matches is None:
             raise GsbenchError(f"the stored matches of {first} and {second} are gone from {self.folder}: run again")
