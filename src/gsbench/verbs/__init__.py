@@ -1,6 +1,6 @@
 """The verbs of the command line: modules with ``main(argv, runs) -> exit code``, where ``runs`` is the runs folder."""
 
-VERBS = {  # what each is for
+VERBS = {  # their purposes, as `gsbench --help` lists them
     "fetch": "download public scenes: Mip-NeRF 360, Tanks and Temples, Deep Blending",
     "evaluate": "measure renders of any program; --as enters them beside an experiment's arms",
     "tables": "Markdown, CSV, LaTeX or HTML tables of an experiment",

@@ -1,4 +1,4 @@
-"""``gsbench ablate``: which part of a densifier carries its gain."""
+"""``gsbench ablate``: which part of a densifier makes its gain."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -27,33 +27,32 @@ DEFAULT_METRIC = "psnr"
 
 
 def main(argv: Sequence[str], runs: Path) -> int:
-    """The verb: the exit code says, as that of a sweep, whether some trial failed; raises InputError for bad input."""
+    """Run the verb: the exit code says, as a sweep's does, whether a trial failed; raises InputError for bad input."""
     options = _parser().parse_args(argv)
     settings = options.settings
     words = [*settings, *([] if _names_experiment(settings) else [f"name={_default_name(settings)}"])]
     first = _trials(words)
     densify = _only_densifier(first)
-    found = declared_switches(_class_switches(first[0]), first[0].values["densify"])
-    switches = choose_switches(found, options.switches, densify)
-    trials = {run: _trials([*words, *_off(words_of(run, switches), first[0])]) for run in runs_to_train(switches)}
-    every = list(trials.values())
-    _check_different(trials)
-    flat = [trial for group in every for trial in group]
+    declared = declared_switches(_class_switches(first[0]), first[0].values["densify"])
+    switches = choose_switches(declared, options.switches, densify)
+    by_run = {run: _trials([*words, *_words(words_of(run, switches), first[0])]) for run in runs_to_train(switches)}
+    _check_different(by_run)
+    trials = [trial for group in by_run.values() for trial in group]
     print(
-        f"{densify}: {counted(len(switches), 'part')} ({', '.join(switches)}), {len(trials)} runs, "
-        f"{counted(len(flat), 'trial')}"
+        f"{densify}: {counted(len(switches), 'part')} ({', '.join(switches)}), {len(by_run)} runs, "
+        f"{counted(len(trials), 'trial')}"
     )
-    for run, group in trials.items():
+    for run, group in by_run.items():
         hashes = ", ".join(dict.fromkeys(trial.folder.name.partition(SEED)[0] for trial in group))
         print(f"  {hashes}: {without(run, list(switches))}")
     if options.dry_run:
-        print("\n".join(describe_plan(flat, flat[0].values["launch"]["parallel"])))
+        print("\n".join(describe_plan(trials, trials[0].values["launch"]["parallel"])))
         return 0
-    home = flat[0].files.home
-    code = run_trials(flat)
+    home = trials[0].files.home
+    code = run_trials(trials)
     if code == 0:
-        keys = {run: {t.values["scene"]["name"]: t.files.key for t in group} for run, group in trials.items()}
-        metric = options.metric or flat[0].values["eval"].get("primary") or DEFAULT_METRIC
+        keys = {run: {t.values["scene"]["name"]: t.files.key for t in group} for run, group in by_run.items()}
+        metric = options.metric or trials[0].values["eval"].get("primary") or DEFAULT_METRIC
         print("\n".join(table(judge_runs(read_experiment(home).trials, keys, metric))))
         print(f"all metrics and pictures: gsbench report {home.name}")
     return code
@@ -98,10 +97,10 @@ def _class_switches(trial: Trial) -> dict[str, Switch]:
     return dict(getattr(type(Parts(trial.values).trainer), "SWITCHES", {}))
 
 
-def _off(settings: dict[str, Any], first: Trial) -> list[str]:
-    """Words that give the densifier these settings."""
-    known = first.values["densify"]
-    return [f"{'' if key in known else '+'}densify.{key}={_text(value)}" for key, value in settings.items()]
+def _words(settings: dict[str, Any], first: Trial) -> list[str]:
+    """The words that give the densifier these settings; a key that it lacks needs Hydra's plus."""
+    densify = first.values["densify"]
+    return [f"{'' if key in densify else '+'}densify.{key}={_text(value)}" for key, value in settings.items()]
 
 
 def _text(value: Any) -> str:
@@ -117,10 +116,10 @@ def _default_name(words: Sequence[str]) -> str:
     return f"ablate_{chosen[-1].replace('/', '_')}" if chosen else "ablate"
 
 
-def _check_different(trials: dict[frozenset[str], list[Trial]]) -> None:
-    """Raise InputError where two runs are the same trial: a switch whose setting changes nothing."""
+def _check_different(by_run: dict[frozenset[str], list[Trial]]) -> None:
+    """Raise InputError for two runs that are the same trial, because a switch changes nothing."""
     seen: dict[Path, frozenset[str]] = {}
-    for run, group in trials.items():
-        other = seen.setdefault(group[0].folder, run)
-        if other != run:
-            raise InputError(f"switching {', '.join(sorted(other ^ run))} changes no setting: give another VALUE")
+    for run, group in by_run.items():
+        earlier = seen.setdefault(group[0].folder, run)
+        if earlier != run:
+            raise InputError(f"switching {', '.join(sorted(earlier ^ run))} changes no setting: give another VALUE")

@@ -17,20 +17,22 @@ class ArgumentParser(argparse.ArgumentParser):
 
     def parse_args(self, args: Any = None, namespace: Any = None) -> Any:
         words = list(args or [])
-        typed = [word for word in words if word.lstrip("+").startswith("allow_targets=")]
-        found, unknown = self.parse_known_args([word for word in words if word not in typed], namespace)
+        settings = [word for word in words if word.lstrip("+").startswith("allow_targets=")]
+        parsed, unknown = self.parse_known_args([word for word in words if word not in settings], namespace)
+        # Settings may stand anywhere on the line. argparse takes positional words in one row only, leaves later ones
+        # unknown, and would take some for an option's value.
         takers = [action.dest for action in self._actions if not action.option_strings and "=" in str(action.metavar)]
-        if takers:  # settings count wherever they stand: argparse takes them in one row alone, or for an option's value
-            typed += [word for word in unknown if SETTING.match(word)]
-            setattr(found, takers[0], [*getattr(found, takers[0]), *typed])
+        if takers:
+            settings += [word for word in unknown if SETTING.match(word)]
+            setattr(parsed, takers[0], [*getattr(parsed, takers[0]), *settings])
             unknown = [word for word in unknown if not SETTING.match(word)]
         else:
-            unknown += typed
+            unknown += settings
         if unknown:
             options = [option for action in self._actions for option in action.option_strings]
-            nears = (closest(word.partition("=")[0], options) for word in unknown if word.startswith("--"))
-            self.error(f"unrecognized arguments: {' '.join(unknown)}{next(filter(None, nears), '')}")
-        return found
+            hints = (closest(word.partition("=")[0], options) for word in unknown if word.startswith("--"))
+            self.error(f"unrecognized arguments: {' '.join(unknown)}{next(filter(None, hints), '')}")
+        return parsed
 
     def error(self, message: str) -> NoReturn:
         verb = self.prog.removeprefix("gsbench").strip()
@@ -38,21 +40,21 @@ class ArgumentParser(argparse.ArgumentParser):
 
 
 def port(text: str) -> int:
-    """A TCP port, 0 for any free one; an argument's ``type``."""
+    """A TCP port, or 0 for any free one; an argument's ``type``."""
     if not text.isascii() or not text.isdigit() or int(text) > MAX_PORT:
         raise argparse.ArgumentTypeError(f"must be a number from 0 to {MAX_PORT}, got {text!r}")
     return int(text)
 
 
 def path(text: str) -> Path:
-    """A path that is not empty, with ``~`` in place; an argument's ``type``."""
+    """A path, with ``~`` expanded; an argument's ``type``."""
     if not is_path(text):
         raise argparse.ArgumentTypeError(f"{text!r} is not a path")
     return Path(text).expanduser()
 
 
 def add_question(parser: argparse.ArgumentParser) -> None:
-    """Add the words that say what is trained, and what decides."""
+    """Add the arguments that say what is trained, and which metric decides."""
     parser.add_argument("settings", nargs="*", metavar="KEY=VALUE", help="of the trials, as of a sweep; no seeds")
     parser.add_argument("--metric", default="psnr", help="decides: psnr (the default), lpips_squeeze, gaussians, …")
     parser.add_argument("--least", help="the least difference that matters, as 0.1 or 10%%; default: the metric's")
@@ -78,7 +80,7 @@ def _condition(text: str) -> tuple[str, str]:
 
 
 def names(text: str) -> tuple[str, ...]:
-    """Different names with commas between them; an argument's ``type``."""
+    """Different names, separated by commas; an argument's ``type``."""
     words = tuple(word.strip() for word in text.split(","))
     if not all(words) or len(set(words)) < len(words):
         raise argparse.ArgumentTypeError(f"must be different names, comma between, got {text!r}")

@@ -32,38 +32,38 @@ MAX_SIDE = 16_384  # px
 MAX_COUNT = 1_000_000_000
 
 
-def parser() -> ArgumentParser:
+def _parser() -> ArgumentParser:
     names = ", ".join(executor.name for executor in EXECUTORS)
-    made = ArgumentParser(
+    parser = ArgumentParser(
         prog="gsbench bench",
         description="Time rasterizers and the training step side by side: medians of steps that take turns.",
     )
-    made.add_argument(
+    parser.add_argument(
         "--raster",
         default="cpu",
         help=f"names, comma between: {names}, or your own, mine.MyRasterizer",
     )
-    made.add_argument("--size", default="500x375", help="image sizes, comma between")
-    made.add_argument("--count", default="100000", help="numbers of Gaussians, comma between")
-    made.add_argument(
+    parser.add_argument("--size", default="500x375", help="image sizes, comma between")
+    parser.add_argument("--count", default="100000", help="numbers of Gaussians, comma between")
+    parser.add_argument(
         "--scene",
         default="trained",
         choices=("trained", "random", "skewed"),
         help="like a trained model (default), like one at the start, or like one with its detail at few places",
     )
-    made.add_argument("--ply", type=path, help="time this model instead of a synthetic scene")
-    made.add_argument("--repeats", type=_count, default=5, help="turns that count (default 5)")
-    made.add_argument("--threads", type=_count, help="CPU threads (default: as many as torch takes)")
-    made.add_argument("--json", action="store_true", help="print JSON")
-    made.add_argument(
+    parser.add_argument("--ply", type=path, help="time this model instead of a synthetic scene")
+    parser.add_argument("--repeats", type=_count, default=5, help="turns that count (default 5)")
+    parser.add_argument("--threads", type=_count, help="CPU threads (default: as many as torch takes)")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+    parser.add_argument(
         "--no-memory", action="store_true", help="do not measure peak memory, which needs one process each"
     )
-    return made
+    return parser
 
 
 def main(argv: Sequence[str], _runs: Path | None = None) -> int:
     """Print the table, or with ``--json`` the list of results."""
-    options = parser().parse_args(argv)
+    options = _parser().parse_args(argv)
     try:
         sizes = [_size(text) for text in options.size.split(",")]
         counts = [_count(text) for text in options.count.split(",")]
@@ -74,7 +74,7 @@ def main(argv: Sequence[str], _runs: Path | None = None) -> int:
     rasters = options.raster.split(",")
     if AUTO in rasters:
         raise InputError(f"--raster {AUTO} is a choice among executors: name those to time")
-    allow_modules([raster for raster in rasters if "." in raster])  # named here by the one who types
+    allow_modules([raster for raster in rasters if "." in raster])  # the user typed them, which allows them
 
     from gsbench.bench import run_bench
 
@@ -93,7 +93,7 @@ def main(argv: Sequence[str], _runs: Path | None = None) -> int:
 
 
 def table(rows: list[dict[str, Any]]) -> str:
-    """The results as columns of text; columns that no result has are left out."""
+    """The results as aligned columns of text. Columns that no result has are left out."""
     used = [key for key in COLUMNS if any(row.get(key) is not None for row in rows)]
     cells = [used] + [[_cell(key, row.get(key)) for key in used] for row in rows]
     widths = [max(len(line[k]) for line in cells) for k in range(len(used))]

@@ -24,13 +24,13 @@ from gsbench.verbs.arguments import ArgumentParser, add_question
 from gsbench.words import counted, printable
 
 FOUND, NOT_FOUND = 0, 3
-SHOWN = 10  # characters of a commit's hash
-OWN_SOURCE = Path("src/gsbench/__init__.py")  # in a checkout of gsbench itself
+HASH_LENGTH = 10  # characters of a commit's hash that are shown
+OWN_SOURCE = Path("src/gsbench/__init__.py")  # present in a checkout of gsbench itself
 LOG = "bisect.log"
 
 
 def main(argv: Sequence[str], runs: Path) -> int:
-    """Run the verb: 0 where the commit is found, 3 where it is not; raises where GOOD or BAD does not train."""
+    """Run the verb: 0 if the commit is found, 3 if not; raises TrainingError if GOOD or BAD does not train."""
     parser = ArgumentParser(
         prog="gsbench bisect",
         description="Find the commit that made results worse in the git repository of this folder: one with a "
@@ -53,20 +53,20 @@ def main(argv: Sequence[str], runs: Path) -> int:
 
 
 @dataclass
-class Search:
-    """A search on its way: the commits, the first of them good, the one declaration of all steps, and their answers."""
+class CommitSearch:
+    """A search through ``commits``, the first of which is good, with one declaration for all its steps."""
 
-    home: Path  # an experiment without trials, which holds the declaration; each commit has its own beside it
+    home: Path  # an experiment without trials for the declaration; each commit's trials are in one of its own
     settings: Sequence[str]
     scenes: frozenset[str]
     declaration: Declaration
     trees: WorkTrees
     commits: Sequence[tuple[str, str, str]]
-    answers: dict[int, str] = field(default_factory=dict)
+    answers: dict[int, str] = field(default_factory=dict)  # what was found out, by the commit's index
 
     def result(self, number: int) -> str | None:
-        """The answer of a commit against the first; None where it does not train. Trains what is missing."""
-        good, new = (self.home.parent / f"{self.home.name}_{self.commits[k][0][:SHOWN]}" for k in (0, number))
+        """The result of a commit against the first one; None if it does not train. Trains what is missing."""
+        good, new = (self.home.parent / f"{self.home.name}_{self.commits[k][0][:HASH_LENGTH]}" for k in (0, number))
         gate = Gate(self.declaration, lambda: _trials(good), lambda: _trials(new))
 
         def run(planned: Sequence[Planned]) -> None:
@@ -84,13 +84,13 @@ class Search:
         return result_of(verdict)
 
     def _train(self, number: int, home: Path, seeds: Sequence[int]) -> None:
-        """Train a commit with those seeds that are not done, by the code of its work tree."""
+        """Train a commit with the seeds that are not done, by the code in its work tree."""
         done = {(trial.scene, trial.seed) for trial in _trials(home)}
         missing = [str(seed) for seed in seeds if not {(scene, seed) for scene in self.scenes} <= done]
         if not missing:
             return
         commit, _, subject = self.commits[number]
-        print(f"{commit[:SHOWN]} {printable(subject)}: seeds {', '.join(missing)}", file=sys.stderr)
+        print(f"{commit[:HASH_LENGTH]} {printable(subject)}: seeds {', '.join(missing)}", file=sys.stderr)
         tree = self.trees.tree(commit)
         environment = os.environ | {"GSBENCH_RUNS": str(home.parent)}
         if (tree / OWN_SOURCE).is_file():
@@ -101,41 +101,42 @@ class Search:
         run_program(command, home / LOG, tree / self.trees.prefix, environment, None)
 
     def table(self) -> list[str]:
-        """Lines on every commit, the newest first."""
+        """Lines about every commit, the newest first."""
         lines = []
         for number in reversed(range(len(self.commits))):
             commit, date, subject = self.commits[number]
             answer = "the good one" if number == 0 else self.answers.get(number, "not tried")
-            lines.append(printable(f"{commit[:SHOWN]}  {date}  {subject}\n            {answer}"))
+            lines.append(printable(f"{commit[:HASH_LENGTH]}  {date}  {subject}\n            {answer}"))
         return lines
 
 
-def _begin(options: argparse.Namespace, trees: WorkTrees, commits: Sequence[tuple[str, str, str]]) -> Search:
-    """Look at the words, and declare the question of all steps before the first."""
-    first = one_trial_per_scene("bisect", options.settings, options.metric)
-    some = next(iter(first.values()))
-    for trial in first.values():
+def _begin(options: argparse.Namespace, trees: WorkTrees, commits: Sequence[tuple[str, str, str]]) -> CommitSearch:
+    """Check the settings, and declare the question of all steps before the first one."""
+    by_scene = one_trial_per_scene("bisect", options.settings, options.metric)
+    example = next(iter(by_scene.values()))  # its settings are those of all, apart from the scene
+    for trial in by_scene.values():
         place = trial.values["scene"].get("path")
         if place and not Path(place).expanduser().is_absolute():
             raise InputError(f"scene.path={place}: commits are trained in other folders, so give the whole path")
-    arms = {scene: (trial.folder.parent.name,) * 2 for scene, trial in first.items()}
-    share = ERROR_RATE / most_steps(len(commits) - 1)
+    arms = {scene: (trial.folder.parent.name,) * 2 for scene, trial in by_scene.items()}
+    share = ERROR_RATE / most_steps(len(commits) - 1)  # of each step, so that all together err in 5 % at most
     seeds = range(max(0, options.seeds))
-    declaration = ask(options.metric, options.least, arms, seeds, some.values, share)
-    kept = [word for word in options.settings if not word.startswith(("name=", "runs="))]
-    runs = checked_runs_folder(str(some.files.runs))
+    declaration = ask(options.metric, options.least, arms, seeds, example.values, share)
+    settings = [word for word in options.settings if not word.startswith(("name=", "runs="))]
+    runs = checked_runs_folder(str(example.files.runs))
     make_runs_folder(runs)
-    home = runs / f"{some.values['name']}_{sha256_of([commits[0][0], commits[-1][0], *kept])[:SHOWN]}"
+    # The name is a hash of the question, so that the same command continues the same search.
+    home = runs / f"{example.values['name']}_{sha256_of([commits[0][0], commits[-1][0], *settings])[:HASH_LENGTH]}"
     declaration = declare_questions(home, declaration)
-    return Search(home, kept, frozenset(first), declaration, trees, commits)
+    return CommitSearch(home, settings, frozenset(by_scene), declaration, trees, commits)
 
 
 def _trials(home: Path) -> tuple[TrialResult, ...]:
     return read_experiment(home).trials if home.is_dir() else ()
 
 
-def _conclusion(found: tuple[int, int] | None, search: Search) -> list[str]:
-    """Lines that say what the search has found."""
+def _conclusion(found: tuple[int, int] | None, search: CommitSearch) -> list[str]:
+    """The lines that say which commit, or which commits, the search found."""
     if found is None:
         return [
             "The last commit is not shown to be worse than the first: allow more --seeds, or look at another metric."
@@ -143,6 +144,6 @@ def _conclusion(found: tuple[int, int] | None, search: Search) -> list[str]:
     good, bad = found
     commit, date, subject = search.commits[bad]
     if bad - good == 1:
-        return [printable(f"It became worse with {commit[:SHOWN]} ({date}): {subject}")]
-    first = search.commits[good + 1][0][:SHOWN]
-    return [f"It became worse with one of {counted(bad - good, 'commit')}, from {first} to {commit[:SHOWN]}."]
+        return [printable(f"It became worse with {commit[:HASH_LENGTH]} ({date}): {subject}")]
+    first = search.commits[good + 1][0][:HASH_LENGTH]
+    return [f"It became worse with one of {counted(bad - good, 'commit')}, from {first} to {commit[:HASH_LENGTH]}."]

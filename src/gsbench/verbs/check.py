@@ -15,7 +15,6 @@ from gsbench.launch.batch import missing_folders
 from gsbench.launch.dry_run import describe_plan
 from gsbench.launch.record import declare_questions
 from gsbench.runs.declaration import read_declarations
-from gsbench.runs.trial_folder import TrialFolder
 from gsbench.verbs.arguments import ArgumentParser, path
 from gsbench.words import counted
 
@@ -23,7 +22,7 @@ HTML = "claims.html"
 
 
 def main(argv: Sequence[str], runs: Path) -> int:
-    """Run the verb: 0 whatever the verdicts are; raises InputError for bad input."""
+    """Run the verb: 0 for any verdicts; raises InputError for bad input."""
     parser = ArgumentParser(
         prog="gsbench check",
         description="Test the claims of a file (docs/claims.md): write the plan down, run trials until each claim is "
@@ -63,7 +62,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
 
 
 def _recheck(file: ClaimsFile, archive: Path, out: Path | None) -> int:
-    """Print the verdicts that the archive's trials make, and write their page; 0 whatever the verdicts are.
+    """Print the verdicts by the archive's trials, and write their page to ``out`` if given; returns 0.
 
     Raises InputError for an ``out`` of another format.
     """
@@ -84,7 +83,7 @@ def _recheck(file: ClaimsFile, archive: Path, out: Path | None) -> int:
 
 
 def _permissions(words: Sequence[str]) -> Sequence[str]:
-    """The words after the file, which can only be permissions. Raises InputError for others."""
+    """The words after the file. Raises InputError for words that are no permissions."""
     for word in words:
         if word.split("=")[0] != PERMISSIONS:
             raise InputError(f"{word}: settings of a check are in its file of claims; here only {PERMISSIONS}=[…]")
@@ -92,25 +91,25 @@ def _permissions(words: Sequence[str]) -> Sequence[str]:
 
 
 def describe(check: Check) -> list[str]:
-    """Describe a dry run: each claim with its question or why it is not testable, the trials, and the time."""
+    """The lines of a dry run: each claim with its question or why it is not testable, the trials, and the time."""
     file, declaration = check.file, check.declaration
-    asked = {question.name: question for question in declaration.questions}
-    lines = [f"{file.paper}: {counted(len(asked), 'claim')} to be tested"]
+    questions = {question.name: question for question in declaration.questions}
+    lines = [f"{file.paper}: {counted(len(questions), 'claim')} to be tested"]
     for claim in file.claims:
         missing = declaration.missing.get(claim.id, [])
-        if claim.id not in asked:
+        if claim.id not in questions:
             lines.append(f"not testable here  {claim.id}: {claim.not_testable or '; '.join(missing)}")
             continue
         what = f"{claim.metric} of {claim.arm} against {claim.baseline}: {claim.direction}, by {claim.effect} at least"
-        scenes, looks = ", ".join(asked[claim.id].scenes), ", ".join(map(str, declaration.looks))
+        scenes, looks = ", ".join(questions[claim.id].scenes), ", ".join(map(str, declaration.looks))
         lines.append(f"to be tested       {claim.id}: {what}; on {scenes}; looks at {looks} seeds")
         lines += [f"                   without {reason}" for reason in missing]
-    if not asked:
+    if not questions:
         return lines
     first, most = check.trials(declaration.looks[0]), check.trials(declaration.looks[-1])
     lines.append(
         f"{counted(len(first), 'trial')} until the first look, {len(most)} at most; "
-        f"each test may err in {100 * file.error_rate / len(asked):.3g} % of such sweeps"
+        f"each test may err in {100 * file.error_rate / len(questions):.3g} % of such sweeps"
     )
     if most:
         lines += describe_plan(most, most[0].values["launch"]["parallel"])
@@ -125,9 +124,9 @@ def _run(check: Check) -> None:
     check = replace(check, declaration=declare_questions(check.home, check.declaration))
 
     def run(planned: Sequence[Planned]) -> None:
-        left = [one for one in check.to_run(planned) if TrialFolder.of(one.values).why_not_done(one.values)]
-        if left:
-            run_batch(left)
+        unfinished = [trial for trial in check.to_run(planned) if trial.files.why_not_done(trial.values)]
+        if unfinished:
+            run_batch(unfinished)
 
     verdicts = check.verdicts(run_looks(check.declaration, check.judged, run))
     page = make_page(check.file, verdicts, check.declaration, read_declarations(check.home))

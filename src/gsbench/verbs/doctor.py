@@ -1,4 +1,4 @@
-"""``gsbench doctor``: what this machine has, what is missing, and how to mend it."""
+"""``gsbench doctor``: what this machine has, what is missing, and how to get it."""
 
 import shutil
 import sys
@@ -27,7 +27,7 @@ OPTIONAL = {  # module -> what needs it, and the extra that brings it
 
 
 class Finding(NamedTuple):
-    """One thing that was looked at: ``ok``, worth a ``note``, or ``bad`` (gsbench will not work)."""
+    """The result of one check: ``ok``, worth a ``note``, or ``bad`` (gsbench will not work)."""
 
     verdict: Literal["ok", "note", "bad"]
     topic: str
@@ -47,7 +47,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
 
 
 def check_packages() -> Iterator[Finding]:
-    """gsbench, Python, and what is imported beside them."""
+    """The versions of gsbench, Python and the packages that gsbench imports."""
     from gsbench import __version__
 
     yield Finding("ok", "gsbench", f"{__version__} in {Path(__file__).resolve().parents[1]}")
@@ -62,7 +62,7 @@ def check_packages() -> Iterator[Finding]:
 
 
 def check_devices() -> Iterator[Finding]:
-    """torch, the GPUs that it can use or what keeps it from one that is there, and the rasterizers on all devices."""
+    """Findings about torch, the GPUs that it can or cannot use and why, and the rasterizers on each device."""
     try:
         import torch
     except (ImportError, OSError) as error:
@@ -97,10 +97,10 @@ def check_devices() -> Iterator[Finding]:
 
 
 def check_triton() -> Iterator[Finding]:
-    """Check the compiler that raster=triton needs at its first run on a GPU."""
+    """Findings about the compiler that raster=triton needs at its first run on a GPU."""
     from gsbench.raster.executors import missing_tools
 
-    if version_of("triton") is None:  # torch for CUDA would have brought it along
+    if version_of("triton") is None:  # it comes with torch for CUDA, so there is no GPU to run it on
         return
     if fault := find("triton").too_old():
         yield Finding("note", "triton", f"raster=triton {fault}")
@@ -109,7 +109,7 @@ def check_triton() -> Iterator[Finding]:
 
 
 def check_weights() -> Iterator[Finding]:
-    """Weights that are at hand; nothing is downloaded."""
+    """Findings about the weights of networks that are here; nothing is downloaded."""
     from gsbench.eval.lpips import BACKBONES, find_any
     from gsbench.init.dim import EXTRACTOR_WEIGHTS, LIGHTGLUE_WEIGHTS
     from gsbench.weights import WEIGHTS_VARIABLE, MissingWeights, hub_cache

@@ -65,7 +65,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
 
 
 def export_results(name: str, runs: Path, out: Path | None, pictures: bool = False) -> int:
-    """Write the archive of an experiment's results, and say what is not in it; 0."""
+    """Write the archive of an experiment's results, and warn of what is left out; returns 0."""
     from gsbench.claims.archive import write_archive
 
     if not is_folder_name(name):
@@ -82,7 +82,7 @@ def export_results(name: str, runs: Path, out: Path | None, pictures: bool = Fal
 
 
 def check_form(out: Path) -> None:
-    """Raise InputError for the name of a file in another form than the 3DGS PLY."""
+    """Raise InputError unless the name of the file is that of a 3DGS PLY."""
     if not out.name.lower().endswith(".ply") or out.name.lower().endswith(".compressed.ply"):
         raise InputError(
             f"--out {out}: gsbench writes the 3DGS .ply, which every viewer and trainer reads (docs/other_models.md "

@@ -1,4 +1,4 @@
-"""``gsbench fetch``: public scenes into the data folder."""
+"""``gsbench fetch``: download public scenes into the data folder."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -22,7 +22,7 @@ PATIENCE = Patience()
 
 
 def main(argv: Sequence[str], runs: Path) -> int:
-    """Run the verb: 0 if all that was asked for is here."""
+    """Run the verb: 0 if all requested scenes are here."""
     catalog = read_catalog()
     options = _parser(list(catalog)).parse_args(argv)
     data = data_dir()
@@ -75,7 +75,7 @@ def listing(datasets: Sequence[Dataset], data: Path) -> list[str]:
 def _make_folder(data: Path) -> None:
     try:
         data.mkdir(parents=True, exist_ok=True)
-    except (FileExistsError, NotADirectoryError, FileNotFoundError) as error:  # a file, or in /proc
+    except (FileExistsError, NotADirectoryError, FileNotFoundError) as error:  # `data` is a file, or lies in /proc
         raise InputError(
             f"{data} cannot be the data folder ({error.strerror}): set {DATA_VARIABLE} to another"
         ) from error
@@ -101,10 +101,10 @@ def _scenes(dataset: Dataset, names: Sequence[str]) -> Sequence[str]:
 
 
 def _mirror(mirror: str | None) -> str | None:
-    """The address or folder to fetch from instead of the published address; raises `InputError` for others."""
+    """The address or folder to fetch from instead of the published one; raises InputError if it is neither."""
     if not mirror:
         return None
-    with suppress(ValueError):  # an address such as http://[::1
+    with suppress(ValueError):  # urlsplit raises for an address such as http://[::1
         if urlsplit(mirror).hostname and mirror.startswith(("http://", "https://")):
             return mirror
     if is_path(mirror) and Path(mirror).expanduser().is_dir():

@@ -1,4 +1,4 @@
-"""``gsbench gate``: is this version of a trainer worse than the one that an archive is of?"""
+"""``gsbench gate``: is this version of a trainer worse than the version whose results an archive holds?"""
 
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -22,7 +22,7 @@ EXIT_CODES = {PASSED: 0, WORSE: 1, NOT_DECIDED: 3}
 
 
 def main(argv: Sequence[str], runs: Path) -> int:
-    """Run the verb: 0 passed, 1 worse, 3 not decided; raises GsbenchError (1) where trials fail, InputError (2)."""
+    """Run the verb: 0 passed, 1 worse, 3 not decided; raises GsbenchError (1) if trials fail, InputError (2)."""
     parser = ArgumentParser(
         prog="gsbench gate",
         description="Train this version on scenes and seeds of an archive (gsbench export --results), seed by seed "
@@ -34,22 +34,22 @@ def main(argv: Sequence[str], runs: Path) -> int:
     parser.add_argument("--seeds", type=int, help="the largest number of seeds; default: all that the archive has")
     add_where(parser)
     options = parser.parse_args(argv)
-    first = one_trial_per_scene("gate", options.settings, options.metric)
-    some = next(iter(first.values()))
-    home = some.files.home
+    by_scene = one_trial_per_scene("gate", options.settings, options.metric)
+    example = next(iter(by_scene.values()))  # its settings are those of all, apart from the scene
+    home = example.files.home
     with tempfile.TemporaryDirectory() as folder:
-        every = unpack_archive(options.archive, Path(folder)).trials
-        baseline = _baseline(select_trials(every, dict(options.where)), first)
+        archived = unpack_archive(options.archive, Path(folder)).trials
+        baseline = _baseline(select_trials(archived, dict(options.where)), by_scene)
         seeds = _seeds(baseline, options.seeds)
-        arms = {scene: (_arm(one[0]), first[scene].folder.parent.name) for scene, one in baseline.items()}
-        declaration = ask(options.metric, options.least, arms, seeds, some.values)
+        arms = {scene: (_arm(old[0]), by_scene[scene].folder.parent.name) for scene, old in baseline.items()}
+        declaration = ask(options.metric, options.least, arms, seeds, example.values)
         trials = {
-            (trial_key(scene, arms[scene][1], NEW), seed): with_seed(one, seed)
-            for scene, one in first.items()
+            (trial_key(scene, arms[scene][1], NEW), seed): with_seed(trial, seed)
+            for scene, trial in by_scene.items()
             for seed in seeds
         }
         make_runs_folder(checked_runs_folder(str(home.parent)))
-        old = [one for own in baseline.values() for one in own if one.seed in seeds]
+        old = [trial for of_scene in baseline.values() for trial in of_scene if trial.seed in seeds]
         gate = Gate(declare_questions(home, declaration), lambda: old, lambda: _done(home, list(trials.values())))
 
         def run(planned: Sequence[Planned]) -> None:
@@ -64,38 +64,42 @@ def main(argv: Sequence[str], runs: Path) -> int:
     return EXIT_CODES[result_of(verdict)]
 
 
-def _baseline(trials: Sequence[TrialResult], first: Mapping[str, Trial]) -> dict[str, list[TrialResult]]:
-    """The archive's trials by scene: of several arms on a scene those whose name the new trials have.
+def _baseline(archived: Sequence[TrialResult], by_scene: Mapping[str, Trial]) -> dict[str, list[TrialResult]]:
+    """The archive's trials of each scene. If it has several arms there, the one with the name of the new trial's arm.
 
-    Raises InputError for a scene that the archive lacks, and where it has several such arms.
+    Raises InputError for a scene that the archive lacks, and if several arms or settings are left.
     """
-    found = {}
-    for scene, new in first.items():
-        own = [trial for trial in trials if trial.scene == scene]
-        if not own:
-            there = listed(sorted({trial.scene for trial in trials}))
-            raise InputError(f"the archive has no trial on {scene} (it has {there})")
-        own = [trial for trial in own if _arm(trial) == new.folder.parent.name] or own
-        if len(kinds := group_by(own, lambda trial: (_arm(trial), trial.config_hash))) > 1:
-            arms = listed([f"{arm} ({settings})" for arm, settings in kinds])
+    baseline = {}
+    for scene, new in by_scene.items():
+        old = [trial for trial in archived if trial.scene == scene]
+        if not old:
+            scenes = listed(sorted({trial.scene for trial in archived}))
+            raise InputError(f"the archive has no trial on {scene} (it has {scenes})")
+        old = [trial for trial in old if _arm(trial) == new.folder.parent.name] or old
+        if len(variants := group_by(old, lambda trial: (_arm(trial), trial.config_hash))) > 1:
+            arms = listed([f"{arm} ({settings})" for arm, settings in variants])
             raise InputError(f"the archive has several arms on {scene}, {arms}: choose by --where KEY=VALUE")
-        found[scene] = own
-    return found
+        baseline[scene] = old
+    return baseline
 
 
 def _seeds(baseline: Mapping[str, Sequence[TrialResult]], most: int | None) -> list[int]:
-    """The seeds that all scenes have, ``most`` at most; raises InputError where there are fewer than asked for."""
-    shared = sorted(set.intersection(*({trial.seed for trial in own} for own in baseline.values())))
+    """The seeds that all scenes have, ``most`` at most; raises InputError if there are fewer."""
+    shared = sorted(set.intersection(*({trial.seed for trial in trials} for trials in baseline.values())))
     if most is not None and not 0 < most <= len(shared):
         raise InputError(f"--seeds {most}: the archive has {len(shared)} seeds of all scenes")
     return shared[:most]
 
 
 def _done(home: Path, trials: Sequence[Trial]) -> list[TrialResult]:
-    """The results of those trials that are done by the code as it is now: others are of an earlier version."""
-    ours = {trial.folder: trial for trial in trials}
-    found = read_experiment(home).trials if home.is_dir() else ()
-    return [one for one in found if one.path in ours and not ours[one.path].files.why_not_done(ours[one.path].values)]
+    """The results of those ``trials`` that are done. Results of earlier code do not count as done."""
+    by_folder = {trial.folder: trial for trial in trials}
+    results = read_experiment(home).trials if home.is_dir() else ()
+    return [
+        result
+        for result in results
+        if (trial := by_folder.get(result.path)) is not None and not trial.files.why_not_done(trial.values)
+    ]
 
 
 def _arm(trial: TrialResult) -> str:

@@ -1,4 +1,4 @@
-"""``gsbench plan``: from trials that are there, how many scenes and seeds resolve a difference."""
+"""``gsbench plan``: how many scenes and seeds resolve a difference, estimated from an experiment's trials."""
 
 import argparse
 import math
@@ -16,7 +16,7 @@ from gsbench.runs.declaration import Question
 from gsbench.verbs.arguments import ArgumentParser
 from gsbench.words import counted
 
-MOST_SHOWN = 5  # designs
+MAX_DESIGNS = 5  # that are shown: combinations of scenes and seeds
 
 
 def main(argv: Sequence[str], runs: Path) -> int:
@@ -66,7 +66,7 @@ def _lines(components: Components, shown: Quantity, difference: float) -> list[s
             continue
         designs = designs_needed(difference, components, like_these)
         designs.sort(key=lambda design: (design.trials, design.scenes))
-        texts = [f"{one.scenes} × {one.seeds} ({one.trials} trials)" for one in designs[:MOST_SHOWN]]
+        texts = [f"{one.scenes} × {one.seeds} ({one.trials} trials)" for one in designs[:MAX_DESIGNS]]
         lines.append(
             f"  to see {difference:g} on {group}, scenes × seeds: {', '.join(texts) or 'no number that can be run'}"
         )

@@ -1,4 +1,4 @@
-"""``gsbench pool``: one answer from the results of many."""
+"""``gsbench pool``: one answer from many archives of results."""
 
 import sys
 from collections import Counter
@@ -16,7 +16,7 @@ BETTER = {1: ", more is better", -1: ", less is better", 0: ""}
 
 
 def main(argv: Sequence[str], runs: Path) -> int:
-    """The verb: 0, or 1 where a source was left out; raises InputError where none can be read."""
+    """Run the verb: 0, or 1 if a source was left out; raises InputError if none can be read."""
     parser = ArgumentParser(
         prog="gsbench pool",
         description="A mean over many archives of `gsbench export --results`, each with the same weight.",
@@ -45,9 +45,9 @@ def main(argv: Sequence[str], runs: Path) -> int:
 def pool_sources(
     sources: Sequence[Path], wanted: Wanted, protocol: str | None = None
 ) -> tuple[Pooled, list[str], list[str]]:
-    """(the mean of all studies in ``sources``, notes on them, a line for each source or study that is left out).
+    """Pool all studies in ``sources``: (their mean, notes on them, a line for each source or study that is left out).
 
-    Raises InputError where nothing is left.
+    Raises InputError if no study is left.
     """
     studies, notes, faults = [], list[str](), list[str]()
     seen: dict[str, Path] = {}

@@ -1,4 +1,4 @@
-"""Questions about the configuration, which Hydra answers: ``--cfg job``, ``--info``, tab completion."""
+"""Questions about the configuration that Hydra answers: ``--cfg job``, ``--info``, tab completion."""
 
 import os
 import re
@@ -16,7 +16,7 @@ COMPLETION = re.compile(r"(install|uninstall|query)=(bash|zsh|fish)")
 
 
 def ask_hydra(argv: list[str]) -> int:
-    """Let Hydra answer about the configuration; no trial is run. Raises InputError for what it would not understand."""
+    """Let Hydra answer a question about the configuration, and run no trial. Raises InputError for bad input."""
     options = _parser().parse_args(argv)
     asked = [options.cfg is not None, options.info is not None, options.shell_completion, options.hydra_help]
     if sum(asked) != 1 or ((options.resolve or options.package) and options.cfg is None):
@@ -44,10 +44,10 @@ def _check(overrides: list[str], config_dir: Path | None, package: str | None) -
 
 
 def _check_typed(line: str) -> None:
-    """Refuse to complete a line that would import a package which it does not allow."""
+    """Refuse to complete a line that would make Hydra import a package which the line does not allow."""
     words = []
     for word in line.split():
-        with suppress(InputError):  # half typed
+        with suppress(InputError):  # a half-typed word
             parse_word(word)
             words.append(word)
     check_search_path(words, typed_permissions(words))

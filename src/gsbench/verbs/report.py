@@ -40,6 +40,6 @@ def main(argv: Sequence[str], runs: Path) -> int:
 
 
 def file_at(out: Path, experiment: str) -> Path:
-    """The file that ``--out`` means: itself, or one in that folder, beside other experiments' tables and reports."""
+    """The file that ``--out`` means: ``out`` itself, or in a folder a file named after the experiment."""
     is_file = out.suffix.lower() in FILE_SUFFIXES and not out.is_dir()
     return out if is_file else out / f"{experiment}-{REPORT_NAME}"

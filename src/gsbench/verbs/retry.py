@@ -1,4 +1,4 @@
-"""``gsbench retry``: run what failed, was stopped or is missing of an experiment, with its own settings."""
+"""``gsbench retry``: run an experiment's failed, stopped and missing trials again, with their own settings."""
 
 import logging
 import os
@@ -25,7 +25,7 @@ log = logging.getLogger(__name__)
 
 
 def main(argv: Sequence[str], runs: Path) -> int:
-    """Run the verb: as the sweep's own command, the exit code says whether some trial failed."""
+    """Run the verb: the exit code says, as a sweep's does, whether a trial failed."""
     from gsbench.app.command import run_trials
 
     parser = ArgumentParser(
@@ -42,8 +42,8 @@ def main(argv: Sequence[str], runs: Path) -> int:
     parser.add_argument("--dry-run", action="store_true", help="only list them")
     options = parser.parse_args(argv)
     home = experiment_home(runs, options.experiment)
-    if others := [change for change in options.changes if makes_other_trials(key_of(change))]:
-        raise InputError(f"{others[0]} would make other trials than those of the plan: give the sweep's own command")
+    if refused := [change for change in options.changes if makes_other_trials(key_of(change))]:
+        raise InputError(f"{refused[0]} would make other trials than those of the plan: give the sweep's own command")
     unfinished = [
         trial.folder
         for trial in states_of_experiment(home)
@@ -53,8 +53,8 @@ def main(argv: Sequence[str], runs: Path) -> int:
         print(f"nothing to retry: all trials of {options.experiment} are done, running or queued")
         return 0
     planned = read_plan(home)
-    here = os.getcwd()
-    trials = [recompose(folder, planned.get(folder), runs, options.changes, here) for folder in unfinished]
+    modules = os.getcwd()  # noted now, since `recompose` changes the current folder
+    trials = [recompose(folder, planned.get(folder), runs, options.changes, modules) for folder in unfinished]
     _check_trackers(trials, options.changes)
     if options.dry_run:
         print("\n".join(describe_plan(trials, trials[0].values["launch"]["parallel"])))
@@ -68,35 +68,39 @@ def main(argv: Sequence[str], runs: Path) -> int:
 
 
 def _check_trackers(trials: Sequence[Trial], changes: Sequence[str]) -> None:
-    """Raise InputError where trials would send their results to a tracker that files name and nobody typed."""
-    typed = next((word.partition("=")[2] for word in changes if key_of(word) == TRACKER), None)
+    """Raise InputError for a trial that would send its results to a tracker which only a file names.
+
+    The runs folder may be somebody else's, and its address theirs.
+    """
+    typed_uri = next((word.partition("=")[2] for word in changes if key_of(word) == TRACKER), None)
     for trial in trials:
-        if strange := untyped_address(trial.values["tracking"], typed):
+        if address := untyped_address(trial.values["tracking"], typed_uri):
             raise InputError(
-                f"{trial.files.label} would send its results to {strange}, an address from a file: to allow it, type "
-                f"{TRACKER}={strange} (for a trial in no plan: set {VARIABLE}={strange}); tracking=none sends nothing"
+                f"{trial.files.label} would send its results to {address}, an address from a file: to allow it, type "
+                f"{TRACKER}={address} (for a trial in no plan: set {VARIABLE}={address}); tracking=none sends nothing"
             )
 
 
-def recompose(folder: Path, planned: PlannedTrial | None, runs: Path, changes: list[str], here: str) -> Trial:
+def recompose(folder: Path, planned: PlannedTrial | None, runs: Path, changes: list[str], modules: str) -> Trial:
     """The trial in ``folder``: from its planned overrides, else from the configuration that it wrote.
 
-    Neither allows anything to run: that ``changes``, which were typed ``here``, must do again.
+    Neither gives permission to run code: ``changes`` must give it again. ``modules`` is the folder of the user's
+    modules.
     """
     if planned is not None:
         if Path(planned.cwd).is_dir():
             os.chdir(planned.cwd)  # relative paths were meant from there, and the trials are run from there
-        changed = {PERMISSIONS, *map(key_of, changes)}
-        own = [word for word in planned.overrides if key_of(word) not in changed]
+        replaced = {PERMISSIONS, *map(key_of, changes)}
+        kept = [word for word in planned.overrides if key_of(word) not in replaced]
         if any(change.startswith("launch=") and change not in planned.overrides for change in changes):
-            own = [word for word in own if not word.startswith("launch.")]  # they were meant for the other launcher
-        # but not the modules: a stranger's plan would name a folder of the stranger's
-        trial = compose_one([*own, *changes], modules=here)
+            kept = [word for word in kept if not word.startswith("launch.")]  # they were meant for the other launcher
+        # Modules are not taken from planned.cwd: somebody else's plan would name a folder of theirs.
+        trial = compose_one([*kept, *changes], modules=modules)
         return Trial(trial.values | {"runs": str(runs)}, trial.overrides)
     files, allowed = TrialFolder(folder), typed_permissions(changes)
     if any(key_of(change) != PERMISSIONS for change in changes):
         raise InputError(f"{files.label} is in no plan, so no setting of it can be changed: run it by its own command")
-    allow_modules(allowed, here)
+    allow_modules(allowed, modules)
     values = files.configuration() | {"runs": str(runs), PERMISSIONS: list(allowed)}
     if values["densify"].get("evaluated_from") == FROM_RENDERS:
         raise InputError(f"{files.label} was entered from renders: give the command of `gsbench evaluate` again")

@@ -12,7 +12,7 @@ DONE, LEFT_OUT = 0, 1
 
 
 def main(argv: Sequence[str], runs: Path) -> int:
-    """Run the verb: 0, or 1 where an archive was left out; raises InputError where none can be read."""
+    """Run the verb: 0, or 1 if an archive was left out; raises InputError if none can be read."""
     from gsbench.claims.site import INDEX, write_site  # here, for a quick answer to --help
 
     parser = ArgumentParser(

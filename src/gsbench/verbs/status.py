@@ -1,4 +1,4 @@
-"""``gsbench status``: what an experiment has done, runs, failed and misses."""
+"""``gsbench status``: the trials of an experiment that are done, running, failed or missing."""
 
 import json
 import time
@@ -19,7 +19,7 @@ ORDER = ("failed", "damaged", "running", "queued", "partial", "missing", "supers
 
 
 def main(argv: Sequence[str], runs: Path) -> int:
-    """Run the verb: 0 if all trials are done, or will be, 1 if some failed or are missing."""
+    """Run the verb: 0 if all trials are done, running or queued, 1 if some failed or are missing."""
     parser = ArgumentParser(prog="gsbench status", description="The state of every trial of an experiment.")
     parser.add_argument("experiment", nargs="?", help="its name; without one, a line for each experiment")
     parser.add_argument("--all", action="store_true", help="list the finished trials too")
@@ -55,16 +55,14 @@ def main(argv: Sequence[str], runs: Path) -> int:
 
 
 def progress_with_superseded(home: Path) -> list[TrialState]:
-    """The state of every trial of the experiment in ``home``, of finished ones also whether their code is the present.
+    """The state of every trial of the experiment in ``home``, with ``superseded`` for those that older code made."""
+    folders = {folder: trial.cwd for folder, trial in read_plan(home).items()}
 
-    A user's class is looked up where the trial was asked for: another folder may have another file of that name.
-    """
-    places = {folder: trial.cwd for folder, trial in read_plan(home).items()}
+    # The user's modules are read in the folder where the trial's command was given: another may have a namesake.
+    def present_digest(module: str, trial: TrialResult) -> str | None:
+        return module_digest(module, folders[trial.path]) if trial.path in folders else None
 
-    def present(module: str, trial: TrialResult) -> str | None:
-        return module_digest(module, places[trial.path]) if trial.path in places else None
-
-    reasons = find_superseded(read_experiment(home).trials, present)
+    reasons = find_superseded(read_experiment(home).trials, present_digest)
     return [
         replace(trial, state="superseded", note=reasons[trial.folder])
         if trial.state == "done" and trial.folder in reasons
@@ -73,11 +71,11 @@ def progress_with_superseded(home: Path) -> list[TrialState]:
     ]
 
 
-def lines_of(trials: list[TrialState], everything: bool) -> list[str]:
-    """A line for each trial that deserves attention (or each, with ``everything``), and a summary."""
+def lines_of(trials: list[TrialState], with_done: bool) -> list[str]:
+    """A line for each trial that is not done (or for each, ``with_done``), and a summary."""
     lines = []
     for state in ORDER:
-        if state == "done" and not everything:
+        if state == "done" and not with_done:
             continue
         for trial in trials:
             if trial.state == state:
@@ -87,7 +85,7 @@ def lines_of(trials: list[TrialState], everything: bool) -> list[str]:
 
 
 def summary_of(trials: list[TrialState]) -> str:
-    """Count the trials in each state, in one line."""
+    """The number of trials in each state, in one line."""
     counts = {state: sum(trial.state == state for trial in trials) for state in reversed(ORDER)}
     return f"{counted(len(trials), 'trial')}: " + ", ".join(
         f"{count} {state}" for state, count in counts.items() if count
@@ -104,7 +102,7 @@ def _overview(runs: Path) -> int:
 
 
 def _age(trial: TrialState) -> str:
-    """``for 5 min`` of a state that lasts, ``5 min ago`` of one that was reached."""
+    """``for 5 min`` for a state that lasts, ``5 min ago`` for a final one."""
     if trial.since is None:
         return ""
     time_since = readable_time(max(0.0, time.time() - trial.since))

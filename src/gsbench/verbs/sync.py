@@ -1,4 +1,4 @@
-"""``gsbench sync``: mirror to the tracker what it missed, once."""
+"""``gsbench sync``: send to the tracker, once, what it missed."""
 
 from collections.abc import Sequence
 from pathlib import Path

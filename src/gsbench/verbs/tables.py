@@ -1,4 +1,4 @@
-"""``gsbench tables``: read an experiment's result files, print or write its tables."""
+"""``gsbench tables``: print or write the tables of an experiment, from its result files."""
 
 import argparse
 import re
@@ -45,7 +45,7 @@ def _format_of(out: Path | None) -> str:
 
 
 def _trials(trials: Sequence[TrialResult], options: argparse.Namespace) -> dict[str, str]:
-    """One row a trial; what only a table has is refused."""
+    """A CSV with one row per trial. Raises InputError for options that only a table has."""
     for name in ("rows", "columns", "metrics", "layout", "paper"):
         if getattr(options, name) is not None:
             raise InputError(f"--format {TRIALS} shows every column of every trial, and takes no --{name}")
@@ -53,8 +53,8 @@ def _trials(trials: Sequence[TrialResult], options: argparse.Namespace) -> dict[
 
 
 def _tables(experiment: Experiment, trials: Sequence[TrialResult], options: argparse.Namespace) -> dict[str, str]:
-    """The tables as text, each with what its file's name ends in."""
-    layout = options.layout or (_is_plain(options) and layout_of(experiment.name)) or "plain"
+    """The texts of the tables, by the ending of their file's name."""
+    layout = options.layout or (_has_default_layout(options) and layout_of(experiment.name)) or "plain"
     metrics = options.metrics
     if layout == FAIRNESS:
         return _fairness_sheets(experiment, options.format)
@@ -75,7 +75,7 @@ def _tables(experiment: Experiment, trials: Sequence[TrialResult], options: argp
 
 
 def _fairness_sheets(experiment: Experiment, format_name: str) -> dict[str, str]:
-    """The sheet of every pair of arms that is compared, whichever trials a table would show."""
+    """The fairness sheets of all compared pairs of arms, from all trials of the experiment."""
     trials, pairs = compared_pairs(experiment)
     if not pairs:
         raise InputError(f"experiment {experiment.name} has one arm, so there is nothing to compare")
@@ -87,7 +87,7 @@ def _fairness_sheets(experiment: Experiment, format_name: str) -> dict[str, str]
 
 
 def _as_file(arm: Arm) -> str:
-    """An arm as a part of a file's name, its variant included."""
+    """An arm, with its variant, as part of a file's name."""
     return re.sub(r"[^\w.=-]+", "_", str(arm))
 
 
@@ -132,15 +132,15 @@ def _parser() -> ArgumentParser:
     return parser
 
 
-def _is_plain(options: argparse.Namespace) -> bool:
-    """No layout of the user's own was asked for."""
+def _has_default_layout(options: argparse.Namespace) -> bool:
+    """Return whether the user chose neither rows nor columns."""
     return options.rows is None and options.columns is None
 
 
 def _write(texts: Mapping[str, str], out: Path | None, name: str) -> None:
-    """Print the texts, or write them: to the file ``out`` if it has the ending of the format, else into that folder.
+    """Print the texts, or write them to the file ``out``, or into the folder ``out`` unless it has the format's ending.
 
-    In a folder each file is named after the experiment; a second table stands beside the file ``out``.
+    In a folder, files are named after the experiment. A second table is written beside the file ``out``.
     """
     if out is None:
         print("\n".join(texts.values()), end="")

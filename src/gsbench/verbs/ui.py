@@ -1,4 +1,4 @@
-"""``gsbench ui``: the MLflow dashboard on this machine, lean."""
+"""``gsbench ui``: the MLflow dashboard on this machine, with few processes."""
 
 import os
 import shlex
@@ -15,7 +15,7 @@ from gsbench.system.stopping import stop_on_signals
 from gsbench.verbs.arguments import ArgumentParser, port
 
 DEFAULT_PORT = 5000
-LEAN = {  # the default takes eight processes and 2 GB
+LEAN = {  # environment; MLflow's defaults take eight processes and 2 GB
     "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false",
     "MLFLOW_DISABLE_TELEMETRY": "true",
     "MLFLOW_LOGGING_LEVEL": "WARNING",
@@ -23,7 +23,7 @@ LEAN = {  # the default takes eight processes and 2 GB
 
 
 def main(argv: Sequence[str], runs: Path) -> int:
-    """Run the verb: it serves until Ctrl-C."""
+    """Run the verb: serves the dashboard until Ctrl-C."""
     parser = ArgumentParser(prog="gsbench ui", description="The MLflow dashboard, on this machine only.")
     parser.add_argument(
         "--uri", help="the tracker's database; default: $MLFLOW_TRACKING_URI, or that of the runs folder"
@@ -45,15 +45,15 @@ def main(argv: Sequence[str], runs: Path) -> int:
 
 def serve(uri: str, port: int) -> int:
     """Run ``mlflow ui`` with one worker and no job runner, until a signal or Ctrl-C."""
-    place = find_spec("mlflow")
-    assert place is not None
-    assert place.origin is not None
+    mlflow_spec = find_spec("mlflow")
+    assert mlflow_spec is not None
+    assert mlflow_spec.origin is not None
     command = [sys.executable, "-m", "mlflow", "ui", "--backend-store-uri", uri, "--host", "127.0.0.1"]
     command += ["--port", str(port), "--workers", "1"]
-    # uvicorn looks for modules in the current folder first, where a `yaml.py` may lie; MLflow's own place is safe.
-    command += ["--uvicorn-opts", f"--app-dir={shlex.quote(str(Path(place.origin).parents[1]))}"]
+    # uvicorn imports modules from the current folder first, where a `yaml.py` may lie; MLflow's own folder is safe.
+    command += ["--uvicorn-opts", f"--app-dir={shlex.quote(str(Path(mlflow_spec.origin).parents[1]))}"]
     with stop_on_signals():
-        # Not `subprocess.run`: it would kill `mlflow ui` alone, whose server then is nobody's child and keeps the port.
+        # Not `subprocess.run`: it would kill only `mlflow ui`, and its orphaned server would keep the port.
         server = subprocess.Popen(command, env=LEAN | dict(os.environ))
         try:
             return server.wait()
