@@ -1,7 +1,7 @@
-"""The mirror: what the files of a trial say, shown in MLflow, TensorBoard or Weights & Biases.
+"""Tracking: the files of a trial mirrored to MLflow, TensorBoard or Weights & Biases.
 
-Files come first. A process beside the trials follows them and writes to the tracker in batches, so a tracker that is
-slow, down or read-only never harms a trial; what it missed, ``gsbench sync`` adds later from the same files.
+Trials write only files. A process beside them follows the files and writes to the tracker in batches, so a tracker that
+is slow, down or read-only never harms a trial. ``gsbench sync`` sends later what the tracker missed.
 """
 
 from gsbench.tracking.mirror import Mirror

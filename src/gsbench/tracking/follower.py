@@ -1,7 +1,7 @@
-"""Mirroring a trial: its files are read, and what they gained is sent to its tracker.
+"""Mirroring: reads the files of trials and sends new records to their tracker.
 
-`sync` does so once, for trials that have ended. `follow` is a process beside a sweep, which looks again and again until
-its trials have ended. The files are the truth: how far a trial has come and how it ended is read there.
+`sync` does so once, for trials that have ended. `follow` is the main function of a process beside a sweep, which reads
+again and again until the sweep's trials have ended. The progress and the end of a trial are read from its files.
 """
 
 import os
@@ -26,15 +26,15 @@ from gsbench.tracking.mlflow_sink import untyped_address
 from gsbench.tracking.trial import DEFAULT, Sink, TrackedTrial, name_of, read_state
 from gsbench.words import counted
 
-LOCK = ".mlflow.lock"  # one process at a time mirrors a trial, to whichever tracker
-SECONDS_AFTER_PARENT = 10.0  # to tell the tracker that the trials' process is gone
+LOCK = ".mlflow.lock"  # in the trial's folder: one process at a time mirrors a trial, to any tracker
+SECONDS_AFTER_PARENT = 10.0  # to tell the tracker how trials ended after the sweep's process is gone
 
 
 class TrackerRun:
-    """The run of the trial in ``folder``, opened anew or gone on with, and locked until it is closed.
+    """The tracker's run of the trial in ``folder``, new or continued. It is locked until it is closed.
 
-    ``options`` are the settings ``tracking``, ``values`` the whole configuration. Raises BusyError where another
-    process mirrors the trial, and whatever the tracker raises.
+    ``options`` are the settings ``tracking``, ``values`` the whole configuration. Raises BusyError if another process
+    mirrors the trial, and any error of the tracker.
     """
 
     def __init__(self, folder: TrialFolder, options: dict[str, Any], values: dict[str, Any]) -> None:
@@ -53,23 +53,23 @@ class TrackerRun:
 
     @property
     def is_complete(self) -> bool:
-        """Return whether the run shows the present results."""
+        """Return whether the run shows the trial's present results."""
         return self._state["complete"] is not None and self._state["complete"] == self._trial.results_hash()
 
     def add_curves(self) -> None:
         """Log the records that were written since the last call."""
         if self.is_complete:
             return
-        for name, newest, points in self._trial.curves(self._state["logged"]):
-            self._sink.log(points)
+        for name, newest, scalars in self._trial.curves(self._state["logged"]):
+            self._sink.log(scalars)
             self._state["logged"][name] = newest
         write_json(self._file, self._state)
 
     def end(self) -> None:
-        """Log the rest, and close the run as the files say that the trial ended: failed, done, or else killed."""
+        """Log the rest, and close the run with the trial's end by its files: failed, done, or otherwise killed."""
         if self.is_complete:
             return
-        if self._state["complete"] is not None:  # results that were there when it began are replaced by others
+        if self._state["complete"] is not None:  # the run shows earlier results, which new ones have replaced
             self._open()
         self.add_curves()
         folder = self._trial.folder
@@ -89,7 +89,7 @@ class TrackerRun:
 
 
 def make_sink(options: dict[str, Any], trial: TrackedTrial) -> Sink:
-    """The trial's place in the tracker that ``tracking.sink`` names."""
+    """The sink of a trial for the tracker that ``tracking.sink`` names."""
     match options.get("sink", DEFAULT):
         case "tensorboard":
             from gsbench.tracking.tensorboard_sink import TensorBoardSink
@@ -109,12 +109,11 @@ def make_sink(options: dict[str, Any], trial: TrackedTrial) -> Sink:
 
 
 def sync(folders: Iterable[TrialFolder], uri: str | None) -> Iterator[str]:
-    """Mirror what the tracker missed of ended trials; yields a line for each that is new there or left out, and one
-    for all.
+    """Mirror ended trials that the tracker lacks; yields a line for each mirrored or left-out trial, and a summary.
 
-    Raises MirrorError where the tracker does not take it.
+    Raises MirrorError if the tracker refuses a trial.
     """
-    new = known = 0
+    new = already_there = 0
     for folder in folders:
         state = folder.state()
         if state == "damaged":
@@ -127,10 +126,10 @@ def sync(folders: Iterable[TrialFolder], uri: str | None) -> Iterator[str]:
             yield f"left out: {error}"
             continue
         options = values["tracking"] | ({"uri": uri} if uri else {})
-        # A runs folder of somebody else's must not send what is here, or our passwords, to an address of theirs.
-        if strange := untyped_address(options, uri):
+        # The runs folder may be somebody else's: it must not make us send files or passwords to an address of theirs.
+        if address := untyped_address(options, uri):
             yield (
-                f"left out: {folder.label}: its configuration names the tracker {strange}, and --uri {strange} was "
+                f"left out: {folder.label}: its configuration names the tracker {address}, and --uri {address} was "
                 "not typed"
             )
             continue
@@ -139,16 +138,16 @@ def sync(folders: Iterable[TrialFolder], uri: str | None) -> Iterator[str]:
         except BusyError:
             yield f"{folder.label} is being mirrored by another process"
             continue
-        except Exception as error:  # whatever the tracker raises
-            raise refused(folder, options, error) from error
-        new, known = new + is_new, known + (not is_new)
+        except Exception as error:  # any error of the tracker's client
+            raise refusal(folder, options, error) from error
+        new, already_there = new + is_new, already_there + (not is_new)
         if is_new:
             yield f"mirrored {folder.label}"
-    yield f"{counted(new, 'trial')} mirrored now, {known} before"
+    yield f"{counted(new, 'trial')} mirrored now, {already_there} before"
 
 
 def mirror_ended(folder: TrialFolder, options: dict[str, Any], values: dict[str, Any]) -> bool:
-    """Mirror what is missing of an ended trial; False if nothing was. Raises what `TrackerRun` raises."""
+    """Mirror an ended trial; returns False if the tracker lacked nothing. Raises the errors of `TrackerRun`."""
     run = TrackerRun(folder, options, values)
     try:
         if run.is_complete:
@@ -159,8 +158,8 @@ def mirror_ended(folder: TrialFolder, options: dict[str, Any], values: dict[str,
         run.close()
 
 
-def refused(folder: TrialFolder, options: dict[str, Any], error: Exception) -> MirrorError:
-    """The error of a trial that the tracker does not take: one line, whatever library it comes from."""
+def refusal(folder: TrialFolder, options: dict[str, Any], error: Exception) -> MirrorError:
+    """A MirrorError, in one line, for an ``error`` of the tracker's client about a trial."""
     lines = str(error).strip().splitlines()
     reason = f"{type(error).__name__}: {lines[0][:200] if lines else ''}"
     return MirrorError(f"{name_of(options)} does not take {folder.label} ({reason})")
@@ -168,63 +167,65 @@ def refused(folder: TrialFolder, options: dict[str, Any], error: Exception) -> M
 
 # ---- beside a sweep
 
-Input = Queue[str | None]  # lines, and None for the end
+Lines = Queue[str | None]  # of stdin; None is the end
 
 
 def follow() -> NoReturn:
-    """Mirror the trials whose folders come as lines of the input, until they have ended and no more lines come.
+    """Mirror the trials whose folders come as lines on stdin, until stdin ends and the trials have ended.
 
-    The words of the command: the time between two looks, and the patience of the process that waits for this one, in s.
+    Arguments of the process: the time between two readings of the files, and how long the parent waits for this process
+    at the end; both in seconds.
     """
     pause, patience = map(float, sys.argv[2:4])
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    told: Input = Queue()
-    threading.Thread(target=_read_input, args=(told, patience), daemon=True).start()
+    lines: Lines = Queue()
+    threading.Thread(target=_read_input, args=(lines, patience), daemon=True).start()
     code = 0
     try:
-        _follow(told, pause)
-    except Exception as error:  # noqa: BLE001 - whatever the tracker raises
+        _follow(lines, pause)
+    except Exception as error:  # noqa: BLE001 - any error of the tracker's client
         code = TRACKER_FAILED
         traceback.print_exc()
         print(" ".join(str(error).split()), file=sys.stderr, flush=True)
-    os._exit(code)  # no library is torn down: one might hang or crash in it
+    os._exit(code)  # skips the clean-up of libraries, which might hang or crash
 
 
-def _follow(told: Input, pause: float) -> None:
-    trials: list[_Followed] = []
+def _follow(lines: Lines, pause: float) -> None:
+    trials: list[_FollowedTrial] = []
     last = False
     while not last:
         with suppress(Empty):
-            place = told.get(timeout=pause)
-            while place is not None:
-                trials.append(_Followed(TrialFolder(Path(place))))
-                place = told.get_nowait()
+            path = lines.get(timeout=pause)
+            while path is not None:
+                trials.append(_FollowedTrial(TrialFolder(Path(path))))
+                path = lines.get_nowait()
             last = True
         for trial in trials:
             try:
                 trial.catch_up(last)
             except BusyError:
                 pass
-            except Exception as error:  # whatever the tracker raises: it is tried again, and at last said
+            except Exception as error:  # any error of the tracker's client: tried again, and raised the last time
                 if last:
-                    raise refused(trial.folder, trial.options, error) from error
+                    raise refusal(trial.folder, trial.options, error) from error
         trials = [trial for trial in trials if not trial.has_ended]
 
 
-class _Followed:
-    """A trial that is to be mirrored; its run is opened when the trial runs or has ended, or at the end of all."""
+class _FollowedTrial:
+    """A trial to mirror. Its run is opened once the trial runs or has ended, or when the sweep ends."""
 
     def __init__(self, folder: TrialFolder) -> None:
         self.folder, self.has_ended = folder, False
         self.options: dict[str, Any] = {}
-        self._told = time.time()
+        self._added_at = time.time()
         self._run: TrackerRun | None = None
 
     def catch_up(self, last: bool) -> None:
-        """Send what the files have gained, and that the trial has ended; ``last`` says that all trials have."""
-        state = self.folder.state()  # before the curves are read, so that an ended trial's are whole
-        waits = state != "running" and self._run is None and not self._has_ended_since()
-        if not (self.folder.path / CONFIG).exists() or (waits and not last):  # for its turn
+        """Send the new records, and the trial's end once it has ended. ``last`` says that the sweep has ended."""
+        # The state is read before the curves: if it says that the trial has ended, the curves are complete.
+        state = self.folder.state()
+        is_waiting = state != "running" and self._run is None and not self._has_ended_since()
+        if not (self.folder.path / CONFIG).exists() or (is_waiting and not last):
             return
         if self._run is None:
             values = self.folder.configuration()
@@ -237,17 +238,19 @@ class _Followed:
             self.has_ended = True
 
     def _has_ended_since(self) -> bool:
-        """Return whether the trial has ended since it was told of: what it left before is of an earlier run."""
+        """Return whether the trial has ended since it was added. Older result files are of an earlier run."""
         for name in (RESULTS, FAILED):
             with suppress(OSError):
-                if (self.folder.path / name).stat().st_mtime >= self._told:
+                if (self.folder.path / name).stat().st_mtime >= self._added_at:
                     return True
         return False
 
 
-def _read_input(told: Input, patience: float) -> None:
+def _read_input(lines: Lines, patience: float) -> None:
     for line in sys.stdin:
-        told.put(line.rstrip("\n"))
-    told.put(None)
+        lines.put(line.rstrip("\n"))
+    lines.put(None)
+    # The parent kills this process after its patience. If the parent was killed itself, this ends the process, even
+    # while the tracker's client hangs.
     time.sleep(patience + SECONDS_AFTER_PARENT)
-    os._exit(1)  # whatever hangs
+    os._exit(1)

@@ -1,11 +1,11 @@
-"""The side of the trials: a process beside them follows their files; at the end it is waited for, a bounded time.
+"""The mirror as the trials see it: it starts the follower process, and at the end waits for it a bounded time.
 
-Why a process: a tracker's client may hang in a socket, a lock or a C library for as long as the other side likes. A
-thread that does so cannot be ended, and one that is inside a C library when the interpreter exits takes the whole
-process down, after a trial that was complete. A process can be killed.
+Why a process: a tracker's client may hang in a socket, a lock or a C library for any time. A hanging thread cannot be
+ended, and a thread that is inside a C library when the interpreter exits crashes the process, after a trial that was
+complete. A process can be killed.
 
-It is told which folders to follow, and finds all else in files. How it ended is its exit code, and why is the last line
-of what it wrote to stderr.
+The follower gets the folders to follow on stdin, and reads everything else from files. Its exit code says how it ended,
+and the last line on its stderr says why.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ from gsbench.tracking.trial import name_of
 
 log = logging.getLogger(__name__)
 
-TRACKER_FAILED = 3  # exit code where the tracker, or a file, is at fault: the last line on stderr says why
-SECONDS_TO_STOP = 3.0  # patience where a signal asks to end
+TRACKER_FAILED = 3  # exit code if the tracker, or a file, is at fault: the last line on stderr says why
+SECONDS_TO_STOP = 3.0  # patience after a signal that asks to end
 
 
 class MirrorError(Exception):
-    """Error of a mirror that could not be written; the text is the reason, in one line."""
+    """The error of a mirror that could not be written. Its text is the reason, in one line."""
 
 
 class Mirror:
-    """Mirrors the trials that begin while the ``with`` block runs, all by one process; none if it is ``idle``.
+    """Mirrors the trials that begin within a ``with`` block, all by one process; none if it is ``idle``.
 
-    On leaving it, the tracker is waited for a bounded time. Whatever the tracker does, nothing is raised: one line in
-    the log says what is missing.
+    At the end of the block, it waits a bounded time for the tracker. Errors of the tracker are never raised: one line
+    in the log says what is missing.
     """
 
     def __init__(self, idle: bool = False) -> None:
@@ -68,18 +68,18 @@ class Mirror:
 
     def _start(self) -> subprocess.Popen[bytes]:
         """A fresh interpreter that runs `gsbench.tracking.follower.follow`. Raises OSError where it cannot start."""
-        self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - the process's for all its life
+        self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - open as long as the process runs
         words = (str(self._options["flush_seconds"]), str(self._options["patience_seconds"]))
         return subprocess.Popen(
             python_command("gsbench.tracking.follower", "follow", *words),
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,  # what MLflow prints
             stderr=self._errors,
-            start_new_session=True,  # Ctrl-C is for the trial, which then ends us
+            start_new_session=True,  # Ctrl-C must reach only the trials' process, which then ends this one
         )
 
     def _finish(self, seconds: float) -> None:
-        """Tell the process that its input has ended, and wait for its end; after ``seconds`` it is ended."""
+        """Close the process's input, wait for its end ``seconds`` at most, then kill it."""
         process, self._process = self._process, None
         assert process is not None
         try:
@@ -93,14 +93,14 @@ class Mirror:
             with suppress(OSError):
                 process.stdin.close()  # type: ignore[union-attr]
             self._errors.seek(0)
-            said = self._errors.read()
+            stderr = self._errors.read()
             self._errors.close()
         if process.returncode == TRACKER_FAILED:
-            text = said.decode("utf-8", "replace").strip()
+            text = stderr.decode("utf-8", "replace").strip()
             log.debug("tracking failed:\n%s", text)
             self._warn(text.splitlines()[-1])
         elif process.returncode != 0:
-            self._warn(f"the mirror {describe_exit(process.returncode)}; its last lines: {telling_lines(said)}")
+            self._warn(f"the mirror {describe_exit(process.returncode)}; its last lines: {telling_lines(stderr)}")
 
     def _warn(self, error: object) -> None:
         log.warning("tracking: %s; the files are complete, `gsbench sync` mirrors them later", error)

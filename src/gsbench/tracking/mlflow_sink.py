@@ -1,7 +1,7 @@
-"""MLflow: the tracker's address, a client of it, and a trial as a run there.
+"""MLflow: the tracker's address, its client, and a trial as an MLflow run.
 
-Each metric's time is a function of the files, so that MLflow, which drops exact repetitions, holds it once even if it
-was sent twice. Which run it is stands in the trial's folder, so that none is begun twice.
+A metric's time is computed from the trial's files, not from the clock. MLflow drops exact repetitions, so a metric that
+is sent twice is stored once. The trial's folder keeps the run's id, so that no trial gets two runs.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from gsbench.errors import InputError
 from gsbench.files import atomic, require_own, write_json
 from gsbench.runs import layout
 from gsbench.runs.layout import ARTIFACTS, DATABASE
-from gsbench.tracking.trial import Point, Summary, TrackedTrial
+from gsbench.tracking.trial import Scalar, Summary, TrackedTrial
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
 
 VARIABLE = "MLFLOW_TRACKING_URI"
 LOCK = ".mlflow.lock"  # in the runs folder: one process at a time makes tables and experiments
-KIND = {"mlflow.experimentKind": "custom_model_development"}  # else its page opens as that of a chat program
-# Settings against printing, phoning home and hanging for minutes.
+KIND = {"mlflow.experimentKind": "custom_model_development"}  # else its page opens in the view for chat models
+# Environment against printing, telemetry and hanging for minutes.
 SETTINGS = {
     "MLFLOW_DISABLE_TELEMETRY": "true",
     "MLFLOW_LOGGING_LEVEL": "WARNING",
@@ -39,7 +39,7 @@ SETTINGS = {
     "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "2",
     "MLFLOW_HTTP_REQUEST_TIMEOUT": "20",
     "PGCONNECT_TIMEOUT": "20",
-    # A machine that vanished within a transaction would hold its rows until TCP gives up, after hours.
+    # A machine that vanishes within a transaction would lock its rows until TCP gives up, after hours.
     "PGOPTIONS": "-c idle_in_transaction_session_timeout=60s",
 }
 
@@ -54,9 +54,9 @@ def tracker_uri(uri: str | None, runs: Path) -> str:
 
 
 def untyped_address(options: Mapping[str, Any], typed: str | None = None) -> str | None:
-    """The tracker's address that the settings ``tracking`` of a file name; None where it may be used.
+    """The tracker's address in the settings ``tracking`` of a file, if it may not be used; else None.
 
-    That is so where they name none, the one that was ``typed``, or that of the environment.
+    It may be used if it is the ``typed`` one or that of the environment.
     """
     address = options.get("uri")
     if not options.get("enabled", True) or not address or address in (typed, os.environ.get(VARIABLE)):
@@ -65,55 +65,55 @@ def untyped_address(options: Mapping[str, Any], typed: str | None = None) -> str
 
 
 def connect(uri: str | None, runs: Path) -> MlflowClient:
-    """A client of the tracker; creates a new database under a lock, since MLflow's own set-up races."""
+    """A client of the tracker. Creates a missing database under a lock, since MLflow's own set-up has races."""
     for name, value in SETTINGS.items():
         os.environ.setdefault(name, value)
     import mlflow
 
-    for logger in ("mlflow", "alembic"):  # importing mlflow has set their levels
+    for logger in ("mlflow", "alembic"):  # only now: importing mlflow sets their levels
         logging.getLogger(logger).setLevel(logging.WARNING)
     address = tracker_uri(uri, runs)
     for name in (DATABASE, ARTIFACTS):
         require_own(runs, runs / name)
     with FileLock(runs / LOCK):
         _create_sqlite(address)
-        client = mlflow.MlflowClient(tracking_uri=address)  # with the first client come the tables
+        client = mlflow.MlflowClient(tracking_uri=address)  # the first client creates the tables
         client.search_experiments(max_results=1)
     return client
 
 
 def ensure_experiment(client: MlflowClient, name: str, runs: Path) -> str:
-    """The id of experiment ``name``, created once under a lock; a deleted one is restored."""
+    """The id of experiment ``name``, which is created under a lock if missing, and restored if deleted."""
     from mlflow.exceptions import MlflowException
 
     with FileLock(runs / LOCK):
-        found = client.get_experiment_by_name(name)
-        if found is None:
-            served = str(client.tracking_uri).startswith(("http:", "https:"))  # then the server says where
+        experiment = client.get_experiment_by_name(name)
+        if experiment is None:
+            served = str(client.tracking_uri).startswith(("http:", "https:"))  # a server chooses the location itself
             location = None if served else (runs / ARTIFACTS / name).as_uri()
-            with suppress(MlflowException):  # a rival on another machine was first, or what follows says what is wrong
+            with suppress(MlflowException):  # a process on another machine may have created it in the meantime
                 return str(client.create_experiment(name, artifact_location=location, tags=KIND))
-            found = client.get_experiment_by_name(name)
-        if found is None:
+            experiment = client.get_experiment_by_name(name)
+        if experiment is None:
             raise RuntimeError(f"MLflow could not create the experiment {name}")
-        if found.lifecycle_stage != "active":
-            client.restore_experiment(found.experiment_id)
+        if experiment.lifecycle_stage != "active":
+            client.restore_experiment(experiment.experiment_id)
         for key, value in KIND.items():
-            if key not in found.tags:  # somebody else's experiment of this name
-                client.set_experiment_tag(found.experiment_id, key, value)
-        return str(found.experiment_id)
+            if key not in experiment.tags:  # another program's experiment of this name
+                client.set_experiment_tag(experiment.experiment_id, key, value)
+        return str(experiment.experiment_id)
 
 
 def require_own_artifacts(client: MlflowClient, address: str, runs: Path) -> None:
-    """Raise InputError where a run of the runs folder's own database has its artifacts outside of that folder.
+    """Raise InputError if a run in the runs folder's own database has its artifacts outside of that folder.
 
-    ``address`` is what the run says. Another tracker was typed, and says itself where artifacts go.
+    ``address`` is the run's artifact location. Other trackers are not checked: the user typed them.
     """
     from mlflow.utils.file_utils import local_file_uri_to_path
 
     if client.tracking_uri != default_uri(runs):
         return
-    # The database of a stranger's runs folder may name a server, which would get the files and our password.
+    # The runs folder may be somebody else's, and its database name a server that would get files and our password.
     place = Path(local_file_uri_to_path(address))
     if not place.is_relative_to(runs / ARTIFACTS) or ".." in place.parts:
         raise InputError(
@@ -124,18 +124,18 @@ def require_own_artifacts(client: MlflowClient, address: str, runs: Path) -> Non
 
 
 def user_tags() -> dict[str, str]:
-    """The user's name, where the system has one."""
+    """The tag with the user's name, if the system has one."""
     try:
         return {"mlflow.user": getpass.getuser()}
-    except (KeyError, OSError, ImportError):  # a container's nameless user; Windows
+    except (KeyError, OSError, ImportError):  # a user without a name in a container; Windows
         return {}
 
 
 def _create_sqlite(uri: str) -> None:
-    """Make the database file of a SQLite address, if it is missing, whole or not at all.
+    """Make the database file of a SQLite address if it is missing, completely or not at all.
 
-    MLflow's migrations of SQLite are no transaction: a process that was killed within them would leave tables that no
-    later one can use.
+    MLflow's migrations of SQLite are no transaction: a process that is killed during them leaves tables that no later
+    process can use.
     """
     import sqlalchemy
     from mlflow.store.tracking.sqlalchemy_store import SqlAlchemyStore
@@ -152,16 +152,16 @@ def _create_sqlite(uri: str) -> None:
 
 # ---- a trial
 
-STATE = "mlflow.json"  # in the trial's folder: the run that mirrors it and how far
-OWN_DATABASE = "runs/mlflow.db"
+STATE = "mlflow.json"  # in the trial's folder: which run mirrors it, and how far
+OWN_DATABASE = "runs/mlflow.db"  # stands in the state for the database of the runs folder
 TOKEN_TAG = "gsbench.token"
-PARAMS_TAG = "gsbench"  # set when all settings are there
+PARAMS_TAG = "gsbench"  # set once all settings are logged
 ERROR_TAG = "error"
 MAX_TAG = 5000  # characters of a tag (MLflow's limit)
 MAX_VALUE = 6000  # characters of a parameter (MLflow's limit)
 MAX_PARAMS = 100  # parameters in a batch
 MAX_METRICS = 1000  # metrics in a batch
-NOT_IN_A_KEY = re.compile(r"[^a-zA-Z0-9_\-./ ]")  # what MLflow refuses in a picture's name
+NOT_IN_A_KEY = re.compile(r"[^a-zA-Z0-9_\-./ ]")  # characters that MLflow refuses in a picture's name
 
 
 class MlflowSink:
@@ -176,7 +176,7 @@ class MlflowSink:
         self._started = 0  # ms since 1970
 
     def open(self, state: dict[str, Any], results: str | None) -> dict[str, Any]:
-        """Open the run (see `gsbench.tracking.trial.Sink`); a deleted one and one in another tracker count as none."""
+        """Open the run (see `gsbench.tracking.trial.Sink`). A deleted run, or one in another tracker, is replaced."""
         uri = self._uri()
         experiment_id = ensure_experiment(self.client, self._trial.values["name"], self._trial.folder.runs)
         run = None
@@ -188,7 +188,7 @@ class MlflowSink:
         if run is None:
             token = uuid.uuid4().hex
             state = {"uri": uri, "token": token, "started": int(time.time() * 1000), "complete": None, "logged": {}}
-            # Before the run is there, so that it is found again if nobody hears of its creation.
+            # Written before the run is created, so that its token finds it even if the server's answer is lost.
             write_json(self._trial.folder.path / STATE, state)
             run = self._create_run(experiment_id, token)
         self.run_id, self._started = run.info.run_id, state["started"]
@@ -199,22 +199,22 @@ class MlflowSink:
             self.client.update_run(self.run_id, status="RUNNING")
         return state
 
-    def log(self, points: Sequence[Point]) -> None:
+    def log(self, scalars: Sequence[Scalar]) -> None:
         """Log numbers in batches."""
         from mlflow.entities import Metric
 
-        metrics = [Metric(point.key, point.value, self._time_of(point.seconds), point.step) for point in points]
+        metrics = [Metric(scalar.key, scalar.value, self._time_of(scalar.seconds), scalar.step) for scalar in scalars]
         for start in range(0, len(metrics), MAX_METRICS):
             self.client.log_batch(self.run_id, metrics=metrics[start : start + MAX_METRICS])
 
     def complete(self, summary: Summary) -> None:
-        """Log final metrics, pictures as a grid and files, and close the run."""
+        """Log the final metrics, pictures and files, and close the run."""
         from mlflow.entities import RunTag
         from PIL import Image
 
         if ERROR_TAG in self.client.get_run(self.run_id).data.tags:  # an earlier attempt failed
             self.client.delete_tag(self.run_id, ERROR_TAG)
-        self.log(summary.points)
+        self.log(summary.scalars)
         self.client.log_batch(self.run_id, tags=[RunTag(key, value) for key, value in summary.tags.items()])
         for folder, path in summary.files:
             self.client.log_artifact(self.run_id, str(path), folder or None)
@@ -226,7 +226,7 @@ class MlflowSink:
         self.client.set_terminated(self.run_id, "FINISHED")
 
     def stop(self, status: str, reason: str | None) -> None:
-        """Close the run; the ``reason`` of a failure becomes a tag, and its files are shown."""
+        """Close the run. The ``reason`` of a failure becomes a tag, and its files are uploaded."""
         if reason is not None:
             self.client.set_tag(self.run_id, ERROR_TAG, reason[:MAX_TAG])
             for name in (layout.CONFIG, layout.FAILED, layout.LOG):
@@ -235,9 +235,9 @@ class MlflowSink:
         self.client.set_terminated(self.run_id, status)
 
     def _find_run(self, experiment_id: str, token: str) -> Any:
-        """The run that has the token; None where there is none, or it was deleted."""
-        found = self.client.search_runs([experiment_id], f"tags.`{TOKEN_TAG}` = '{token}'", max_results=1)
-        return found[0] if found else None
+        """The run with this token; None if there is none or it was deleted."""
+        runs = self.client.search_runs([experiment_id], f"tags.`{TOKEN_TAG}` = '{token}'", max_results=1)
+        return runs[0] if runs else None
 
     def _create_run(self, experiment_id: str, token: str) -> Any:
         trial, client = self._trial, self.client
@@ -253,10 +253,10 @@ class MlflowSink:
         self.client.set_tag(self.run_id, PARAMS_TAG, "1")
 
     def _time_of(self, seconds: float) -> int:
-        """The time in ms of what happened after ``seconds`` of training."""
+        """The time, in ms since 1970, ``seconds`` of training after the run's start."""
         return int(self._started + 1000 * seconds)
 
     def _uri(self) -> str:
-        """Address of the run: the tracker's address, or a word for the runs folder's own, which may move with it."""
+        """The address to keep in the state: the tracker's, or `OWN_DATABASE`, since a runs folder may be moved."""
         uri = str(self.client.tracking_uri)
         return OWN_DATABASE if uri == default_uri(self._trial.folder.runs) else uri

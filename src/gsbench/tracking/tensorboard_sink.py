@@ -1,4 +1,4 @@
-"""A trial as event files of TensorBoard, in ``tensorboard/`` of the runs folder."""
+"""A trial as TensorBoard event files, in ``tensorboard/`` of the runs folder."""
 
 import shutil
 import time
@@ -7,11 +7,11 @@ from typing import Any
 
 from gsbench.files import require_own
 from gsbench.runs.layout import TENSORBOARD
-from gsbench.tracking.trial import Point, Summary, TrackedTrial
+from gsbench.tracking.trial import Scalar, Summary, TrackedTrial
 
 
 class TensorBoardSink:
-    """The event files of one trial. They cannot be mended: a trial that is gone on with is written anew."""
+    """The event files of one trial. They cannot be edited, so a continued trial is written anew."""
 
     state_file = "tensorboard.json"
 
@@ -35,18 +35,18 @@ class TensorBoardSink:
             self._writer.add_text(name, f"| | |\n|---|---|\n{table}")
         return {"complete": None, "logged": {}}
 
-    def log(self, points: Sequence[Point]) -> None:
-        """Write numbers, and see that they are in the file."""
-        for point in points:
-            self._writer.add_scalar(point.key, point.value, point.step, self._started + point.seconds)
+    def log(self, scalars: Sequence[Scalar]) -> None:
+        """Write numbers, and flush them to the file."""
+        for scalar in scalars:
+            self._writer.add_scalar(scalar.key, scalar.value, scalar.step, self._started + scalar.seconds)
         self._writer.flush()
 
     def complete(self, summary: Summary) -> None:
-        """Write final numbers, and the pictures of the test views."""
+        """Write the final numbers and the pictures of the test views."""
         import numpy as np
         from PIL import Image
 
-        self.log(summary.points)
+        self.log(summary.scalars)
         for name, path in summary.pictures.items():
             with Image.open(path) as image:
                 self._writer.add_image(name, np.asarray(image.convert("RGB")), summary.step, dataformats="HWC")

@@ -1,4 +1,4 @@
-"""A trial in a tracker's terms: what its files say, how far that was sent, and the contract of a tracker."""
+"""A trial in a tracker's terms: its scalars, tags and files, the state of its mirror, and the contract of a tracker."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -12,7 +12,7 @@ from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import TrialRecord, read_rows
 
 FILES = (layout.CONFIG, layout.RESULTS, layout.INIT_REPORT, layout.PER_VIEW, layout.EVENTS)
-CURVES = {layout.CURVES: "train", layout.EVENTS: "events"}
+CURVES = {layout.CURVES: "train", layout.EVENTS: "events"}  # file: prefix of its scalars' names
 
 
 DEFAULT = "mlflow"
@@ -20,8 +20,8 @@ NAMES = {DEFAULT: "MLflow", "tensorboard": "TensorBoard", "wandb": "Weights & Bi
 
 
 @dataclass(frozen=True)
-class Point:
-    """One number of a trial: its name, the iteration, and the seconds of training until then."""
+class Scalar:
+    """One number of a trial: its name, its value, the iteration, and the seconds of training until then."""
 
     key: str
     value: float
@@ -31,25 +31,23 @@ class Point:
 
 @dataclass(frozen=True)
 class Summary:
-    """Summary of a complete trial: final numbers, tags, pictures of the test views by name, other files by
-    folder ("" for none).
-    """
+    """Summary of a complete trial: what a tracker shows at its end."""
 
-    points: Sequence[Point]
+    scalars: Sequence[Scalar]
     tags: dict[str, str]
-    pictures: dict[str, Path]
-    files: Sequence[tuple[str, Path]]
+    pictures: dict[str, Path]  # of the test views, by name
+    files: Sequence[tuple[str, Path]]  # (folder in the tracker, "" for none; file)
     step: int
     seconds: float
 
 
 class Sink(Protocol):
-    """One trial in a tracker. Each method may raise whatever the tracker's client raises.
+    """One trial in a tracker. Each method may raise any error of the tracker's client.
 
-    It is closed by no one: its process ends without tearing anything down, so each method sends what it is given.
+    A sink is never closed, since its process ends without clean-up. So each method must send at once what it gets.
 
     Examples:
-        One that prints:
+        A sink that prints:
 
         >>> class Printed:
         ...     state_file = "printed.json"
@@ -57,42 +55,42 @@ class Sink(Protocol):
         ...     def open(self, state, results):
         ...         return state
         ...
-        ...     def log(self, points):
-        ...         for point in points:
-        ...             print(f"{point.step}: {point.key} {point.value}")
+        ...     def log(self, scalars):
+        ...         for scalar in scalars:
+        ...             print(f"{scalar.step}: {scalar.key} {scalar.value}")
         ...
         ...     def complete(self, summary):
-        ...         self.log(summary.points)
+        ...         self.log(summary.scalars)
         ...
         ...     def stop(self, status, reason):
         ...         print(status, reason)
 
         >>> sink: Sink = Printed()
-        >>> sink.log([Point("loss", 0.5, step=100, seconds=1.0)])
+        >>> sink.log([Scalar("loss", 0.5, step=100, seconds=1.0)])
         100: loss 0.5
     """
 
-    state_file: str  # in the trial's folder: what `open` returned, "complete" and "logged" kept by `TrackedTrial`
+    state_file: str  # in the trial's folder, for the state that `open` returns; see `MirrorState`
 
     def open(self, state: dict[str, Any], results: str | None) -> dict[str, Any]:
-        """Begin the trial's run, or go on with the one that ``state`` tells of; returns the state to keep.
+        """Begin a run for the trial, or continue the run that ``state`` names; returns the state to keep.
 
-        ``results`` is the hash of the trial's results, if there are any: where ``state["complete"]`` is another, the
-        run shows results that are no longer the trial's, and is replaced.
+        ``results`` is the hash of the trial's results, None without results. If ``state["complete"]`` is another hash,
+        the run shows results that are no longer the trial's, and is replaced.
         """
 
-    def log(self, points: Sequence[Point]) -> None:
-        """Take numbers; some may be repetitions, where a process was killed after it had sent them."""
+    def log(self, scalars: Sequence[Scalar]) -> None:
+        """Log numbers. Some may be repetitions: a process may be killed between sending and noting that."""
 
     def complete(self, summary: Summary) -> None:
-        """Show what came out, and that the trial is done."""
+        """Show the results, and that the trial is done."""
 
     def stop(self, status: str, reason: str | None) -> None:
         """Show that the trial ended without results: ``status`` KILLED, or FAILED for a ``reason``."""
 
 
 def name_of(options: dict[str, Any]) -> str:
-    """The tracker's name, for people."""
+    """The tracker's name in messages."""
     return NAMES[options.get("sink", DEFAULT)]
 
 
@@ -110,12 +108,12 @@ class TrackedTrial:
 
     @property
     def label(self) -> str:
-        """The run's name: the seed first, since trackers cut names at their end."""
+        """The run's name. The seed comes first, since trackers cut long names at their end."""
         return f"seed {self.values['seed']} {self.values['scene']['name']} {self.arm}"
 
     @property
     def path(self) -> str:
-        """The trial's folder as seen from the runs folder."""
+        """The trial's folder, relative to the runs folder."""
         return self.folder.path.relative_to(self.folder.runs).as_posix()
 
     def tags(self) -> dict[str, str]:
@@ -124,42 +122,45 @@ class TrackedTrial:
         return {"kind": "trial", **names, "seed": str(self.values["seed"]), "folder": self.path}
 
     def params(self) -> dict[str, str]:
-        """The settings that have a value, by their dotted keys; the arm is first in charts."""
+        """The settings that have a value, by their dotted keys. The arm comes first, for charts."""
         return {"arm": self.arm} | {key: str(value) for key, value in flatten(self.values).items() if str(value)}
 
     def results_hash(self) -> str | None:
-        """The hash of the results, by which a mirror knows whether it shows them; None where there are none."""
+        """The hash of the results, by which a mirror knows whether it shows them; None without results."""
         results = self.folder.sound_record()
         return None if results is None else sha256_of(results.to_json())
 
-    def curves(self, logged: dict[str, int]) -> Iterator[tuple[str, int, list[Point]]]:
-        """Read each file of curves: its name, its newest iteration, and its points after ``logged[name]``."""
-        building = self.folder.building()  # a training in progress writes elsewhere
+    def curves(self, logged: dict[str, int]) -> Iterator[tuple[str, int, list[Scalar]]]:
+        """Yield for each file of curves with new records: its name, its newest iteration, and the new scalars.
+
+        Records after the iteration ``logged[name]`` are new.
+        """
+        building = self.folder.building()  # a training in progress writes to its own folder in the store
         sources = [Path(building.folder)] if building.stage == TRAIN.name else []
         for name, prefix in CURVES.items():
             source = next((folder / name for folder in (*sources, self.folder.path) if (folder / name).exists()), None)
             records = [] if source is None else [r for r in read_rows(source) if r["step"] > logged.get(name, 0)]
             if records:
-                points = [
-                    Point(f"{prefix}/{key}", float(value), int(record["step"]), _seconds(record))
+                scalars = [
+                    Scalar(f"{prefix}/{key}", float(value), int(record["step"]), _seconds(record))
                     for record in records
                     for key, value in record.items()
                     if key != "step"
                 ]
-                yield name, int(records[-1]["step"]), points
+                yield name, int(records[-1]["step"]), scalars
 
     def summary(self, results: TrialRecord, images: int, with_model: bool) -> Summary:
-        """The summary of the finished trial, with ``images`` test views at most, and the model if ``with_model``."""
+        """The summary of the finished trial, with at most ``images`` test views, and the model if ``with_model``."""
         step, seconds = results.iterations, results.seconds.get("train", results.iterations / 1000)
         numbers = dict(results.metrics) | {
             key: value
             for key in ("num_gaussians", "num_init_points", "peak_memory_mb")
-            if (value := getattr(results, key)) is not None  # not known of renders that another program made
+            if (value := getattr(results, key)) is not None  # None: unknown, for renders of another program
         }
         numbers |= {f"seconds_{key}": value for key, value in results.seconds.items()}
         numbers |= {f"total/{key}": value for key, value in results.events.items()}
-        points = [
-            Point(key, float(value), int(at), seconds * int(at) / max(1, step))
+        scalars = [
+            Scalar(key, float(value), int(at), seconds * int(at) / max(1, step))
             for at, measured in results.metrics_at.items()
             for key, value in measured.metrics.items()
         ]
@@ -167,7 +168,7 @@ class TrackedTrial:
         names = (*FILES, *([layout.POINT_CLOUD] if with_model else []))
         files = [("", self.folder.path / name) for name in names if (self.folder.path / name).exists()]
         return Summary(
-            points=points + [Point(key, float(value), step, seconds) for key, value in numbers.items()],
+            scalars=scalars + [Scalar(key, float(value), step, seconds) for key, value in numbers.items()],
             tags=tags | {f"hash_{key}": value for key, value in results.hashes.items()},
             pictures={
                 f"{kind}/{path.stem}": path
@@ -181,18 +182,16 @@ class TrackedTrial:
 
 
 def _seconds(record: Mapping[str, float]) -> float:
-    """The training time of a record, or else a function of its iteration: the same whenever it is read."""
+    """The training time of a record. Without one, a function of its iteration, so that each reading gives the same."""
     return float(record.get("seconds", record["step"] / 1000))
 
 
 @dataclass(frozen=True, kw_only=True)
 class MirrorState(Record):
-    """State that any sink keeps: ``complete`` is the hash of the results that it shows, ``logged`` the newest iteration
-    by file; the rest says which run it is, in the sink's own words.
-    """
+    """The state of a mirror. `TrackerRun` keeps the first two fields; a sink uses the others to find its run again."""
 
-    complete: str | None = None
-    logged: dict[str, Count] = field(default_factory=dict)
+    complete: str | None = None  # hash of the results that the run shows
+    logged: dict[str, Count] = field(default_factory=dict)  # newest iteration sent, by file
     uri: str | None = None
     token: str | None = None
     started: Count | None = None  # ms since 1970
@@ -204,6 +203,6 @@ class MirrorState(Record):
 
 
 def read_state(file: Path) -> dict[str, Any]:
-    """Read the state in ``file``; empty, as if nothing were mirrored yet, where it is absent or damaged."""
+    """Read the state in ``file``. It is empty, as if nothing were mirrored yet, for an absent or damaged file."""
     state = read_if_sound(file, MirrorState)
     return {} if state is None else {"complete": None, "logged": {}} | state.to_json()

@@ -1,4 +1,4 @@
-"""A trial as a run of Weights & Biases: its server is ``tracking.uri``, or what WANDB_BASE_URL and WANDB_MODE say."""
+"""A trial as a run of Weights & Biases. ``tracking.uri`` is its server, else WANDB_BASE_URL and WANDB_MODE decide."""
 
 import os
 import uuid
@@ -7,9 +7,9 @@ from typing import Any
 
 from gsbench.files import require_own
 from gsbench.runs.layout import WANDB
-from gsbench.tracking.trial import Point, Summary, TrackedTrial
+from gsbench.tracking.trial import Scalar, Summary, TrackedTrial
 
-STEP = "iteration"  # the axis of our curves: their own counter only goes up, and we read two files
+STEP = "iteration"  # our own axis: W&B's step must only grow, and the two files of curves are read one after the other
 
 
 class WandbSink:
@@ -24,7 +24,7 @@ class WandbSink:
         self._run: Any = None
 
     def open(self, state: dict[str, Any], results: str | None) -> dict[str, Any]:
-        """Open the run (see `gsbench.tracking.trial.Sink`). One that shows former results stays beside the new one."""
+        """Open the run (see `gsbench.tracking.trial.Sink`). A run with earlier results stays beside the new one."""
         if state.get("complete") is not None:
             if state["complete"] == results:
                 return state
@@ -50,29 +50,30 @@ class WandbSink:
         self._run.define_metric("*", step_metric=STEP)
         return state
 
-    def log(self, points: Sequence[Point]) -> None:
-        """Log numbers, those of an iteration together."""
+    def log(self, scalars: Sequence[Scalar]) -> None:
+        """Log numbers, together for each iteration."""
         by_step: dict[int, dict[str, float]] = {}
-        for point in points:
-            by_step.setdefault(point.step, {})[point.key] = point.value
+        for scalar in scalars:
+            by_step.setdefault(scalar.step, {})[scalar.key] = scalar.value
         for step, values in by_step.items():
             self._run.log({STEP: step, **values})
 
     def complete(self, summary: Summary) -> None:
-        """Log final numbers, pictures and files, and finish the run."""
+        """Log the final numbers, pictures and files, and finish the run."""
         import wandb
 
-        self.log(summary.points)
+        self.log(summary.scalars)
         pictures = {name: wandb.Image(str(path)) for name, path in summary.pictures.items()}
         if pictures:
             self._run.log({STEP: summary.step, **pictures})
-        self._run.summary.update({point.key: point.value for point in summary.points if point.step == summary.step})
+        final = {scalar.key: scalar.value for scalar in summary.scalars if scalar.step == summary.step}
+        self._run.summary.update(final)
         self._run.config.update(summary.tags, allow_val_change=True)
         for _, path in summary.files:
             self._run.save(str(path), base_path=str(self._trial.folder.path), policy="now")
         self._run.finish(0)
 
     def stop(self, status: str, reason: str | None) -> None:
-        """Finish the run with what went wrong."""
+        """Finish the run as failed, with the reason or the status."""
         self._run.summary["error" if reason else "status"] = reason or status
         self._run.finish(1)
