@@ -15,7 +15,7 @@ from gsbench.analysis.paper import (
     INTERVAL,
     QUANTITIES,
     ROUNDING,
-    Printed,
+    PrintedNumber,
     agreement,
     load_paper,
     load_published,
@@ -90,8 +90,8 @@ def test_what_the_paper_contradicts_follows_from_its_numbers() -> None:
 
 
 def test_a_printed_number_stands_for_its_rounding_range() -> None:
-    assert Printed("0.27").range == pytest.approx((0.265, 0.275))
-    assert Printed("0.270").range == pytest.approx((0.2695, 0.2705))
+    assert PrintedNumber("0.27").range == pytest.approx((0.265, 0.275))
+    assert PrintedNumber("0.270").range == pytest.approx((0.2695, 0.2705))
 
 
 @pytest.mark.parametrize(
@@ -108,7 +108,7 @@ def test_a_printed_number_stands_for_its_rounding_range() -> None:
     ],
 )
 def test_agreement(measured: Cell, expected: str) -> None:
-    assert agreement(measured, Printed("0.12")) == expected
+    assert agreement(measured, PrintedNumber("0.12")) == expected
 
 
 def test_table1_has_the_papers_rows_and_marks_what_was_not_run(make_experiment: Callable[..., Experiment]) -> None:

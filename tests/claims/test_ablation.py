@@ -15,11 +15,11 @@ from gsbench.claims.ablation import (
     Run,
     choose_switches,
     declared_switches,
-    effective,
+    effective_run,
     judge_runs,
+    markdown_table,
+    off_settings,
     runs_to_train,
-    table,
-    words_of,
 )
 from gsbench.cli import run
 from gsbench.config.command_words import options
@@ -46,11 +46,11 @@ def on(*names: str) -> Run:
 def test_what_acts_within_another_is_trained_only_where_that_is_on() -> None:
     runs = runs_to_train(NESTED)
     assert runs == [on("rule", "shrink", "once"), on("once", "rule"), on("rule", "shrink"), on("rule"), on()]
-    assert effective(on("shrink", "once"), NESTED) == on()
+    assert effective_run(on("shrink", "once"), NESTED) == on()
     alone = {"shrink": NESTED["shrink"]}  # where the rule is not asked about it stays as it is: on
     assert runs_to_train(alone) == [on("shrink"), on()]
-    assert words_of(on("rule"), NESTED) == {"of": 1, "b": 2}
-    assert words_of(on("rule", "shrink", "once"), NESTED) == {}
+    assert off_settings(on("rule"), NESTED) == {"of": 1, "b": 2}
+    assert off_settings(on("rule", "shrink", "once"), NESTED) == {}
 
 
 def test_switches_within_each_other_are_refused() -> None:
@@ -130,7 +130,7 @@ def test_each_combination_is_judged_against_all_parts(tmp_path: Path) -> None:
         "without once, rule and shrink": (-1.4, "refuted"),
     }
     assert verdicts[0].family == 4
-    lines = table(verdicts)
+    lines = markdown_table(verdicts)
     assert lines[0] == "| run | difference in PSNR (dB) from all parts | interval | verdict |"
     assert lines[2].startswith("| without once | ") or lines[2].startswith("| without shrink | −0.4")
 
@@ -142,7 +142,7 @@ def test_a_combination_whose_trials_are_missing_has_no_verdict(tmp_path: Path) -
         path.unlink()
     verdicts = judge_runs(load_experiment(tmp_path, "exp").trials, keys, "psnr")
     assert verdicts[-1].answer is None
-    assert table(verdicts)[-1].endswith("| unknown | unknown | courtyard: seed 0 has no partner |")
+    assert markdown_table(verdicts)[-1].endswith("| unknown | unknown | courtyard: seed 0 has no partner |")
 
 
 @pytest.mark.parametrize(

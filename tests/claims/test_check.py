@@ -15,7 +15,7 @@ import yaml
 from gsbench.claims.check import Check, ClaimVerdict, prepare
 from gsbench.claims.file import parse_claims
 from gsbench.claims.page import make_page, to_html
-from gsbench.claims.stopping import Planned, run_looks
+from gsbench.claims.stopping import KeyAndSeed, run_looks
 from gsbench.cli import run
 from gsbench.config.compose import Trial, with_seed
 from gsbench.errors import InputError
@@ -65,7 +65,7 @@ class FakeRunner:
 def looked(check: Check, runner: FakeRunner) -> list[ClaimVerdict]:
     """Go through the looks; what is done is not run again."""
 
-    def run(planned: Sequence[Planned]) -> None:
+    def run(planned: Sequence[KeyAndSeed]) -> None:
         trials = check.to_run(planned)
         if left := [one for one in trials if not (TrialFolder.of(one.values).path / "results.json").exists()]:
             runner(left)
@@ -130,7 +130,7 @@ def test_settings_that_do_not_compose_name_their_place(tmp_path: Path) -> None:
 
 
 def test_another_seed_is_another_folder_and_the_same_settings(tmp_path: Path) -> None:
-    trial = next(iter(check_of(tmp_path).first.values()))
+    trial = next(iter(check_of(tmp_path).first_trials.values()))
     other = with_seed(trial, 7)
     assert yaml.safe_load(other.yaml)["seed"] == other.values["seed"] == 7
     assert yaml.safe_load(other.yaml) | {"seed": 0} == yaml.safe_load(trial.yaml)

@@ -19,7 +19,7 @@ from gsbench.claims.gate import (
     SPARE,
     WORSE,
     Gate,
-    ask,
+    declare_gate,
     describe,
     deviations,
     first_worse,
@@ -38,7 +38,7 @@ SCENES = dict.fromkeys(("courtyard", "garden"), ("sfm-adc", "sfm-adc"))
 
 
 def asked(metric: str = "psnr", least: str | None = "0.1", seeds: int = 4, **scenes: tuple[str, str]) -> Declaration:
-    return replace(ask(metric, least, scenes or SCENES, range(seeds), VALUES), time="2020-01-01T00:00:00Z")
+    return replace(declare_gate(metric, least, scenes or SCENES, range(seeds), VALUES), time="2020-01-01T00:00:00Z")
 
 
 def trials(runs: Path, effect: float, noise: float, seeds: int = 4, scenes: Sequence[str] = tuple(SCENES)) -> Any:

@@ -14,12 +14,12 @@ from scipy import stats
 from gsbench.analysis.results import load_experiment
 from gsbench.analysis.statistics import Interval, t_test
 from gsbench.claims.archive import write_archive
-from gsbench.claims.pooling import Study, Wanted, describe, pool, read_studies
+from gsbench.claims.pooling import PooledQuestion, Study, describe, pool, read_studies
 from gsbench.cli import run
 from gsbench.errors import InputError
 from tests.analysis.synthetic import Plan, write_runs
 
-WANTED = Wanted(("volumetric", "new"), ("adc", "gaussian-splatting"), "psnr")
+WANTED = PooledQuestion(("volumetric", "new"), ("adc", "gaussian-splatting"), "psnr")
 EFFECTS = (0.5, 0.9, 0.4, 0.7)
 STUDIES = [Study(f"trial {k}", effect, Interval(effect - 0.1, effect + 0.1)) for k, effect in enumerate(EFFECTS)]
 

@@ -22,7 +22,7 @@ from omegaconf import DictConfig
 from gsbench.app.command import OWN_LAUNCHER, TrialTask
 from gsbench.app.grids import bare_key, checked_grids, grid_points, is_interval, words_of_grids
 from gsbench.app.tuning import tuned_jobs
-from gsbench.claims.stopping import Planned, headline, plan_sweep, run_looks
+from gsbench.claims.stopping import KeyAndSeed, headline, plan_sweep, run_looks
 from gsbench.config.command_words import parse_word
 from gsbench.config.compose import Trial, compose_jobs, resolve_times
 from gsbench.config.hydra_entry import explained
@@ -117,7 +117,7 @@ class Sweep:
         stopping = replace(stopping, declaration=declare_questions(stopping.home, stopping.declaration))
         launched: set[Path] = set()
 
-        def run(planned: Sequence[Planned]) -> None:
+        def run(planned: Sequence[KeyAndSeed]) -> None:
             batch = [trial for key in planned if (trial := stopping.trials[key]).folder not in launched]
             launched.update(trial.folder for trial in batch)
             if batch:

@@ -1,1 +1,1 @@
-"""Claims and their verdicts: a plan written down first, seeds added until it is decided, results of many pooled."""
+"""Claims and their verdicts: questions declared first, seeds added until they are decided, results of many pooled."""

@@ -1,8 +1,8 @@
 """Ablation of a densifier: its switches, the runs of all their combinations, and the verdicts on them.
 
-A switch is declared by the densifier's class (``SWITCHES``), by its YAML (``switches``), or on the command line. It is
-on as the densifier is configured; its ``off`` settings take that part out. Runs that differ only in what does nothing
-there (the scales of children where nothing is split) are one and the same, and trained once.
+A switch turns one part of the densifier off by its ``off`` settings; as configured, all switches are on. The class
+(``SWITCHES``), the YAML file (``switches``) or the command line declares it. A switch may have no effect while another
+is off (the scales of children if nothing is split). Runs that differ only in such switches are trained once.
 """
 
 import itertools
@@ -19,54 +19,58 @@ from gsbench.settings import Switch, checked
 from gsbench.words import closest, listed
 
 MAX_SWITCHES = 8
-_ABSENT = object()  # unlike any value
+_ABSENT = object()  # differs from any value
 
 Run = frozenset[str]  # the switches that are on
-Keys = Mapping[str, str]  # of a run, by scene: the folder of its trials without the seed
+TrialKeys = Mapping[str, str]  # scene -> folder of a run's trials, without the seed
 
 
 def declared_switches(own: Mapping[str, Switch], values: Mapping[str, Any]) -> dict[str, Switch]:
-    """The switches of a densifier's class, and those of its settings ``values``, that take something out there.
+    """The switches of a densifier's class (``own``) and of its settings, without those whose ``off`` settings hold
+    already.
 
-    Raises InputError for a switch that is none.
+    Raises InputError for a malformed switch.
     """
-    listed_there = values.get("switches") or {}
-    if not isinstance(listed_there, Mapping):
-        raise InputError(f"densify.switches must be a mapping NAME: {{off: {{KEY: VALUE}}}}, got {listed_there!r}")
-    found = dict(own)
-    for name, entry in listed_there.items():
+    in_settings = values.get("switches") or {}
+    if not isinstance(in_settings, Mapping):
+        raise InputError(f"densify.switches must be a mapping NAME: {{off: {{KEY: VALUE}}}}, got {in_settings!r}")
+    switches = dict(own)
+    for name, entry in in_settings.items():
         where = f"densify.switches.{name}"
         if not isinstance(entry, Mapping) or "off" not in entry:
             raise InputError(f"{where} must be {{off: {{KEY: VALUE}}}}, got {entry!r}")
-        found[str(name)] = Switch(**checked(Switch, dict(entry), where))
+        switches[str(name)] = Switch(**checked(Switch, dict(entry), where))
     return {
         name: switch
-        for name, switch in found.items()
+        for name, switch in switches.items()
         if any(values.get(key, _ABSENT) != value for key, value in switch.off.items())
     }
 
 
-def choose_switches(found: Mapping[str, Switch], names: Sequence[str], densify: str) -> dict[str, Switch]:
-    """Choose the switches of ``names``, or all; raises InputError for an unknown name, for none, and for too many."""
+def choose_switches(declared: Mapping[str, Switch], names: Sequence[str], densify: str) -> dict[str, Switch]:
+    """The declared switches of these names, by default all.
+
+    Raises InputError for an unknown name, if no switch is declared, and for too many switches.
+    """
     for name in names:
-        if name not in found:
+        if name not in declared:
             raise InputError(
-                f"{name!r} is not a switch of densify={densify}{closest(name, found)} (there are "
-                f"{', '.join(found) or 'none'})"
+                f"{name!r} is not a switch of densify={densify}{closest(name, declared)} (there are "
+                f"{', '.join(declared) or 'none'})"
             )
-    if not found:
+    if not declared:
         raise InputError(
             f"densify={densify} declares no switch that is on: name one by +densify.switches.NAME.off.KEY=VALUE, where "
             "the setting turns a part off (docs/claims.md)"
         )
-    chosen = {name: found[name] for name in names or found}
+    chosen = {name: declared[name] for name in names or declared}
     if len(chosen) > MAX_SWITCHES:
         raise InputError(f"{len(chosen)} switches make {2 ** len(chosen)} runs: choose at most {MAX_SWITCHES}")
     return chosen
 
 
-def effective(run: Run, switches: Mapping[str, Switch]) -> Run:
-    """The run without the switches that do nothing in it, because that within which they act is off."""
+def effective_run(run: Run, switches: Mapping[str, Switch]) -> Run:
+    """The run without the switches that have no effect in it, because the switch that they depend on is off."""
     return frozenset(name for name in run if _acts(name, run, switches))
 
 
@@ -76,21 +80,21 @@ def _acts(name: str, run: Run, switches: Mapping[str, Switch]) -> bool:
 
 
 def runs_to_train(switches: Mapping[str, Switch]) -> list[Run]:
-    """All combinations, each once, all switches on first; raises InputError for switches within each other."""
+    """All different runs, the one with all switches on first; raises InputError if switches depend on each other."""
     for name in switches:
-        seen, place = [name], switches[name].within
-        while place in switches:
-            if place in seen:
-                raise InputError(f"the switches {', '.join(seen)} form a circle: each is within the next")
-            seen, place = [*seen, place], switches[place].within
+        chain, outer = [name], switches[name].within
+        while outer in switches:
+            if outer in chain:
+                raise InputError(f"the switches {', '.join(chain)} form a circle: each is within the next")
+            chain, outer = [*chain, outer], switches[outer].within
     sizes = range(len(switches) + 1)
-    every = [Run(chosen) for size in sizes for chosen in itertools.combinations(switches, size)]
-    runs = dict.fromkeys(effective(run, switches) for run in every)
+    combinations = [Run(chosen) for size in sizes for chosen in itertools.combinations(switches, size)]
+    runs = dict.fromkeys(effective_run(run, switches) for run in combinations)
     return sorted(runs, key=lambda run: (-len(run), sorted(run)))
 
 
-def words_of(run: Run, switches: Mapping[str, Switch]) -> dict[str, Any]:
-    """The settings of ``densify`` that take out what is off in the run."""
+def off_settings(run: Run, switches: Mapping[str, Switch]) -> dict[str, Any]:
+    """The settings of ``densify`` that turn off the parts that are off in the run."""
     settings: dict[str, Any] = {}
     for name, switch in switches.items():
         if name not in run:
@@ -98,14 +102,14 @@ def words_of(run: Run, switches: Mapping[str, Switch]) -> dict[str, Any]:
     return settings
 
 
-def without(run: Run, switches: Sequence[str]) -> str:
-    """``without shrink``, or that all parts are on."""
+def run_name(run: Run, switches: Sequence[str]) -> str:
+    """``without shrink``; ``with all of them`` if all switches are on."""
     off = [name for name in switches if name not in run]
     return f"without {listed(off)}" if off else "with all of them"
 
 
-def judge_runs(trials: Sequence[TrialResult], runs: Mapping[Run, Keys], metric: str) -> list[Verdict]:
-    """The verdict on each run, held against the one with all switches on, in the order of ``runs``; one family."""
+def judge_runs(trials: Sequence[TrialResult], runs: Mapping[Run, TrialKeys], metric: str) -> list[Verdict]:
+    """The verdicts on all runs against the run with all switches on, as one family, in the order of ``runs``."""
     quantity = asked_quantity(metric, trials)
     full = max(runs, key=len)
     questions = [
@@ -113,8 +117,8 @@ def judge_runs(trials: Sequence[TrialResult], runs: Mapping[Run, Keys], metric: 
             metric=metric,
             sign=quantity.direction or 1,
             least=quantity.worthwhile,
-            baseline=Arm("", without(full, sorted(full))),
-            arm=Arm("", without(run, sorted(full))),
+            baseline=Arm("", run_name(full, sorted(full))),
+            arm=Arm("", run_name(run, sorted(full))),
             scenes={scene: (runs[full][scene], key) for scene, key in keys.items()},
         )
         for run, keys in runs.items()
@@ -123,7 +127,7 @@ def judge_runs(trials: Sequence[TrialResult], runs: Mapping[Run, Keys], metric: 
     return judge(trials, Declaration(time="1970-01-01T00:00:00Z", questions=tuple(questions)))
 
 
-def table(verdicts: Sequence[Verdict]) -> list[str]:
+def markdown_table(verdicts: Sequence[Verdict]) -> list[str]:
     """The verdicts as lines of a Markdown table."""
     name = verdicts[0].quantity.name
     lines = [f"| run | difference in {name} from all parts | interval | verdict |", "|---|---|---|---|"]

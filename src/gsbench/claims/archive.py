@@ -1,17 +1,17 @@
-"""An experiment's results as one small file that others can read: a zip archive, and an RO-Crate 1.2 at once.
+"""An experiment's results as one small file for others: a zip archive that is also an RO-Crate 1.2.
 
-It holds, without any pixels but where pictures are asked for:
+It holds:
 
-- ``results.jsonl``: the ``results.json`` of every trial, one a line, with the folder that it lay in;
-- ``configurations.jsonl``: every configuration, with the folders of the trials that had it (their seeds apart);
+- ``results.jsonl``: the ``results.json`` of every trial, one per line, with the trial's folder;
+- ``configurations.jsonl``: every configuration without the seed, with its trials' folders and seeds;
 - ``per_view.csv``: the metrics of every test view;
-- ``declared.jsonl``: what was declared before trials ran, where something was;
-- ``from_pixels.jsonl``: what declared claims ask of the trials' pictures, where they ask something;
-- ``pictures/``: renders and photographs of test views by trial, where they were asked for;
+- ``declared.jsonl``: the declarations of the experiment, if there are any;
+- ``from_pixels.jsonl``: measures of the trials' pictures, if declared claims use them;
+- ``pictures/``: renders and photographs of test views by trial, only if they were asked for;
 - ``archive.json``: the version of this format and the sha256 of the files above;
 - ``ro-crate-metadata.json``: the same in the terms of RO-Crate (w3id.org/ro/crate/1.2), for other tools.
 
-Paths of the machine are left out: of folders the last name is kept. The same results make the same archive, bit by bit.
+Of paths on this machine only the last name is kept. The same results give the same archive, bit by bit.
 """
 
 import csv
@@ -47,24 +47,25 @@ PIXELS = "from_pixels.jsonl"
 MANIFEST, CRATE = "archive.json", "ro-crate-metadata.json"
 TRIALS, CONFIGURATIONS = "results.jsonl", "configurations.jsonl"
 PICTURES_FOLDER, PICTURES = "pictures", (RENDERS, GROUND_TRUTH)
-MOST_BYTES = 1 << 28  # of a file when unpacked; more than any experiment has
-MOST_TOGETHER = 1 << 30  # bytes of all files
-FIXED_DATE = (1980, 1, 1, 0, 0, 0)  # of the files within: the earliest that zip knows
-PRIVATE = ("runs", "tracking")  # settings that say where somebody's files and servers are, and nothing else
-PASSWORD = re.compile(r"(?<=://)[^/@\s]*@")  # user and password of an address
-FOLDERS = re.compile(r"(?<=:)///+\S*/")  # of a file's address, such as sqlite:////home/me/a.db
+# Archives may come from strangers: these limits stop a zip bomb. They are larger than any experiment needs.
+MOST_BYTES = 1 << 28  # bytes of one unpacked file
+MOST_TOGETHER = 1 << 30  # bytes of all unpacked files
+FIXED_DATE = (1980, 1, 1, 0, 0, 0)  # of all files in the zip, so that archives do not depend on time: zip's earliest
+PRIVATE = ("runs", "tracking")  # settings that only name the user's folders and servers
+PASSWORD = re.compile(r"(?<=://)[^/@\s]*@")  # user and password in a URL
+FOLDERS = re.compile(r"(?<=:)///+\S*/")  # folders in a file's URL, such as sqlite:////home/me/a.db
 SEED_KEY = "seed"
 NO_CONFIGURATION = f"it has no {CONFIG}"
-NAMED = ("scene", "init", "densify")  # groups of settings whose names a record repeats
+NAMED_GROUPS = ("scene", "init", "densify")  # groups of settings whose names results.json repeats
 
 
 def write_archive(experiment: Experiment, out: Path, pictures: bool = False) -> list[str]:
-    """Write the experiment's results to the file ``out``; returns a line for each trial that is left out, with why.
+    """Write the experiment's results to the file ``out``; return a line for each trial that is left out, with why.
 
-    With ``pictures``, those of the test views too. Raises InputError where none is left.
+    ``pictures`` adds those of the test views. Raises InputError if no trial can be exported.
     """
     kept, rows, left_out = [], [], list(experiment.warnings)
-    configurations: dict[str, list[tuple[str, int]]] = {}  # each once, with its trials
+    configurations: dict[str, list[tuple[str, int]]] = {}  # {configuration as JSON: (folder, seed) of its trials}
     for trial in experiment.trials:
         try:
             views, configuration = read_views(trial), _configuration(trial)
@@ -85,7 +86,7 @@ def write_archive(experiment: Experiment, out: Path, pictures: bool = False) -> 
         PER_VIEW: _table(rows),
     } | ({DECLARED: read_bytes(declared)} if declared.is_file() else {})
     if any(q.metric == TEXTURED.key for one in read_declarations(experiment.folder) for q in one.questions):
-        contents[PIXELS] = _json_lines(_measured_in_pictures(kept))
+        contents[PIXELS] = _json_lines(_pixel_measures(kept))
     for trial in kept if pictures else ():
         for kind in PICTURES:
             for path in trial.folder.pictures(kind):
@@ -108,22 +109,22 @@ def write_archive(experiment: Experiment, out: Path, pictures: bool = False) -> 
     return left_out
 
 
-def _measured_in_pictures(trials: Sequence[TrialResult]) -> Iterator[dict[str, Any]]:
-    """A line for each trial whose pictures are there."""
+def _pixel_measures(trials: Sequence[TrialResult]) -> Iterator[dict[str, Any]]:
+    """The folder and the measures of each trial whose pictures can be read."""
     for trial in trials:
         with suppress(InputError):
             yield {"folder": _folder(trial), "measures": PixelMeasures(error_textured=textured_error(trial)).to_json()}
 
 
 def unpack_archive(file: Path, runs: Path) -> Experiment:
-    """Lay the trials of an archive into the runs folder ``runs``, which is to be empty, and read them as an experiment.
+    """Unpack the trials of an archive into the empty runs folder ``runs``, and read them as an experiment.
 
-    Raises InputError, one line that names the file, for an archive that is none, cut, edited or of another version.
+    Raises InputError, one line that names the file, if it is no archive, or is cut, edited or of another version.
     """
     try:
         manifest, contents = _read(file)
-        home = runs / _name(manifest["experiment"])
-        trials = [(_place(line["folder"]), line["results"]) for line in _lines(contents[TRIALS])]
+        home = runs / _checked_name(manifest["experiment"])
+        trials = [(_checked_folder(line["folder"]), line["results"]) for line in _lines(contents[TRIALS])]
         _unpack(home, trials, contents)
     except InputError as error:
         raise InputError(f"{file}: {error}") from None
@@ -143,11 +144,11 @@ def unpack_archive(file: Path, runs: Path) -> Experiment:
     return experiment
 
 
-def _check_own(folder: str, values: Mapping[str, Any], results: Mapping[str, Any]) -> None:
-    """Raise InputError where ``values`` are not the configuration of the trial in ``folder`` with these results."""
-    found = {SEED_KEY: values[SEED_KEY]}
-    found |= {group: values[group].get("name") for group in NAMED if isinstance(values.get(group), dict)}
-    for key, value in found.items():
+def _check_configuration(folder: str, values: Mapping[str, Any], results: Mapping[str, Any]) -> None:
+    """Raise InputError if the configuration ``values`` contradicts the ``results`` of the trial in ``folder``."""
+    names = {SEED_KEY: values[SEED_KEY]}
+    names |= {group: values[group].get("name") for group in NAMED_GROUPS if isinstance(values.get(group), dict)}
+    for key, value in names.items():
         if value != results[key]:
             raise InputError(
                 f"{folder}: its configuration says {key} {value}, its results {results[key]}: export it again"
@@ -155,7 +156,7 @@ def _check_own(folder: str, values: Mapping[str, Any], results: Mapping[str, Any
 
 
 def _read(file: Path) -> tuple[dict[str, Any], dict[str, bytes]]:
-    """The manifest, and the files that it lists, each with the right checksum."""
+    """The manifest, and the content of the files that it lists, whose checksums were compared."""
     try:
         with zipfile.ZipFile(file) as archive:
             manifest = json.loads(_member(archive, MANIFEST))
@@ -201,31 +202,31 @@ def _member(archive: zipfile.ZipFile, name: str) -> bytes:
 
 
 def _unpack(home: Path, trials: Sequence[tuple[str, dict[str, Any]]], contents: Mapping[str, bytes]) -> None:
-    """Write the files of every trial as gsbench has them."""
+    """Write the files of every trial into its folder below ``home``."""
     for folder, results in trials:
         if (home / folder).exists():
             raise InputError(f"the trial {folder} is in it twice")
         (home / folder).mkdir(parents=True)
         (home / folder / RESULTS).write_text(json.dumps(results), encoding="utf-8")
-    known = dict(trials)
+    results_by_folder = dict(trials)
     for line in _lines(contents[CONFIGURATIONS]):
         for folder, seed in line["trials"]:
-            if folder in known:
+            if folder in results_by_folder:
                 configuration = line["configuration"] | {SEED_KEY: seed}
-                _check_own(folder, configuration, known[folder])
+                _check_configuration(folder, configuration, results_by_folder[folder])
                 (home / folder / CONFIG).write_text(yaml.safe_dump(configuration, sort_keys=False), encoding="utf-8")
     reader = csv.DictReader(io.StringIO(contents[PER_VIEW].decode()))
     by_trial: dict[str, list[dict[str, str]]] = {}
     for row in reader:
         by_trial.setdefault(row.pop("trial"), []).append(row)
     columns = [name for name in reader.fieldnames or () if name != "trial"]
-    for folder in known & by_trial.keys():
+    for folder in results_by_folder.keys() & by_trial.keys():
         with (home / folder / PER_VIEW).open("w", newline="", encoding="utf-8") as stream:
             writer = csv.DictWriter(stream, columns)
             writer.writeheader()
             writer.writerows(by_trial[folder])
     for line in _lines(contents.get(PIXELS, b"")):
-        if line["folder"] in known:
+        if line["folder"] in results_by_folder:
             (home / line["folder"] / FROM_PIXELS).write_text(json.dumps(line["measures"]), encoding="utf-8")
     for name in contents:
         if name.startswith(f"{PICTURES_FOLDER}/"):
@@ -237,25 +238,25 @@ def _unpack(home: Path, trials: Sequence[tuple[str, dict[str, Any]]], contents: 
 def _unpack_picture(home: Path, name: str, content: bytes) -> None:
     """Write a picture of a test view into its trial's folder; raises InputError for a name that leads elsewhere."""
     folder, kind, file = name.removeprefix(f"{PICTURES_FOLDER}/").rsplit("/", 2)
-    if kind not in PICTURES or not is_folder_name(file) or not (home / _place(folder) / RESULTS).is_file():
+    if kind not in PICTURES or not is_folder_name(file) or not (home / _checked_folder(folder) / RESULTS).is_file():
         raise InputError(f"{name!r} cannot be a picture of a trial")
     (home / folder / kind).mkdir(exist_ok=True)
     (home / folder / kind / file).write_bytes(content)
 
 
 def _folder(trial: TrialResult) -> str:
-    """Of a trial within its experiment."""
+    """A trial's folder within its experiment."""
     return "/".join(trial.path.parts[-3:])
 
 
-def _name(name: object) -> str:
+def _checked_name(name: object) -> str:
     if not isinstance(name, str) or not is_folder_name(name):
         raise InputError(f"{name!r} cannot be the name of an experiment")
     return name
 
 
-def _place(folder: object) -> str:
-    """The folder of a trial, which must not lead anywhere else."""
+def _checked_folder(folder: object) -> str:
+    """A trial's folder within its experiment; raises InputError for a path that could lead out of the runs folder."""
     parts = str(folder).split("/")
     if len(parts) != 3 or not all(map(is_folder_name, parts)):
         raise InputError(f"{folder!r} cannot be the folder of a trial")
@@ -263,7 +264,7 @@ def _place(folder: object) -> str:
 
 
 def read_configuration(trial: TrialResult) -> dict[str, Any]:
-    """The configuration of a trial as its ``config.yaml`` has it; raises InputError where it is absent or damaged."""
+    """The configuration in a trial's ``config.yaml``; raises InputError if it is missing or damaged."""
     try:
         values = read_yaml(trial.path / CONFIG)
     except FileNotFoundError:
@@ -274,13 +275,13 @@ def read_configuration(trial: TrialResult) -> dict[str, Any]:
 
 
 def _configuration(trial: TrialResult) -> str:
-    """The trial's configuration as JSON, without what says where files lie; raises InputError where it is damaged."""
+    """The trial's configuration as JSON, without paths of this machine; raises InputError if it is damaged."""
     values = read_configuration(trial)
     return json.dumps(without_paths({key: value for key, value in values.items() if key not in (*PRIVATE, SEED_KEY)}))
 
 
 def _results(trial: TrialResult) -> dict[str, Any]:
-    """The record of the trial without what says where files lie, in its reasons too."""
+    """The record of the trial without paths of this machine."""
     record = trial.record.to_json()
     reasons = {metric: without_places(reason) for metric, reason in record["unavailable"].items()}
     results: dict[str, Any] = without_paths(record | {"unavailable": reasons})
@@ -288,13 +289,13 @@ def _results(trial: TrialResult) -> dict[str, Any]:
 
 
 def without_paths(value: Any) -> Any:
-    """Plain values, of whose paths on this machine the last names are kept, and of whose addresses no password."""
+    """Plain values in which only the last name of each path on this machine is kept, and no URL has a password."""
     if isinstance(value, Mapping):
         return {key: without_paths(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):
         return [without_paths(entry) for entry in value]
     if isinstance(value, str):
-        if value.startswith(("/", "~")) or PurePath(value).is_absolute():  # with blanks in it, too
+        if value.startswith(("/", "~")) or PurePath(value).is_absolute():  # `without_places` would stop at a blank
             return PurePath(value).name
         return without_places(FOLDERS.sub("///", PASSWORD.sub("", value)))
     return value

@@ -1,7 +1,7 @@
-"""Checks of a file of claims: what can be tested here, the trials that it takes, and the verdicts so far.
+"""Checks of a file of claims: what can be tested here, the trials that are needed, and the verdicts so far.
 
-The trials are ordinary ones of one experiment, found again by their folders, so a check that was killed goes on where
-it stopped and ends with the same verdicts. From published archives the same verdicts are made without any training.
+The trials are ordinary trials of one experiment. So a check that was killed continues where it stopped and ends with
+the same verdicts. A published archive gives the same verdicts without any training.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -15,22 +15,25 @@ from gsbench.analysis.results import read_experiment
 from gsbench.analysis.statistics import SUPPORTED, TOO_SMALL
 from gsbench.claims.archive import unpack_archive
 from gsbench.claims.file import Claim, ClaimsFile
-from gsbench.claims.stopping import Planned, trials_of_look
+from gsbench.claims.stopping import KeyAndSeed, trials_of_look
 from gsbench.config.compose import Trial, compose_one, with_seed
 from gsbench.errors import InputError
 from gsbench.records import read_if_sound
-from gsbench.runs.declaration import Declaration, declared_now, read_declarations, standing_one
+from gsbench.runs.declaration import Declaration, declared_now, latest_declaration, read_declarations
 from gsbench.runs.layout import FAILED, SEED
 from gsbench.runs.trial_folder import Failure
 from gsbench.words import some_of, without_places
 
-Lacking = Callable[[Sequence[Trial]], Sequence[str]]  # a line for each thing that is not here
+FindMissing = Callable[[Sequence[Trial]], Sequence[str]]  # a line for each thing that these trials need and lack
 NOT_TESTABLE = "not testable here"
 
 
 @dataclass(frozen=True)
 class ClaimVerdict:
-    """A claim with its verdict; ``missing`` says which scenes could not be tested, and why."""
+    """A claim with its verdict.
+
+    ``missing`` says which scenes could not be tested, and why; ``failed`` why trials failed.
+    """
 
     claim: Claim
     verdict: Verdict
@@ -73,40 +76,40 @@ class ClaimVerdict:
 
 @dataclass(frozen=True)
 class Check:
-    """A file of claims in a runs folder: its declaration, and the first trial of each folder that it names.
+    """A file of claims that is checked in the runs folder ``runs``, with its declaration.
 
-    ``missing`` says by claim what cannot be tested here.
+    ``first_trials`` has the trial of seed 0 for each key (`TrialResult.key`) in the declaration.
     """
 
     file: ClaimsFile
     runs: Path
     declaration: Declaration
-    first: Mapping[str, Trial]  # by folder
+    first_trials: Mapping[str, Trial]
 
     @property
     def home(self) -> Path:
         return self.runs / self.file.name
 
-    def to_run(self, planned: Sequence[Planned]) -> list[Trial]:
-        """The trials of a look."""
-        return [with_seed(self.first[key], seed) for key, seed in planned]
+    def to_run(self, planned: Sequence[KeyAndSeed]) -> list[Trial]:
+        """The planned trials, composed."""
+        return [with_seed(self.first_trials[key], seed) for key, seed in planned]
 
     def trials(self, seeds: int) -> list[Trial]:
         """The trials of the first ``seeds`` seeds of every claim."""
         return self.to_run(trials_of_look(self.declaration, range(len(self.declaration.questions)), seeds))
 
     def judged(self) -> list[Verdict]:
-        """The verdicts from the trials that are done, of the questions that can be tested."""
+        """The verdicts on the declared questions from the trials that are done."""
         trials = read_experiment(self.home).trials if self.home.is_dir() else ()
         return judge(trials, self.declaration)
 
     def verdicts(self, judged: Sequence[Verdict]) -> list[ClaimVerdict]:
-        """All claims in the order of the file, with the reasons of trials that failed."""
-        found = claim_verdicts(self.file, self.declaration, judged)
-        return [replace(one, failed=tuple(self._failed(one.verdict))) for one in found]
+        """All claims in the order of the file, with the reasons why trials failed."""
+        verdicts = claim_verdicts(self.file, self.declaration, judged)
+        return [replace(one, failed=tuple(self._failures(one.verdict))) for one in verdicts]
 
-    def _failed(self, verdict: Verdict) -> list[str]:
-        """List the reasons why trials of the question failed, each once."""
+    def _failures(self, verdict: Verdict) -> list[str]:
+        """The reasons why trials of an undecided question failed, each once."""
         folders = [
             self.home / f"{key}{SEED}{seed}"
             for both in verdict.question.scenes.values()
@@ -117,15 +120,14 @@ class Check:
         return list(dict.fromkeys(failure.reason for failure in failures if failure is not None))
 
 
-def prepare(file: ClaimsFile, runs: Path, lacking: Lacking, permissions: Sequence[str] = ()) -> Check:
-    """Compose the first trial of every scene and arm of every claim; ``lacking`` says what cannot be had here.
+def prepare(file: ClaimsFile, runs: Path, find_missing: FindMissing, permissions: Sequence[str] = ()) -> Check:
+    """Compose the first trial of each scene and arm of each claim; scenes with something missing are not tested.
 
-    ``permissions`` are words such as ``allow_targets=[mine]`` that were typed: a file of claims can give none.
-
-    Raises InputError, naming claim, scene and arm, for settings that do not compose.
+    ``permissions`` are words such as ``allow_targets=[mine]`` from the command line: a file of claims cannot give
+    permissions. Raises InputError that names claim, scene and arm for settings that do not compose.
     """
-    first: dict[str, Trial] = {}
-    known: dict[tuple[str, ...], Trial] = {}
+    first_trials: dict[str, Trial] = {}
+    composed: dict[tuple[str, ...], Trial] = {}
     questions, missing = [], {}
     for claim in file.claims:
         scenes: dict[str, tuple[str, str]] = {}
@@ -134,17 +136,17 @@ def prepare(file: ClaimsFile, runs: Path, lacking: Lacking, permissions: Sequenc
             trials = []
             for arm in (claim.baseline, claim.arm):
                 words = (*file.words(claim, scene, arm), f"name={file.name}", "seed=0", *permissions)
-                if words not in known:
-                    known[words] = _composed(words, runs, f"claim {claim.id}, scene {scene}, arm {arm}")
-                trials.append(known[words])
-            reason = next((why for trial in trials for why in lacking([trial])), "")
+                if words not in composed:
+                    composed[words] = _compose(words, runs, f"claim {claim.id}, scene {scene}, arm {arm}")
+                trials.append(composed[words])
+            reason = next((line for trial in trials for line in find_missing([trial])), "")
             if reason:
                 reasons.setdefault(reason, []).append(scene)
                 continue
             baseline, arm_key = (trial.files.key for trial in trials)
             if baseline == arm_key:
                 raise InputError(f"claim {claim.id}: {claim.baseline} and {claim.arm} are the same trial on {scene}")
-            first |= {baseline: trials[0], arm_key: trials[1]}
+            first_trials |= {baseline: trials[0], arm_key: trials[1]}
             scenes[scene] = baseline, arm_key
         if scenes:
             questions.append(file.question(claim, scenes))
@@ -153,57 +155,59 @@ def prepare(file: ClaimsFile, runs: Path, lacking: Lacking, permissions: Sequenc
     declaration = declared_now(
         questions=tuple(questions), error_rate=file.error_rate, looks=file.looks, missing=missing
     )
-    return Check(file, runs, declaration, first)
+    return Check(file, runs, declaration, first_trials)
 
 
 def claim_verdicts(file: ClaimsFile, declaration: Declaration, judged: Sequence[Verdict]) -> list[ClaimVerdict]:
-    """Every claim of the file, with its verdict among those ``judged`` by ``declaration``, or why there is none."""
+    """Every claim of the file with its verdict among ``judged``, or with the reason why it could not be tested."""
     by_name = {verdict.question.name: verdict for verdict in judged}
-    found = []
+    verdicts = []
     for claim in file.claims:
         reasons = tuple(declaration.missing.get(claim.id, ()))
         verdict = by_name.get(claim.id)
         if verdict is None or claim.not_testable:
-            why = claim.not_testable or "; ".join(reasons) or "it was not tested"
+            untestable = claim.not_testable or "; ".join(reasons) or "it was not tested"
             quantity = asked_quantity(claim.metric)
-            verdict = Verdict(file.question(claim, {}), quantity, Pairs(()), untestable=why)
+            verdict = Verdict(file.question(claim, {}), quantity, Pairs(()), untestable=untestable)
             reasons = ()
-        found.append(ClaimVerdict(claim, verdict, reasons))
-    return found
+        verdicts.append(ClaimVerdict(claim, verdict, reasons))
+    return verdicts
 
 
 def recheck(file: ClaimsFile, archive: Path, folder: Path) -> tuple[list[ClaimVerdict], Declaration, list[Declaration]]:
     """Judge the claims of ``file`` by the trials in ``archive`` alone, unpacked into the empty folder ``folder``.
 
-    Returns the verdicts, the declaration that they follow, and all of the experiment. Raises InputError, one line, for
-    a damaged archive, one of another experiment or without declared claims, and where the file's claims are not those
-    that were declared.
+    Returns the verdicts, the declaration that they follow, and all declarations of claims. Raises InputError, one line,
+    for an archive that is damaged, of another experiment or without declared claims, and if the file's claims differ
+    from the declared ones.
     """
     experiment = unpack_archive(archive, folder)
     if experiment.name != file.name:
         raise InputError(f"{archive} is of the experiment {experiment.name}, not of {file.name}")
-    every = [one for one in read_declarations(experiment.folder) if one.of_claims]
-    if not every:
+    declarations = [one for one in read_declarations(experiment.folder) if one.of_claims]
+    if not declarations:
         raise InputError(f"{archive}: it declares no claims, so it is not an archive of a gsbench check")
-    declaration = standing_one(every)
+    declaration = latest_declaration(declarations)
     _check_same_claims(file, declaration)
-    return claim_verdicts(file, declaration, judge(experiment.trials, declaration)), declaration, every
+    return claim_verdicts(file, declaration, judge(experiment.trials, declaration)), declaration, declarations
 
 
 def _check_same_claims(file: ClaimsFile, declaration: Declaration) -> None:
-    """Raise InputError where a claim's question is not the one that was declared before the trials ran."""
+    """Raise InputError if a claim's question differs from the one that was declared before the trials ran."""
     declared = {question.name: question for question in declaration.questions}
     for claim in file.claims:
-        asked, was = file.question(claim, {}), declared.get(claim.id)
-        if was is None:
+        in_file, before = file.question(claim, {}), declared.get(claim.id)
+        if before is None:
             continue
         for what in ("metric", "sign", "least", "relative"):
-            if getattr(asked, what) != getattr(was, what):
+            if getattr(in_file, what) != getattr(before, what):
                 raise InputError(
-                    f"claim {claim.id}: its {what} was {getattr(was, what)} when it was declared ({declaration.when}), "
-                    f"and is {getattr(asked, what)} in the file: use the file as it was then"
+                    f"claim {claim.id}: its {what} was {getattr(before, what)} when it was declared "
+                    f"({declaration.when}), and is {getattr(in_file, what)} in the file: use the file as it was then"
                 )
-        if (claim.baseline, claim.arm) != tuple(arm.densify for arm in (was.baseline, was.arm) if arm is not None):
+        if (claim.baseline, claim.arm) != tuple(
+            arm.densify for arm in (before.baseline, before.arm) if arm is not None
+        ):
             raise InputError(
                 f"claim {claim.id}: other arms were declared ({declaration.when}): use the file as it was then"
             )
@@ -211,7 +215,7 @@ def _check_same_claims(file: ClaimsFile, declaration: Declaration) -> None:
         raise InputError(f"the file lacks claims that were declared: {', '.join(sorted(unknown))}")
 
 
-def _composed(words: Sequence[str], runs: Path, where: str) -> Trial:
+def _compose(words: Sequence[str], runs: Path, where: str) -> Trial:
     try:
         trial = compose_one(words)
     except InputError as error:

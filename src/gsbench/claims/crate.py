@@ -7,7 +7,7 @@ from typing import Any
 from gsbench.analysis.results import TrialResult
 
 SPECIFICATION = "https://w3id.org/ro/crate/1.2"
-FILES = {  # media type, and in words what it is
+FILES = {  # media type and description
     "results.jsonl": (
         "application/jsonl",
         "Results of every trial, one JSON object a line: metrics, counts, hashes, code",
@@ -22,7 +22,7 @@ PICTURE = ("image/png", "A test view of a trial: its render, or the photograph")
 
 
 def crate_metadata(name: str, trials: Sequence[TrialResult], sizes: Mapping[str, int]) -> dict[str, Any]:
-    """The content of ``ro-crate-metadata.json``: ``sizes`` has the bytes of each file of the archive."""
+    """The content of ``ro-crate-metadata.json``; ``sizes`` are the bytes of each file in the archive."""
     scenes = sorted({trial.scene for trial in trials})
     arms = sorted({f"{trial.init}-{trial.densify}" for trial in trials})
     protocols = sorted({trial.record.protocol for trial in trials})

@@ -1,4 +1,4 @@
-"""The file of claims: what a paper says, and how it would be tested here, typed and checked before any trial runs.
+"""The file of claims: what a paper says, and how it is tested here. It is checked before any trial runs.
 
     name: check_volumetric
     paper: Refining Gaussian Splatting (arXiv 2508.05187)
@@ -17,7 +17,7 @@
         least: 0.005
         refuted_if: the difference is above 0, or within 0.005 of it
 
-Settings, scenes, arms, budgets and splits are settings as on the command line. docs/claims.md has every key.
+Settings, scenes, arms, budgets and splits have settings as on the command line. docs/claims.md has every key.
 """
 
 import math
@@ -40,7 +40,7 @@ from gsbench.words import closest
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,60}")
 KEY = re.compile(r"[+]?\w+([./]\w+)*")  # of a setting
-GIVEN_BY_CHECK = ("name", "seed", "runs", "eval.primary")  # settings that the plan sets by itself
+GIVEN_BY_CHECK = ("name", "seed", "runs", "eval.primary")  # settings that the check sets itself
 MOST_ALPHA = 0.2
 NO_SIZE = "the whole claim depends on it: 0.005, or 10% of the baseline's value"
 DIRECTIONS = {"higher": 1, "lower": -1, "same": 0}
@@ -51,8 +51,8 @@ Settings = dict[str, Any]
 
 
 @dataclass(frozen=True)
-class Least:
-    """The least effect that matters: a difference of the metric, or (``relative``) a part of the baseline's value."""
+class LeastEffect:
+    """The least effect that matters: a difference of the metric, or (``relative``) a fraction of the baseline."""
 
     size: float
     relative: bool
@@ -63,9 +63,9 @@ class Least:
 
 @dataclass(frozen=True)
 class Claim:
-    """One claim. ``scenes`` are all of the file's where none are named; ``seeds`` the file's.
+    """One claim. Without ``scenes``, it is about all scenes of the file.
 
-    ``not_testable`` is a reason why nobody can test it with this file, such as a size that is out of reach.
+    ``not_testable`` says why this file cannot test the claim, for example because the paper's size is out of reach.
     """
 
     id: Name
@@ -84,11 +84,11 @@ class Claim:
 
     @property
     def sign(self) -> int:
-        """The sign of the claimed difference, arm minus baseline; 0 where none is claimed."""
+        """The sign of the claimed difference, arm minus baseline; 0 if no difference is claimed."""
         return DIRECTIONS[self.direction]
 
     @property
-    def effect(self) -> Least:
+    def effect(self) -> LeastEffect:
         return read_least(self.least, f"claim {self.id}")
 
 
@@ -96,14 +96,14 @@ class Claim:
 class ClaimsFile:
     """A checked file of claims.
 
-    ``error_rate`` is the chance that any verdict on the page is false; claims that can be tested share it. ``seeds``
-    are the most of each scene and arm. ``size`` says in words what the paper's own experiments were.
+    ``error_rate`` is the chance that any verdict is false; all tested claims share it. ``seeds`` is the most of each
+    scene and arm. ``size`` describes the paper's own experiments in words.
     """
 
     name: Name
     paper: Sentence
     seeds: Annotated[int, Ge(FIRST_LOOK)]
-    scenes: dict[str, Any]  # the settings of each, by name
+    scenes: dict[str, Any]  # settings by scene; as for arms
     arms: dict[str, Any]
     claims: list[Claim]
     settings: Settings = field(default_factory=dict)
@@ -114,7 +114,7 @@ class ClaimsFile:
         return tuple(claim.scenes or self.scenes)
 
     def words(self, claim: Claim, scene: str, arm: str) -> list[str]:
-        """The settings of a claim's trials with this scene and arm, as words of a command line; seed and name apart."""
+        """The settings of a claim's trials with this scene and arm, as command-line words without seed and name."""
         chosen = self.settings | self.scenes[scene] | self.arms[arm] | claim.split | claim.budget
         return [f"{key}={_text(value)}" for key, value in chosen.items()]
 
@@ -124,7 +124,7 @@ class ClaimsFile:
         return plan_looks(self.seeds)
 
     def question(self, claim: Claim, scenes: Mapping[str, tuple[str, str]]) -> Question:
-        """The claim as a question about trials in these folders, baseline and arm by scene."""
+        """The claim as a question; ``scenes`` has the keys of baseline's and arm's trials by scene."""
         return Question(
             metric=claim.metric,
             sign=claim.sign,
@@ -142,7 +142,7 @@ class ClaimsFile:
 
 
 def read_claims(path: Path) -> ClaimsFile:
-    """Read and check a file of claims; raises InputError, one line that names the place and the mend."""
+    """Read and check a file of claims; raises InputError, one line that says where the fault is and how to fix it."""
     try:
         content = read_yaml(resolved(path), unique=True)
     except FileNotFoundError:
@@ -156,19 +156,19 @@ def read_claims(path: Path) -> ClaimsFile:
 
 
 def parse_claims(content: object) -> ClaimsFile:
-    """The claims of what a YAML file holds."""
+    """Check the content of a file of claims; raises InputError as `read_claims` does."""
     if not isinstance(content, dict):
         raise InputError("it must be a mapping with name, paper, seeds, scenes, arms and claims")
-    given: dict[str, Any] = {str(key): value for key, value in content.items()}
-    listed = given.pop("claims", None)
-    values = checked(ClaimsFile, given, "")
+    entries: dict[str, Any] = {str(key): value for key, value in content.items()}
+    listed = entries.pop("claims", None)
+    values = checked(ClaimsFile, entries, "")
     _require(ClaimsFile, {*values, "claims"}, "")
     scenes = _named_settings(values["scenes"], "scenes", "scene")
     arms = _named_settings(values["arms"], "arms", "densify")
     _check_settings(values.get("settings", {}), "settings")
     if not isinstance(listed, list) or not listed:
         raise InputError("claims must be a list of at least one claim")
-    claims = [_claim(entry, place) for place, entry in enumerate(listed, 1)]
+    claims = [_claim(entry, number) for number, entry in enumerate(listed, 1)]
     file = ClaimsFile(**(values | {"scenes": scenes, "arms": arms, "claims": claims}))
     for claim in claims:
         _check_claim(claim, file)
@@ -178,8 +178,8 @@ def parse_claims(content: object) -> ClaimsFile:
     return file
 
 
-def read_least(value: float | str, where: str) -> Least:
-    """``0.005``, or ``10%`` of the baseline's value; raises InputError for one of no width."""
+def read_least(value: float | str, where: str) -> LeastEffect:
+    """Read ``0.005``, or ``10%`` of the baseline's value; raises InputError unless it is a number above 0."""
     text = str(value).strip()
     relative = text.endswith("%")
     try:
@@ -188,11 +188,11 @@ def read_least(value: float | str, where: str) -> Least:
         size = math.nan
     if not math.isfinite(size) or size <= 0:
         raise InputError(f"{where}: least must be a number above 0, got {value!r}: {NO_SIZE}")
-    return Least(size, relative)
+    return LeastEffect(size, relative)
 
 
-def _claim(entry: object, place: int) -> Claim:
-    where = f"claims[{place}]"
+def _claim(entry: object, number: int) -> Claim:
+    where = f"claims[{number}]"
     if not isinstance(entry, dict):
         raise InputError(f"{where} must be a mapping with id, says, where, …, got {entry!r}")
     values = checked(Claim, {str(key): value for key, value in entry.items()}, where)
@@ -203,27 +203,25 @@ def _claim(entry: object, place: int) -> Claim:
 def _require(cls: type, values: Iterable[str], where: str) -> None:
     """Raise InputError for the first field without a default that was not given."""
     given = set(values)
-    for entry in fields(cls):
-        needed = entry.default is entry.default_factory  # both are dataclasses.MISSING
-        if needed and entry.name not in given:
-            raise InputError(
-                f"{where}{'.' if where else ''}{entry.name} is not given: a claim needs it (docs/claims.md)"
-            )
+    for one in fields(cls):
+        required = one.default is one.default_factory  # both are dataclasses.MISSING
+        if required and one.name not in given:
+            raise InputError(f"{where}{'.' if where else ''}{one.name} is not given: a claim needs it (docs/claims.md)")
 
 
 def _named_settings(groups: Mapping[str, Any], where: str, group: str) -> dict[str, Settings]:
-    """Scenes or arms by name; one without settings is the choice of that name in ``group``."""
+    """The settings of scenes or arms by name. A name without settings is a choice of the settings group ``group``."""
     if not groups:
         raise InputError(f"{where} must name at least one, as {where}: {{courtyard: {{}}}}")
-    found = {}
+    by_name = {}
     for name, settings in groups.items():
         if not NAME.fullmatch(str(name)):
             raise InputError(f"{where}: {name!r} must be a name of letters, digits, _ and -")
         if settings is not None and not isinstance(settings, dict):
             raise InputError(f"{where}.{name} must be a mapping of settings, as {{{group}: {name}}}, got {settings!r}")
         _check_settings(settings or {}, f"{where}.{name}")
-        found[str(name)] = dict(settings or {group: str(name)})
-    return found
+        by_name[str(name)] = dict(settings or {group: str(name)})
+    return by_name
 
 
 def _check_settings(settings: Mapping[str, Any], where: str) -> None:
@@ -232,6 +230,7 @@ def _check_settings(settings: Mapping[str, Any], where: str) -> None:
             raise InputError(f"{where}: {key!r} is not a setting such as scene.max_size")
         if key.lstrip("+~") in GIVEN_BY_CHECK:
             raise InputError(f"{where}: {key} is set by the plan itself: leave it out")
+        # A file of claims may come from a stranger, so it cannot allow the import of other code.
         if key.lstrip("+~") == PERMISSIONS:
             raise InputError(f"{where}: no file can allow code to run: type {PERMISSIONS}=[…] after the file's name")
         if isinstance(value, dict):
@@ -280,7 +279,7 @@ def _check_metric(claim: Claim, file: ClaimsFile) -> None:
 
 
 def _text(value: object) -> str:
-    """A value of YAML as it is written on a command line."""
+    """A YAML value as text for a command line."""
     if value is None:
         return "null"
     if isinstance(value, bool):

@@ -1,8 +1,8 @@
-"""A gate: is a new version of a trainer worse than the version whose trials are at hand?
+"""A gate: is a new version of a trainer worse than the baseline version?
 
-One question about two versions, asked in planned looks (`gsbench.claims.stopping`), with three answers: the new version
-passes, is worse, or is not decided after the seeds that were allowed. It passes where it is better, where any
-difference is too small to matter, or where it is at least shown not to be worse by the least that matters.
+It is one question in planned looks (`gsbench.claims.stopping`). The new version passes, is worse, or is undecided after
+all allowed seeds. It passes if it is better, if any difference is too small to matter, or if it is shown not to be
+worse by the least difference that matters.
 """
 
 import math
@@ -21,27 +21,27 @@ from gsbench.eval.facts import known_keys
 from gsbench.runs.declaration import ERROR_RATE, Declaration, Question, declared_now, trial_key
 from gsbench.words import closest, counted, listed
 
-BASELINE, NEW = "baseline", "new"  # in keys of trials, in the place of the hash of settings that both may share
+BASELINE, NEW = "baseline", "new"  # replace the configuration hash in trials' keys, since versions may share settings
 PASSED, WORSE, NOT_DECIDED = "passed", "worse", "undecided"
 
-Trials = Callable[[], Iterable[TrialResult]]
+ReadTrials = Callable[[], Iterable[TrialResult]]
 
 
 @dataclass(frozen=True)
 class Gate:
-    """A declared question about two versions, with what gives the trials of each that are done."""
+    """A declared question about two versions, with functions that read each version's finished trials."""
 
     declaration: Declaration
-    baseline: Trials
-    new: Trials
+    baseline: ReadTrials
+    new: ReadTrials
 
     def judged(self) -> list[Verdict]:
-        """The verdict so far; final also where the new version is not worse, as no further seed has to show more."""
-        trials = [*_called(BASELINE, self.baseline()), *_called(NEW, self.new())]
+        """The verdict so far. It is final also once the new version is not worse: a gate needs no more."""
+        trials = [*_as_version(BASELINE, self.baseline()), *_as_version(NEW, self.new())]
         return [replace(one, final=one.final or result_of(one) == PASSED) for one in judge(trials, self.declaration)]
 
 
-def ask(
+def declare_gate(
     metric: str,
     least: str | None,
     scenes: Mapping[str, tuple[str, str]],
@@ -51,15 +51,15 @@ def ask(
 ) -> Declaration:
     """The declaration of a gate about ``metric`` on ``scenes``, each with the names of both arms, such as ``sfm-adc``.
 
-    ``least`` is text such as ``0.1`` or ``10%``, None for what is known of the metric; ``seeds`` are in the order in
-    which they are added; ``values`` the configuration of a trial, which may hold metrics of the user's own. Raises
+    ``least`` is text such as ``0.1`` or ``10%``; None takes the metric's usual least difference. Seeds are added in the
+    order of ``seeds``. ``values`` is a trial's configuration, which may define the user's own metrics. Raises
     InputError, one line, for a metric that cannot be judged, and for too few seeds.
     """
     own = values["eval"].get("extra") or {}
     known = (*known_keys(), *COSTS, *own)
     if metric not in known:
         raise InputError(f"--metric {metric}: there is no such metric{closest(metric, known)}")
-    sign, usual = -1, None  # of counts and times less is better
+    sign, usual = -1, None  # less is better of counts and times
     if metric not in COSTS:
         facts = facts_for(metric, values)
         sign, usual = facts.direction, facts.worthwhile
@@ -91,8 +91,8 @@ def ask(
 
 
 def result_of(verdict: Verdict) -> str:
-    """``passed``, ``worse``, or ``undecided``, which may change as long as the verdict is not final."""
-    if verdict.untestable:  # no pair differs, or none can be compared
+    """``passed``, ``worse``, or ``undecided``; the result may change until the verdict is final."""
+    if verdict.untestable:  # all pairs are equal, or none can be compared
         return PASSED if verdict.equal else NOT_DECIDED
     if verdict.outcome in (SUPPORTED, TOO_SMALL):
         return PASSED
@@ -125,7 +125,7 @@ def describe(verdict: Verdict) -> str:
 
 
 def deviations(baseline: Sequence[TrialResult], new: Sequence[TrialResult]) -> list[str]:
-    """A line for each way in which the two versions were run unlike, beside their code: machine, and libraries."""
+    """A line for each difference of machine or libraries between the two versions' trials."""
     lines = []
     kinds = [sorted({trial.machine or "not recorded" for trial in own}) for own in (baseline, new)]
     if kinds[0] != kinds[1]:
@@ -135,11 +135,11 @@ def deviations(baseline: Sequence[TrialResult], new: Sequence[TrialResult]) -> l
         )
     libraries = {name for trial in (*baseline, *new) for name in trial.record.versions} - {"gsbench"}
     for name in sorted(libraries):
-        known = [sorted({trial.record.versions.get(name, "none") for trial in own}) for own in (baseline, new)]
-        if known[0] != known[1]:
+        versions = [sorted({trial.record.versions.get(name, "none") for trial in own}) for own in (baseline, new)]
+        if versions[0] != versions[1]:
             lines.append(
-                f"deviation: the baseline was made with {name} {listed(known[0])}, the new trials with "
-                f"{listed(known[1])}"
+                f"deviation: the baseline was made with {name} {listed(versions[0])}, the new trials with "
+                f"{listed(versions[1])}"
             )
     return lines
 
@@ -152,17 +152,17 @@ def _not_worse(verdict: Verdict) -> bool:
     return min(sign * verdict.interval.low, sign * verdict.interval.high) > -verdict.least
 
 
-def _called(version: str, trials: Iterable[TrialResult]) -> list[TrialResult]:
+def _as_version(version: str, trials: Iterable[TrialResult]) -> list[TrialResult]:
     return [replace(trial, config_hash=version) for trial in trials]
 
 
-# ---- the search for the commit that made a trainer worse: halving, where each step is a gate
+# ---- bisection: the search for the commit that made a trainer worse, in which each step is a gate
 
-SPARE = 2  # commits that may be left undecided, and passed over, before the search ends with a range
+SPARE = 2  # undecided commits that the search skips before it ends with a range
 
 
 def most_steps(count: int) -> int:
-    """The most gates that a search among ``count`` commits asks: the last one, halving, and those passed over.
+    """The most gates of a bisection of ``count`` commits: that of the last commit, the halvings, and `SPARE`.
 
     Examples:
         >>> most_steps(1), most_steps(12)
@@ -172,11 +172,11 @@ def most_steps(count: int) -> int:
 
 
 def first_worse(count: int, result: Callable[[int], str | None]) -> tuple[int, int] | None:
-    """(last good, first worse) of the commits 0, which is good, to ``count``; with others between, none is known.
+    """(last good, first worse) of the commits 0 to ``count``; commits between the two remain unknown.
 
-    ``result`` gives a commit's answer against commit 0: ``PASSED``, ``WORSE`` or undecided; None of
-    one that does not train, which costs no step. Quality is taken to have moved once. None where the last commit is not
-    shown to be worse.
+    Commit 0 is good, and quality is assumed to change once. ``result`` gives a commit's result against commit 0:
+    ``PASSED``, ``WORSE``, ``NOT_DECIDED``, or None if it does not train, which is no step. Returns None if the last
+    commit is not worse.
 
     Examples:
         >>> first_worse(12, lambda commit: WORSE if commit >= 7 else PASSED)
@@ -185,9 +185,9 @@ def first_worse(count: int, result: Callable[[int], str | None]) -> tuple[int, i
     if result(count) != WORSE:
         return None
     good, bad, spare = 0, count, SPARE
-    passed_over: set[int] = set()
-    while left := [commit for commit in range(good + 1, bad) if commit not in passed_over]:
-        commit = min(left, key=lambda one: abs(2 * one - good - bad))
+    skipped: set[int] = set()
+    while left := [commit for commit in range(good + 1, bad) if commit not in skipped]:
+        commit = min(left, key=lambda one: abs(2 * one - good - bad))  # the nearest to the middle
         answer = result(commit)
         if answer == PASSED:
             good = commit
@@ -196,6 +196,6 @@ def first_worse(count: int, result: Callable[[int], str | None]) -> tuple[int, i
         elif answer is not None and not spare:
             break
         else:
-            passed_over.add(commit)
+            skipped.add(commit)
             spare -= answer is not None
     return good, bad

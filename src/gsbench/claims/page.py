@@ -1,4 +1,4 @@
-"""The page at the end of a check: claim by claim the verdict and all that it rests on."""
+"""The page of a check: each claim with its verdict and the evidence."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,44 +18,47 @@ from gsbench.runs.declaration import Declaration
 from gsbench.runs.layout import SEED
 from gsbench.words import counted
 
-LARGE = 1000.0  # numbers from here on are counts or seconds, and shown whole
+LARGE = 1000.0  # numbers from here on are counts or seconds, shown without decimals
 OUTCOMES: dict[Outcome, str] = {word: word for word in get_args(Outcome)}
 SYMBOLS = {"supported": "✔", "refuted": "✘", "too small to matter": "≈", "undecided": "?", NOT_TESTABLE: "–"}
 
 
 @dataclass(frozen=True)
-class Section:
-    """One claim, ready to be written."""
+class ClaimSection:
+    """The text of one claim."""
 
     verdict: ClaimVerdict
     headline: str
     evidence: tuple[str, ...]
-    fairness: tuple[Table, ...]  # one for each two arms that are paired: scenes may differ in the initialiser
+    fairness: tuple[Table, ...]  # one per pair of arms: scenes may differ in the initialiser
     trials: tuple[tuple[str, str], ...]  # folder without the seed, and its seeds
     chart: str
 
 
 @dataclass(frozen=True)
 class Page:
-    """Content of the verdicts' page, for HTML and the terminal."""
+    """The content of the page, for HTML and the terminal."""
 
     title: str
     lines: tuple[str, ...]
-    sections: tuple[Section, ...]
+    sections: tuple[ClaimSection, ...]
 
 
 def make_page(
     file: ClaimsFile,
     verdicts: Sequence[ClaimVerdict],
     declared: Declaration,
-    every: Sequence[Declaration],
+    declarations: Sequence[Declaration],
 ) -> Page:
-    """The content of the page: what was ``declared``, of ``every`` declaration under this name, and the verdicts."""
+    """The content of the page.
+
+    ``declared`` is the declaration that the verdicts follow, ``declarations`` are all under the experiment's name.
+    """
     counts = {word: sum(verdict.word == word for verdict in verdicts) for word in SYMBOLS}
     tested = sum(one.word != NOT_TESTABLE for one in verdicts)
     lines = [
         f"{file.paper}. " + ", ".join(f"{count} {word}" for word, count in counts.items() if count) + ".",
-        _declared_line(declared, every),
+        _declared_line(declared, declarations),
     ]
     if tested:
         which = "the verdict" if tested == 1 else f"any of the {tested} verdicts"
@@ -82,11 +85,11 @@ def to_text(page: Page) -> str:
 
 
 def to_html(page: Page) -> str:
-    """The page as one HTML file, with charts and pictures in it; needs no network and no other file."""
+    """The page as one HTML file that needs no network and no other file."""
     return fill("page.html.j2", "gsbench.claims", page=page, symbols=SYMBOLS)
 
 
-def _section(one: ClaimVerdict) -> Section:
+def _section(one: ClaimVerdict) -> ClaimSection:
     claim, verdict, answer = one.claim, one.verdict, one.verdict.answer
     evidence = [f"what would refute it: {claim.refuted_if}"]
     headline = one.reason
@@ -104,7 +107,7 @@ def _section(one: ClaimVerdict) -> Section:
     fairness, mixed = _fairness(one)
     if mixed:
         headline += f". {mixed}"
-    return Section(
+    return ClaimSection(
         one,
         headline,
         tuple(filter(None, evidence)),
@@ -115,7 +118,7 @@ def _section(one: ClaimVerdict) -> Section:
 
 
 def _judged_on(one: ClaimVerdict) -> str:
-    """``judged on 8 trials: 2 scenes, 2 seeds, two arms; ...``; "" where no mean is known."""
+    """``judged on 8 trials: 2 scenes, 2 seeds, two arms; ...``; "" if there is no mean."""
     verdict = one.verdict
     if verdict.answer is None:
         return ""
@@ -127,7 +130,7 @@ def _judged_on(one: ClaimVerdict) -> str:
 
 
 def _like_these(one: ClaimVerdict) -> str:
-    """The statement about scenes like these; "" where the scenes are too few for one."""
+    """The statement about scenes like these; "" with too few scenes."""
     word = one.claim.direction if one.claim.sign else "higher"
     return like_these_words(one.verdict, OUTCOMES, f"it is {word}")
 
@@ -142,17 +145,17 @@ def _late_words(one: ClaimVerdict) -> str:
 
 
 def _fairness(one: ClaimVerdict) -> tuple[tuple[Table, ...], str]:
-    """The fairness sheets of a claim's arms, and what else than the idea may have made a difference (`caveats`)."""
-    trials = with_variants(one.verdict.pairs.trials)  # baseline and arm in turn
-    both = dict.fromkeys((before.arm, after.arm) for before, after in zip(trials[::2], trials[1::2], strict=True))
-    arms = [(before, after) for before, after in both if before != after]
-    sentences = dict.fromkeys(caveats(trials, *two) for two in arms)
-    return tuple(fairness_table(trials, *two) for two in arms), " ".join(filter(None, sentences))
+    """The fairness sheets of a claim's arms, and the `caveats` of comparing them."""
+    trials = with_variants(one.verdict.pairs.trials)  # baseline and arm alternate
+    arms = dict.fromkeys((baseline.arm, new.arm) for baseline, new in zip(trials[::2], trials[1::2], strict=True))
+    pairs = [(baseline, arm) for baseline, arm in arms if baseline != arm]
+    sentences = dict.fromkeys(caveats(trials, *pair) for pair in pairs)
+    return tuple(fairness_table(trials, *pair) for pair in pairs), " ".join(filter(None, sentences))
 
 
-def _declared_line(declared: Declaration, every: Sequence[Declaration]) -> str:
+def _declared_line(declared: Declaration, declarations: Sequence[Declaration]) -> str:
     line = f"The claims were declared {declared.when}. A claim says so if trials had been measured before."
-    earlier = {one.hash for one in every if one.of_claims and one.moment < declared.moment}
+    earlier = {one.hash for one in declarations if one.of_claims and one.moment < declared.moment}
     if earlier:
         line += f" Earlier declarations under this name: {len(earlier)}."
     return line
@@ -170,11 +173,11 @@ def _chart(one: ClaimVerdict) -> str:
 
 
 def _folders(trials: Sequence[TrialResult]) -> tuple[tuple[str, str], ...]:
-    """``("exp/garden/sfm-adc/1a2b3c4d", "seeds 0, 1, 2")`` for each arm of a scene."""
+    """``("exp/garden/sfm-adc/1a2b3c4d", "seeds 0, 1, 2")`` for each scene and arm."""
     groups = group_by(trials, lambda trial: trial.label.rpartition(SEED)[0])
     return tuple((folder, seeds_words(own)) for folder, own in groups.items())
 
 
 def _number(value: float) -> str:
-    """Four digits, and none of powers of ten in large counts."""
+    """A number with four digits; large numbers whole, with thousands separators."""
     return f"{value:,.0f}" if abs(value) >= LARGE else f"{value:.4g}"

@@ -1,9 +1,9 @@
-"""Results of many laboratories in one: a mean of their effects, with an interval whose error rate is known.
+"""Pooling results of many laboratories: the mean of their effects, with an interval whose error rate is known.
 
-A study is one archive's mean difference of two arms in one metric, over the pairs of trials of each scene, as every
-difference here (docs/verdict.md). The units are studies, each with the same weight, by Student's t. Weights from the
-studies' own standard errors would take as known what two or three seeds estimate: with the usual random-effects methods
-7 to 10 % of intervals then miss the mean. A mean only where protocols agree.
+A study is one archive's mean difference of two arms in one metric, over its pairs of trials (docs/verdict.md).
+Student's t tests the mean of studies, each with the same weight. Weights from the studies' standard errors would treat
+estimates from two or three seeds as exact: 7 to 10 % of the intervals of usual random-effects methods then miss the
+mean. Studies are pooled only if their protocols agree.
 """
 
 import math
@@ -29,10 +29,10 @@ MIN_STUDIES = 2
 
 @dataclass(frozen=True)
 class Study:
-    """One archive's difference of two arms in one metric, with its ``interval`` (None of a single pair).
+    """One archive's difference of two arms in one metric, with its ``interval`` (None for a single pair).
 
-    Studies must share a ``protocol`` before a mean of them means anything. ``budget`` says what limited the growth of
-    its arms; "" where nobody knows.
+    Only studies with the same ``protocol`` are pooled. ``budget`` says what limited the growth of its arms; "" if that
+    is unknown.
     """
 
     name: str
@@ -44,7 +44,7 @@ class Study:
 
 @dataclass(frozen=True)
 class Pooled:
-    """Studies with the ``test`` of their mean, None where ``refusal`` says why there is none."""
+    """Studies with the ``test`` of their mean; if there is none, ``refusal`` says why."""
 
     studies: tuple[Study, ...]
     refusal: str = ""
@@ -57,16 +57,16 @@ class Pooled:
 
     @property
     def prediction(self) -> Interval:
-        """The interval in which the effect of a further study would lie."""
+        """The prediction interval of a further study's effect."""
         assert self.test is not None
         reach = self.deviation * math.sqrt(1 + 1 / len(self.studies))
         return replace(self.test, error=reach).interval()
 
 
 def pool(studies: Sequence[Study]) -> Pooled:
-    """The mean of studies; without one, and with the reason, where they follow several protocols.
+    """Pool the studies, unless they are too few or follow several protocols.
 
-    Raises InputError for a study that stands twice.
+    Raises InputError for a study that is given twice.
     """
     names = [study.name for study in studies]
     if twice := sorted({name for name in names if names.count(name) > 1}):
@@ -82,7 +82,7 @@ def pool(studies: Sequence[Study]) -> Pooled:
 
 
 def describe(pooled: Pooled) -> list[str]:
-    """The result in sentences."""
+    """The result of pooling in sentences."""
     test = pooled.test
     if test is None:
         return [f"no mean: {pooled.refusal}"]
@@ -103,10 +103,10 @@ def describe(pooled: Pooled) -> list[str]:
 
 
 @dataclass(frozen=True)
-class Wanted:
-    """The pooled question: names that ``arm`` and ``baseline`` go by in the sources, and our key of the metric.
+class PooledQuestion:
+    """The question to pool: the names that ``arm`` and ``baseline`` may have in the archives, and the metric's key.
 
-    ``where``: only trials of archives with these values of settings count.
+    Only trials whose settings have the values of ``where`` count.
     """
 
     arm: tuple[str, ...]
@@ -116,92 +116,95 @@ class Wanted:
 
 
 @dataclass(frozen=True)
-class Found:
-    """Studies of one source, what they say of themselves, and ``trials`` as marks: none is to be counted twice."""
+class ArchiveStudies:
+    """The studies of one archive, notes on them, and a mark of each trial (`_mark`), so that none is counted twice."""
 
     studies: tuple[Study, ...]
     notes: tuple[str, ...] = ()
     trials: frozenset[str] = frozenset()
 
 
-def read_studies(path: Path, wanted: Wanted, name: str) -> Found:
-    """The studies in the archive ``path``, one for each protocol, called ``name``.
+def read_studies(path: Path, question: PooledQuestion, name: str) -> ArchiveStudies:
+    """The studies in the archive ``path``, one or more for each protocol; their labels begin with ``name``.
 
-    Raises InputError, one line, where there is none.
+    Raises InputError, one line, if there is none.
     """
     studies, notes = [], list[str]()
     with tempfile.TemporaryDirectory() as folder:
-        every = unpack_archive(path, Path(folder)).trials
-        trials = with_variants(select_trials(every, wanted.where))
+        archived = unpack_archive(path, Path(folder)).trials
+        trials = with_variants(select_trials(archived, question.where))
         by_protocol = sorted(group_by(trials, lambda trial: trial.record.protocol).items())
         for protocol, own in by_protocol:
-            groups = _groups(own, _pairs(own, wanted, path))
-            for pairs in groups:
-                told_apart = [protocol] * (len(by_protocol) > 1) + [pairs[0][0].init] * (len(groups) > 1)
-                label = f"{name} ({', '.join(told_apart)})" if told_apart else name
-                found = [
-                    find_pairs(own, Question(metric=wanted.metric, baseline=first, arm=second))
-                    for first, second in pairs
+            groups = _group_into_studies(own, _arm_pairs(own, question, path))
+            for arms in groups:
+                qualifiers = [protocol] * (len(by_protocol) > 1) + [arms[0][0].init] * (len(groups) > 1)
+                label = f"{name} ({', '.join(qualifiers)})" if qualifiers else name
+                pairs_by_arms = [
+                    find_pairs(own, Question(metric=question.metric, baseline=baseline, arm=arm))
+                    for baseline, arm in arms
                 ]
-                together = Pairs(tuple(row for one in found for row in one.rows))
+                together = Pairs(tuple(row for pairs in pairs_by_arms for row in pairs.rows))
                 if not together.rows:
-                    reason = next((f" ({line})" for one in found for line in one.left_out), "")
-                    raise InputError(f"{path}: no trials can be paired in {wanted.metric}{reason}")
+                    reason = next((f" ({line})" for pairs in pairs_by_arms for line in pairs.left_out), "")
+                    raise InputError(f"{path}: no trials can be paired in {question.metric}{reason}")
                 test = t_test(together.differences)
                 mean, interval = float(together.differences.mean()), None if test is None else test.interval()
-                studies.append(Study(label, mean, interval, protocol, _budgets(own, pairs)))
-                for (first, second), paired in zip(pairs, found, strict=True):
-                    count = sum(len(row.seeds) for row in paired.rows)
+                studies.append(Study(label, mean, interval, protocol, _budgets(own, arms)))
+                for (baseline, arm), pairs in zip(arms, pairs_by_arms, strict=True):
+                    count = sum(len(row.seeds) for row in pairs.rows)
                     notes.append(
-                        f"{label}: {second} against {first}, {count} pairs of trials on "
-                        f"{', '.join(paired.scenes)}; {_size(own)}"
+                        f"{label}: {arm} against {baseline}, {count} pairs of trials on "
+                        f"{', '.join(pairs.scenes)}; {_size(own)}"
                     )
-                    notes += [f"{label}: left out, {line}" for line in paired.left_out]
-        return Found(tuple(studies), tuple(notes), frozenset(map(_mark, trials)))
+                    notes += [f"{label}: left out, {line}" for line in pairs.left_out]
+        return ArchiveStudies(tuple(studies), tuple(notes), frozenset(map(_mark, trials)))
 
 
-def _groups(trials: Sequence[TrialResult], pairs: Sequence[tuple[Arm, Arm]]) -> list[list[tuple[Arm, Arm]]]:
-    """Group pairs into studies: all are one where each scene has one initialiser, else each is its own."""
+def _group_into_studies(trials: Sequence[TrialResult], pairs: Sequence[tuple[Arm, Arm]]) -> list[list[tuple[Arm, Arm]]]:
+    """All pairs of arms as one study if each scene has one initialiser; else each pair as its own study."""
     scenes = [{trial.scene for trial in trials if trial.arm in pair} for pair in pairs]
     disjoint = sum(map(len, scenes)) == len(set().union(*scenes))
     return [list(pairs)] if disjoint else [[pair] for pair in pairs]
 
 
-def _pairs(trials: Sequence[TrialResult], wanted: Wanted, path: Path) -> list[tuple[Arm, Arm]]:
-    """(baseline, arm) under each initialiser that has both; a name is that of a densifier, with its variant or not."""
+def _arm_pairs(trials: Sequence[TrialResult], question: PooledQuestion, path: Path) -> list[tuple[Arm, Arm]]:
+    """The pair (baseline, arm) of each initialiser that has both.
+
+    A name of an arm is its densifier, its densifier with its variant, or its full name.
+    """
     arms = sorted({trial.arm for trial in trials})
 
     def named(init: str, names: Sequence[str]) -> list[Arm]:
         own = [arm for arm in arms if arm.init == init]
         return [arm for arm in own if {str(replace(arm, init="")), arm.densify, str(arm)} & {*names}]
 
-    found = []
+    pairs = []
     for init in sorted({arm.init for arm in arms}):
-        ones, others = named(init, wanted.baseline), named(init, wanted.arm)
-        if len(ones) > 1 or len(others) > 1:
-            several = ones if len(ones) > 1 else others
+        baselines, others = named(init, question.baseline), named(init, question.arm)
+        if len(baselines) > 1 or len(others) > 1:
+            several = baselines if len(baselines) > 1 else others
             raise InputError(
                 f"{path}: the name fits {' and '.join(map(str, several))}: choose trials with --where "
                 "KEY=VALUE, or give the whole name of one"
             )
-        if ones and others:
-            found.append((ones[0], others[0]))
-    if not found:
+        if baselines and others:
+            pairs.append((baselines[0], others[0]))
+    if not pairs:
         raise InputError(
-            f"{path} has no pair of {' or '.join(wanted.arm)} and {' or '.join(wanted.baseline)} (there are "
+            f"{path} has no pair of {' or '.join(question.arm)} and {' or '.join(question.baseline)} (there are "
             f"{', '.join(map(str, arms))})"
         )
-    return found
+    return pairs
 
 
 def _budgets(trials: Sequence[TrialResult], pairs: Sequence[tuple[Arm, Arm]]) -> str:
-    """``20,000 Gaussians (governor)``: what limited the growth in these pairs of arms."""
+    """``20,000 Gaussians (governor)``: the limits on growth in these pairs of arms."""
     arms = {arm for pair in pairs for arm in pair}
     return " or ".join(sorted({budget_words(trial) or "not known" for trial in trials if trial.arm in arms}))
 
 
 def _size(trials: Sequence[TrialResult]) -> str:
-    """In which trials of archives may differ without being refused, for people to judge."""
+    """The iterations, view sizes and gsbench versions, in which pooled trials may differ, for the reader to judge."""
     sizes = sorted({f"{size[0]}×{size[1]}" for trial in trials if (size := trial.record.resolution)})
     steps = sorted({f"{trial.record.iterations:,}" for trial in trials})
     versions = sorted({trial.record.versions.get("gsbench", "?") for trial in trials})
@@ -209,7 +212,6 @@ def _size(trials: Sequence[TrialResult]) -> str:
 
 
 def _mark(trial: TrialResult) -> str:
-    """Mark that tells a trial from every other: made again elsewhere, it has other seconds."""
+    """A hash that distinguishes a trial from all others, even from a repetition: that takes other seconds."""
     record = trial.record
-    told = [trial.config_hash, trial.seed, record.hashes, record.seconds, dict(trial.metrics)]
-    return sha256_of(told)
+    return sha256_of([trial.config_hash, trial.seed, record.hashes, record.seconds, dict(trial.metrics)])

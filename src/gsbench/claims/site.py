@@ -1,6 +1,6 @@
-"""A static site from archives of results: a page of arms and scenes with all verdicts, and a report of each archive.
+"""A static site from archives of results: a first page with all verdicts, and a report of each archive.
 
-Archives are strangers' files: their words come into the pages as text alone, and into no name of a file.
+Archives may come from strangers: their texts are escaped in pages, and never used in names of files.
 """
 
 import base64
@@ -22,53 +22,54 @@ from gsbench.analysis.tables import build_table
 from gsbench.analysis.verdicts import headline, judge_pairs
 from gsbench.claims.archive import unpack_archive
 from gsbench.errors import InputError
-from gsbench.runs.declaration import read_declarations, standing_one
+from gsbench.runs.declaration import latest_declaration, read_declarations
 
 INDEX, REPORTS = "index.html", "reports"
 
 
 @dataclass(frozen=True)
-class Part:
-    """An archive's part of the first page."""
+class ExperimentSection:
+    """An experiment's section of the first page."""
 
     name: str
-    key: str  # in names of files and anchors: letters, digits, - and _
+    key: str  # for names of files and anchors: letters, digits, - and _
     facts: tuple[tuple[str, str], ...]
-    claims: tuple[Verdict, ...]  # declared ones, with their verdicts
-    lines: tuple[str, ...]  # verdicts on every two arms that are compared
-    tables: tuple[Table, ...]  # of arms × scenes, one for each quantity
+    claims: tuple[Verdict, ...]  # verdicts on declared claims
+    lines: tuple[str, ...]  # verdicts on compared pairs of arms
+    tables: tuple[Table, ...]  # arms × scenes, one for each quantity
     notes: tuple[str, ...] = ()
 
 
 def write_site(archives: Sequence[Path], out: Path, title: str, scratch: Path) -> list[str]:
-    """Write the site into the folder ``out``; returns a line for each archive that is left out, with the reason.
+    """Write the site into the folder ``out``; return a line for each archive that is left out, with the reason.
 
-    ``scratch`` is an empty folder for what is unpacked. Raises InputError where no archive can be read.
+    Archives are unpacked into the empty folder ``scratch``. Raises InputError if no archive can be shown.
     """
-    parts: list[Part] = []
+    sections: list[ExperimentSection] = []
     left_out: list[str] = []
     (out / REPORTS).mkdir(parents=True, exist_ok=True)
     for number, archive in enumerate(archives):
         try:
             experiment = unpack_archive(archive, scratch / str(number))
-            key = _key(experiment.name, {part.key for part in parts})
-            report, part = build_report(experiment), _part(experiment, key)
+            key = _unique_key(experiment.name, {section.key for section in sections})
+            report, section = build_report(experiment), _section(experiment, key)
         except InputError as error:
             left_out.append(str(error))
             continue
         (out / REPORTS / f"{key}.html").write_text(report, encoding="utf-8")
-        parts.append(part)
-    if not parts:
+        sections.append(section)
+    if not sections:
         raise InputError(f"no archive can be shown ({left_out[0]})")
     script = files("gsbench.claims").joinpath("site.js").read_text(encoding="utf-8")
+    # The page's Content-Security-Policy runs no script but the one with this hash.
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
-    values = {"title": title, "parts": parts, "left_out": left_out, "script": script, "script_hash": digest}
+    values = {"title": title, "sections": sections, "left_out": left_out, "script": script, "script_hash": digest}
     page = fill("site.html.j2", "gsbench.claims", **values)
     (out / INDEX).write_text(page, encoding="utf-8")
     return left_out
 
 
-def _part(experiment: Experiment, key: str) -> Part:
+def _section(experiment: Experiment, key: str) -> ExperimentSection:
     trials, notes = experiment.trials, list[str]()
     claims: tuple[Verdict, ...] = ()
     tables: tuple[Table, ...] = ()
@@ -92,31 +93,32 @@ def _part(experiment: Experiment, key: str) -> Part:
         "machine": ", ".join(sorted({trial.machine or "not recorded" for trial in trials})),
         "gsbench": ", ".join(sorted({trial.record.versions.get("gsbench", "unknown") for trial in trials})),
     }
-    lines = tuple(headline(own) for own in judged)
-    return Part(experiment.name, key, tuple(facts.items()), claims, lines, tables, tuple(notes))
+    lines = tuple(map(headline, judged))
+    return ExperimentSection(experiment.name, key, tuple(facts.items()), claims, lines, tables, tuple(notes))
 
 
 def _claims(experiment: Experiment) -> tuple[Verdict, ...]:
-    """The verdicts on claims that were declared, as `gsbench check --from` makes them; of a gate half is elsewhere."""
+    """The verdicts on declared claims, as `gsbench check --from` gives them, without those of gates."""
     declared = [one for one in read_declarations(experiment.folder) if one.of_claims]
     if not declared:
         return ()
-    judged = judge(experiment.trials, standing_one(declared))
+    judged = judge(experiment.trials, latest_declaration(declared))
+    # A gate's baseline trials are not in this archive.
     return tuple(verdict for verdict in judged if not verdict.question.versions)
 
 
 def _by_quantity(table: Table) -> Iterator[Table]:
-    """A table of arms × scenes for each quantity of one that has all."""
-    end = 0
-    for name, size in table.groups:
-        kept = slice(end, end + size)
-        end += size
-        columns = tuple(replace(column, group="") for column in table.columns[kept])
-        rows = tuple(replace(row, entries=row.entries[kept], rule_above=False) for row in table.rows)
+    """Split a table into one table of arms × scenes per quantity."""
+    start = 0
+    for name, count in table.groups:
+        group = slice(start, start + count)
+        start += count
+        columns = tuple(replace(column, group="") for column in table.columns[group])
+        rows = tuple(replace(row, entries=row.entries[group], rule_above=False) for row in table.rows)
         yield replace(table, title=name, columns=columns, rows=rows, notes=())
 
 
-def _key(name: str, taken: set[str]) -> str:
-    """A name of a file that no other archive has, also where capitals are no difference."""
+def _unique_key(name: str, taken: set[str]) -> str:
+    """A key in lower case that is not ``taken``: file systems may not distinguish capitals."""
     plain = re.sub(r"[^a-z0-9_-]+", "-", name.lower()).strip("-") or "experiment"
     return next(key for n in range(1, len(taken) + 2) if (key := plain if n == 1 else f"{plain}-{n}") not in taken)

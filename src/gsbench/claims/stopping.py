@@ -1,6 +1,6 @@
-"""Adding seeds in planned looks until every question is decided, of a check and of a sweep that stops when decided.
+"""Adding seeds in planned looks until every question is decided, for checks and for sweeps that stop when decided.
 
-In such a sweep every two arms are a question about ``eval.primary``.
+In such a sweep, each compared pair of arms is a question about ``eval.primary``.
 """
 
 import logging
@@ -31,12 +31,12 @@ from gsbench.words import counted
 log = logging.getLogger(__name__)
 
 T = TypeVar("T", bound=Trial)
-Planned = tuple[str, int]  # folder of a trial within its experiment, without the seed; and the seed
+KeyAndSeed = tuple[str, int]  # a trial's key (its folder within the experiment without the seed) and its seed
 
 
-def trials_of_look(declaration: Declaration, places: Sequence[int], seeds: int) -> list[Planned]:
-    """The trials that the questions at ``places`` need for their first ``seeds`` seeds, a seed after the other."""
-    questions = [declaration.questions[k] for k in places]
+def trials_of_look(declaration: Declaration, indices: Sequence[int], seeds: int) -> list[KeyAndSeed]:
+    """The trials that the questions at ``indices`` need for their first ``seeds`` seeds, in the order of seeds."""
+    questions = [declaration.questions[k] for k in indices]
     needed = [
         (question.seeds[rank], rank, key)
         for question in questions
@@ -50,53 +50,54 @@ def trials_of_look(declaration: Declaration, places: Sequence[int], seeds: int) 
 def run_looks(
     declaration: Declaration,
     judged: Callable[[], list[Verdict]],
-    run: Callable[[list[Planned]], object],
+    run: Callable[[list[KeyAndSeed]], object],
 ) -> list[Verdict]:
-    """The verdicts, with seeds added look by look; ``judged`` gives those so far, ``run`` runs trials that are not
-    done.
+    """Add seeds look by look until all questions are decided, and return the verdicts.
 
-    A question whose trials failed waits; the others go on.
+    ``judged`` gives the verdicts so far, ``run`` runs trials unless they are done. A question whose trials failed gets
+    no further seeds; the others continue.
     """
-    waiting: set[int] = set()
+    stuck: set[int] = set()
     verdicts = judged()
     for seeds in declaration.looks:
-        left = [k for k, verdict in enumerate(verdicts) if not verdict.final and k not in waiting]
-        if not left:
+        undecided = [k for k, verdict in enumerate(verdicts) if not verdict.final and k not in stuck]
+        if not undecided:
             break
-        if needed := trials_of_look(declaration, left, seeds):
-            log.info("seeds up to %d: %s for %s", seeds, counted(len(needed), "trial"), counted(len(left), "question"))
+        if needed := trials_of_look(declaration, undecided, seeds):
+            trials, questions = counted(len(needed), "trial"), counted(len(undecided), "question")
+            log.info("seeds up to %d: %s for %s", seeds, trials, questions)
             run(needed)
         verdicts = judged()
-        waiting |= {k for k in left if not verdicts[k].final and verdicts[k].pairs.seeds < seeds}
+        stuck |= {k for k in undecided if not verdicts[k].final and verdicts[k].pairs.seeds < seeds}
     return verdicts
 
 
 @dataclass(frozen=True)
-class Stopping(Generic[T]):
-    """A sweep's trials by folder and seed, with the declaration by which they are run."""
+class SweepInLooks(Generic[T]):
+    """The trials of a sweep that stops when decided, with its declaration."""
 
     declaration: Declaration
     home: Path
-    trials: Mapping[Planned, T]
+    trials: Mapping[KeyAndSeed, T]
 
     def judged(self) -> list[Verdict]:
-        """The verdicts of every two arms, from the trials that are done."""
+        """The verdicts on the pairs of arms from the trials that are done."""
         return judge(read_experiment(self.home).trials if self.home.is_dir() else (), self.declaration)
 
     def describe(self) -> str:
-        """Lines that a dry run prints of the looks."""
-        every, looks = range(len(self.declaration.questions)), self.declaration.looks
-        first, most = (len(trials_of_look(self.declaration, every, seeds)) for seeds in (looks[0], looks[-1]))
-        one = self.declaration.questions[0]
+        """A line about the looks for a dry run."""
+        questions, looks = self.declaration.questions, self.declaration.looks
+        indices = range(len(questions))
+        first, most = (len(trials_of_look(self.declaration, indices, seeds)) for seeds in (looks[0], looks[-1]))
         return (
-            f"stops when decided, by {one.metric} and a least difference of {one.least:g}: "
-            f"{counted(len(every), 'pair')} of "
-            f"arms, looks at {', '.join(map(str, looks))} seeds, {first} trials until the first, {most} at most"
+            f"stops when decided, by {questions[0].metric} and a least difference of {questions[0].least:g}: "
+            f"{counted(len(questions), 'pair')} of arms, looks at {', '.join(map(str, looks))} seeds, "
+            f"{first} trials until the first, {most} at most"
         )
 
 
-def plan_sweep(trials: Sequence[T]) -> Stopping[T]:
-    """The plan of a sweep's trials; raises InputError, one line, where a sweep cannot be looked at seed by seed."""
+def plan_sweep(trials: Sequence[T]) -> SweepInLooks[T]:
+    """Plan the looks of a sweep's trials; raises InputError, one line, if the sweep cannot be run in looks."""
     homes = {TrialFolder.of(trial.values).home for trial in trials}
     metrics = {trial.values["eval"].get("primary") for trial in trials}
     if len(homes) > 1 or len(metrics) > 1:
@@ -127,8 +128,8 @@ def plan_sweep(trials: Sequence[T]) -> Stopping[T]:
             Question(metric=metric, sign=sign, least=least, baseline=baseline, arm=arm, scenes=scenes, seeds=seeds)
         )
     declaration = declared_now(questions=tuple(questions), looks=plan_looks(len(seeds)))
-    by_folder = {(one.key, one.seed): trial for one, trial in zip(expected, trials, strict=True)}
-    return Stopping(declaration, home, by_folder)
+    by_key = {(one.key, one.seed): trial for one, trial in zip(expected, trials, strict=True)}
+    return SweepInLooks(declaration, home, by_key)
 
 
 def headline(verdict: Verdict) -> str:
@@ -143,10 +144,10 @@ def headline(verdict: Verdict) -> str:
 
 
 def _expected(trial: Trial) -> TrialResult:
-    """The trial as if it had run: it has a configuration and no results."""
+    """A trial that has not run as a `TrialResult` without results, so that arms can be paired beforehand."""
     values, folder = trial.values, TrialFolder.of(trial.values).path
     record = TrialRecord(
-        status="complete",  # as the type has it: no file says so
+        status="complete",  # the only status that the type allows; no file has this record
         experiment=values["name"],
         scene=values["scene"]["name"],
         init=values["init"]["name"],
@@ -164,22 +165,22 @@ def _expected(trial: Trial) -> TrialResult:
         hashes={},
         versions={},
     )
-    found = TrialResult(folder, folder.name.partition(SEED)[0], record)
-    return replace(found, settings=Configurations({found.key: flatten(yaml.safe_load(trial.yaml))}))
+    result = TrialResult(folder, folder.name.partition(SEED)[0], record)
+    return replace(result, settings=Configurations({result.key: flatten(yaml.safe_load(trial.yaml))}))
 
 
 def facts_for(metric: str, values: Mapping[str, Any]) -> MetricFacts:
-    """Facts of a metric that trials with the configuration ``values`` have; raises InputError for an unknown one."""
-    known = find(metric)
-    if known is not None:
-        return known
-    from gsbench.pipeline.parts import build_metrics  # a user's own, whose class must be made
+    """The facts of a metric of trials with the configuration ``values``; raises InputError for an unknown metric."""
+    shipped = find(metric)
+    if shipped is not None:
+        return shipped
+    from gsbench.pipeline.parts import build_metrics  # here, since only a user's own metric needs it
 
     return facts_of(metric, build_metrics(values["eval"], values["allow_targets"])[metric])
 
 
 def _seeds(trials: Sequence[TrialResult]) -> tuple[int, ...]:
-    """The seeds that all scenes and arms have, in the order of the sweep; raises InputError where they differ."""
+    """The seeds of all scenes and arms, in the order of the sweep; raises InputError if they differ."""
     groups = group_by(trials, lambda trial: (trial.scene, trial.arm))
     seeds = {key: tuple(dict.fromkeys(trial.seed for trial in group)) for key, group in groups.items()}
     first = next(iter(seeds.values()))
@@ -197,10 +198,10 @@ def _seeds(trials: Sequence[TrialResult]) -> tuple[int, ...]:
 
 
 def _scenes(trials: Sequence[TrialResult], baseline: Arm, arm: Arm) -> dict[str, tuple[str, str]]:
-    """The folders of both arms' trials on each scene that has both."""
+    """The keys of both arms' trials on each scene that has both."""
     scenes = {}
     for scene, group in group_by(trials, lambda trial: trial.scene).items():
-        one, other = ({trial.key for trial in group if trial.arm == side} for side in (baseline, arm))
-        if len(one) == len(other) == 1:
-            scenes[scene] = one.pop(), other.pop()
+        baseline_keys, arm_keys = ({trial.key for trial in group if trial.arm == side} for side in (baseline, arm))
+        if len(baseline_keys) == len(arm_keys) == 1:
+            scenes[scene] = baseline_keys.pop(), arm_keys.pop()
     return scenes

@@ -23,10 +23,10 @@ from gsbench.records import Amount, Record, read_typed
 from gsbench.runs.declaration import (
     Declaration,
     declared_now,
+    merge_planned,
     open_question,
     read_declarations,
     record_text,
-    united,
 )
 from gsbench.runs.experiments import make_home
 from gsbench.runs.layout import DECLARED, PLAN, RESULTS
@@ -163,7 +163,7 @@ def declare(trials: Sequence[Trial]) -> None:
             if latest is not None and given is None:
                 log.info("%s: %s stays declared, since %s", home.name, latest.primary, latest.when)
             before = {} if latest is None else latest.planned
-            together = united(before, asked)
+            together = merge_planned(before, asked)
             same = latest is not None and latest.primary == metric
             if latest is not None and same and (together == before or not latest.names_trials):
                 continue

@@ -143,7 +143,7 @@ class Declaration(Record):
         """All trials that were to be run."""
         found: dict[str, tuple[int, ...]] = dict(self.trials or {})
         for question in self.questions:
-            found = dict(united(found, question.planned))
+            found = dict(merge_planned(found, question.planned))
         return found
 
     @property
@@ -201,7 +201,7 @@ def read_declarations(folder: Path, repeated: Iterable[Declared | None] = ()) ->
     return sorted(found, key=lambda declaration: declaration.moment)
 
 
-def standing_one(declarations: Sequence[Declaration]) -> Declaration:
+def latest_declaration(declarations: Sequence[Declaration]) -> Declaration:
     """The latest of ``declarations``, which are in the order of time, with the time from which on it stood."""
     first = len(declarations) - 1
     while first > 0 and declarations[first - 1].hash == declarations[-1].hash:
@@ -209,7 +209,7 @@ def standing_one(declarations: Sequence[Declaration]) -> Declaration:
     return declarations[first]
 
 
-def united(one: Planned, other: Planned) -> Planned:
+def merge_planned(one: Planned, other: Planned) -> Planned:
     """The trials of both."""
     return {key: tuple(sorted({*one.get(key, ()), *other.get(key, ())})) for key in {**one, **other}}
 

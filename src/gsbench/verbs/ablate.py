@@ -10,10 +10,10 @@ from gsbench.claims.ablation import (
     choose_switches,
     declared_switches,
     judge_runs,
+    markdown_table,
+    off_settings,
+    run_name,
     runs_to_train,
-    table,
-    without,
-    words_of,
 )
 from gsbench.config.compose import Trial
 from gsbench.errors import InputError
@@ -35,7 +35,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
     densify = _only_densifier(first)
     declared = declared_switches(_class_switches(first[0]), first[0].values["densify"])
     switches = choose_switches(declared, options.switches, densify)
-    by_run = {run: _trials([*words, *_words(words_of(run, switches), first[0])]) for run in runs_to_train(switches)}
+    by_run = {run: _trials([*words, *_words(off_settings(run, switches), first[0])]) for run in runs_to_train(switches)}
     _check_different(by_run)
     trials = [trial for group in by_run.values() for trial in group]
     print(
@@ -44,7 +44,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
     )
     for run, group in by_run.items():
         hashes = ", ".join(dict.fromkeys(trial.folder.name.partition(SEED)[0] for trial in group))
-        print(f"  {hashes}: {without(run, list(switches))}")
+        print(f"  {hashes}: {run_name(run, list(switches))}")
     if options.dry_run:
         print("\n".join(describe_plan(trials, trials[0].values["launch"]["parallel"])))
         return 0
@@ -53,7 +53,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
     if code == 0:
         keys = {run: {t.values["scene"]["name"]: t.files.key for t in group} for run, group in by_run.items()}
         metric = options.metric or trials[0].values["eval"].get("primary") or DEFAULT_METRIC
-        print("\n".join(table(judge_runs(read_experiment(home).trials, keys, metric))))
+        print("\n".join(markdown_table(judge_runs(read_experiment(home).trials, keys, metric))))
         print(f"all metrics and pictures: gsbench report {home.name}")
     return code
 

@@ -10,8 +10,8 @@ from pathlib import Path
 
 from gsbench.analysis.results import TrialResult, read_experiment
 from gsbench.app.command import one_trial_per_scene
-from gsbench.claims.gate import BASELINE, NEW, Gate, ask, describe, first_worse, most_steps, result_of
-from gsbench.claims.stopping import Planned, run_looks
+from gsbench.claims.gate import BASELINE, NEW, Gate, declare_gate, describe, first_worse, most_steps, result_of
+from gsbench.claims.stopping import KeyAndSeed, run_looks
 from gsbench.errors import InputError, TrainingError
 from gsbench.external.program import run_program
 from gsbench.files import checked_runs_folder, make_runs_folder
@@ -69,7 +69,7 @@ class CommitSearch:
         good, new = (self.home.parent / f"{self.home.name}_{self.commits[k][0][:HASH_LENGTH]}" for k in (0, number))
         gate = Gate(self.declaration, lambda: _trials(good), lambda: _trials(new))
 
-        def run(planned: Sequence[Planned]) -> None:
+        def run(planned: Sequence[KeyAndSeed]) -> None:
             for version, commit, home in ((BASELINE, 0, good), (NEW, number, new)):
                 self._train(commit, home, [seed for key, seed in planned if key.endswith(f"/{version}")])
 
@@ -121,7 +121,7 @@ def _begin(options: argparse.Namespace, trees: WorkTrees, commits: Sequence[tupl
     arms = {scene: (trial.folder.parent.name,) * 2 for scene, trial in by_scene.items()}
     share = ERROR_RATE / most_steps(len(commits) - 1)  # of each step, so that all together err in 5 % at most
     seeds = range(max(0, options.seeds))
-    declaration = ask(options.metric, options.least, arms, seeds, example.values, share)
+    declaration = declare_gate(options.metric, options.least, arms, seeds, example.values, share)
     settings = [word for word in options.settings if not word.startswith(("name=", "runs="))]
     runs = checked_runs_folder(str(example.files.runs))
     make_runs_folder(runs)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from gsbench.claims.check import Check, prepare, recheck
 from gsbench.claims.file import ClaimsFile, read_claims
-from gsbench.claims.stopping import Planned, run_looks
+from gsbench.claims.stopping import KeyAndSeed, run_looks
 from gsbench.config.trust import PERMISSIONS
 from gsbench.errors import InputError
 from gsbench.files import make_runs_folder, place_of, write_text
@@ -123,7 +123,7 @@ def _run(check: Check) -> None:
     make_runs_folder(check.runs)
     check = replace(check, declaration=declare_questions(check.home, check.declaration))
 
-    def run(planned: Sequence[Planned]) -> None:
+    def run(planned: Sequence[KeyAndSeed]) -> None:
         unfinished = [trial for trial in check.to_run(planned) if trial.files.why_not_done(trial.values)]
         if unfinished:
             run_batch(unfinished)

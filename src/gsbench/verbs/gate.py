@@ -8,8 +8,8 @@ from gsbench.analysis.cells import select_trials
 from gsbench.analysis.results import TrialResult, group_by, read_experiment
 from gsbench.app.command import one_trial_per_scene, run_trials
 from gsbench.claims.archive import unpack_archive
-from gsbench.claims.gate import NEW, NOT_DECIDED, PASSED, WORSE, Gate, ask, describe, deviations, result_of
-from gsbench.claims.stopping import Planned, run_looks
+from gsbench.claims.gate import NEW, NOT_DECIDED, PASSED, WORSE, Gate, declare_gate, describe, deviations, result_of
+from gsbench.claims.stopping import KeyAndSeed, run_looks
 from gsbench.config.compose import Trial, with_seed
 from gsbench.errors import GsbenchError, InputError
 from gsbench.files import checked_runs_folder, make_runs_folder
@@ -42,7 +42,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
         baseline = _baseline(select_trials(archived, dict(options.where)), by_scene)
         seeds = _seeds(baseline, options.seeds)
         arms = {scene: (_arm(old[0]), by_scene[scene].folder.parent.name) for scene, old in baseline.items()}
-        declaration = ask(options.metric, options.least, arms, seeds, example.values)
+        declaration = declare_gate(options.metric, options.least, arms, seeds, example.values)
         trials = {
             (trial_key(scene, arms[scene][1], NEW), seed): with_seed(trial, seed)
             for scene, trial in by_scene.items()
@@ -52,7 +52,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
         old = [trial for of_scene in baseline.values() for trial in of_scene if trial.seed in seeds]
         gate = Gate(declare_questions(home, declaration), lambda: old, lambda: _done(home, list(trials.values())))
 
-        def run(planned: Sequence[Planned]) -> None:
+        def run(planned: Sequence[KeyAndSeed]) -> None:
             if code := run_trials([trials[key] for key in planned if key in trials]):
                 raise (InputError if code == 2 else GsbenchError)("the new version's trials fail: nothing is compared")
 

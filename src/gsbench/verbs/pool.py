@@ -7,7 +7,7 @@ from pathlib import Path
 
 from gsbench.analysis.pairing import BASELINE
 from gsbench.analysis.quantities import asked_quantity
-from gsbench.claims.pooling import Pooled, Wanted, describe, pool, read_studies
+from gsbench.claims.pooling import Pooled, PooledQuestion, describe, pool, read_studies
 from gsbench.errors import InputError
 from gsbench.verbs.arguments import ArgumentParser, add_where, names, path
 
@@ -30,7 +30,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
     add_where(parser)
     parser.add_argument("--protocol", help="only studies by this one, such as paper-1")
     options = parser.parse_args(argv)
-    wanted = Wanted(options.arm, options.baseline, options.metric, dict(options.where))
+    wanted = PooledQuestion(options.arm, options.baseline, options.metric, dict(options.where))
     pooled, notes, faults = pool_sources(options.sources, wanted, options.protocol)
     title = f"{options.arm[0]} against {options.baseline[0]}"
     shown = asked_quantity(options.metric)
@@ -43,7 +43,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
 
 
 def pool_sources(
-    sources: Sequence[Path], wanted: Wanted, protocol: str | None = None
+    sources: Sequence[Path], wanted: PooledQuestion, protocol: str | None = None
 ) -> tuple[Pooled, list[str], list[str]]:
     """Pool all studies in ``sources``: (their mean, notes on them, a line for each source or study that is left out).
 
