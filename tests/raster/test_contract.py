@@ -21,7 +21,7 @@ from gsbench.raster.contract import (
     footprint_errors,
     render_with_gradients,
 )
-from gsbench.raster.executors import Executor, find, offers
+from gsbench.raster.executors import Executor, find_executor, offers
 from gsbench.raster.reference import ReferenceRasterizer
 from gsbench.scene.camera import Camera
 from tests.raster.strategies import extreme_gaussians
@@ -42,7 +42,7 @@ def _available() -> list[str]:
 
 @pytest.fixture(params=_available())
 def device(request: pytest.FixtureRequest) -> str:
-    return _home(find(request.param))
+    return _home(find_executor(request.param))
 
 
 @pytest.fixture
@@ -66,7 +66,7 @@ def test_values_and_gradients_match_the_reference(rasterizer: Rasterizer, device
         assert error < GRADIENT_TOLERANCE, f"{name}: relative error {error:.2e}"
         if not (name == "sh_rest" and case.sh_degree == 0):
             assert reference.abs().max() > 0, name
-    assert find(rasterizer.name).has_footprint
+    assert find_executor(rasterizer.name).has_footprint
     assert offers(rasterizer.name, "has_splitting_matrix")  # so it was compared
     assert "splitting_probe" in gradients
     assert max(footprint_errors(output, expected).values()) < FOOTPRINT_TOLERANCE  # asked after the backward pass

@@ -16,7 +16,7 @@ from gsbench.errors import InputError
 from gsbench.pipeline.parts import locate
 from gsbench.raster import create_rasterizer, executors, resolve_name
 from gsbench.raster.contract import CASES, departures
-from gsbench.raster.executors import EXECUTORS, Executor, find, resolve
+from gsbench.raster.executors import EXECUTORS, Executor, find_executor, resolve
 from gsbench.raster.reference import ReferenceRasterizer
 from gsbench.system.install import conf_dir, install_command
 
@@ -78,7 +78,7 @@ def test_what_cannot_run_is_said_with_what_can(monkeypatch: pytest.MonkeyPatch) 
     installed(monkeypatch)
     with pytest.raises(InputError, match=f"raster=gsplat needs gsplat: {re.escape(install_command('gsplat'))}"):
         resolve("gsplat", "cuda")
-    assert find("gsplat").obstacle("cuda") is not None
+    assert find_executor("gsplat").obstacle("cuda") is not None
 
 
 @pytest.mark.parametrize(
@@ -87,7 +87,7 @@ def test_what_cannot_run_is_said_with_what_can(monkeypatch: pytest.MonkeyPatch) 
 def test_triton_has_a_least_version(version: str, is_old: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     installed(monkeypatch, "triton", "gsplat")
     monkeypatch.setattr(importlib.metadata, "version", lambda package: version)
-    assert (find("triton").obstacle("cuda") is not None) == is_old
+    assert (find_executor("triton").obstacle("cuda") is not None) == is_old
     assert resolve("auto", "cuda").name == ("gsplat" if is_old else "triton")
     if is_old:
         with pytest.raises(InputError, match=rf"raster=triton needs triton 3.4 or newer, and {version} is installed: "):

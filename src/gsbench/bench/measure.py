@@ -15,7 +15,7 @@ from gsbench.errors import InputError
 from gsbench.logs import Progress, progress
 from gsbench.pipeline.parts import build_rasterizer
 from gsbench.raster.base import Rasterizer
-from gsbench.raster.executors import find
+from gsbench.raster.executors import find_executor
 from gsbench.system.isolate import run_isolated
 from gsbench.system.resources import peak_memory_mb, reset_peak_memory
 from gsbench.train.device import disable_tf32
@@ -115,7 +115,7 @@ def device_of(raster: str) -> torch.device:
     """The device on which ``raster`` is timed: a GPU if it needs one, or is a user's own class and there is one."""
     if "." in raster:
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    device = torch.device("cpu" if find(raster).runs_on("cpu") else "cuda")
+    device = torch.device("cpu" if find_executor(raster).runs_on("cpu") else "cuda")
     if device.type == "cuda" and not torch.cuda.is_available():
         raise InputError(f"raster={raster} runs on a CUDA device, and torch finds none here")
     return device

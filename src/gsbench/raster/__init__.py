@@ -1,6 +1,6 @@
-"""Rasterizers: one contract (``raster.base``), several executors (``raster.executors``), chosen by name.
+"""Rasterizers: one contract (``raster.base``) and several executors (``raster.executors``), chosen by name.
 
-Loads no torch before a rasterizer is made.
+Does not import torch until a rasterizer is made.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ if TYPE_CHECKING:
 
 
 def resolve_name(name: str, device: torch.device) -> str:
-    """The executor that ``name`` (``auto`` included) means on ``device``; raises InputError where it cannot run
-    there."""
+    """The name of the executor that ``name``, perhaps ``auto``, selects on ``device``. Raises InputError if it cannot
+    run there."""
     return resolve(name, device.type).name
 
 
 def create_rasterizer(name: str, device: torch.device, threads: int | None = None) -> Rasterizer:
-    """The executor called ``name`` (see ``resolve_name``) for ``device``, on ``threads`` CPU threads where that
-    applies."""
+    """Make the rasterizer that ``name``, perhaps ``auto``, selects on ``device``; ``threads`` limits the CPU threads of
+    ``cpu``."""
     executor = resolve(name, device.type)
     module, _, attribute = executor.target.rpartition(".")
     kind = getattr(importlib.import_module(module), attribute)

@@ -1,4 +1,4 @@
-"""The contract of every rasterizer: what goes in, what comes out, and the constants of 3DGS. Loads no torch."""
+"""The contract of every rasterizer: inputs, outputs, and the constants of 3DGS. Does not import torch."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class RasterConstants:
-    """The numbers of the 2023 reference implementation of 3DGS (Kerbl et al.), in the order of the pipeline."""
+    """Constants of the 2023 code of 3DGS (Kerbl et al.), in the order of the pipeline."""
 
     near: float = 0.2  # world units; a Gaussian whose centre has view z <= near is culled
     fov_margin: float = 0.3  # the Jacobian's x/z, y/z are clamped to the image plus 0.3 tan(fov/2) on each side
     blur: float = 0.3  # px^2, added to the diagonal of the 2D covariance
     sigma_extent: float = 3.0  # radius = ceil(3 sqrt(lambda_max)) px
     eigenvalue_floor: float = 0.1  # inside the square root of lambda_max
-    tile: int = 16  # px; a Gaussian reaches every pixel of every tile that its square of 2 radius touches
-    alpha_min: float = 1.0 / 255.0  # a contribution below is skipped
-    alpha_max: float = 0.99  # a contribution is clamped to it (the gradient passes, as in the reference)
-    transmittance_min: float = 1e-4  # a pixel stops before the Gaussian that would bring it below
+    tile: int = 16  # px; a Gaussian reaches all pixels of the tiles that its square of side 2 radius touches
+    alpha_min: float = 1.0 / 255.0  # a smaller alpha is skipped
+    alpha_max: float = 0.99  # a larger alpha is clamped to it (its gradient passes, as in 3DGS)
+    transmittance_min: float = 1e-4  # a pixel stops before the Gaussian that would lower it below this
 
 
 CONSTANTS = RasterConstants()
 
 
 def slope_limits(camera: Camera, constants: RasterConstants = CONSTANTS) -> tuple[float, float, float, float]:
-    """The limits of x/z (least, most) and of y/z in the Jacobian of a projection (`RasterConstants.fov_margin`)."""
+    """The limits in the Jacobian of a projection (`RasterConstants.fov_margin`): x/z least, most; y/z least, most."""
     margin_x = constants.fov_margin * camera.width / (2 * camera.fx)
     margin_y = constants.fov_margin * camera.height / (2 * camera.fy)
     return (
@@ -43,8 +43,8 @@ def slope_limits(camera: Camera, constants: RasterConstants = CONSTANTS) -> tupl
 
 
 def projection_numbers(camera: Camera) -> list[float]:
-    """A camera as the compiled kernels take it: focal lengths and principal point, px, with integer pixel centres;
-    limits of the slopes; rotation, row by row; centre."""
+    """A camera as numbers for compiled kernels: focal lengths, px; principal point, px, with integer pixel centres;
+    limits of the slopes; rotation by rows; centre."""
     return [
         camera.fx,
         camera.fy,
@@ -58,16 +58,16 @@ def projection_numbers(camera: Camera) -> list[float]:
 
 @dataclass(frozen=True)
 class Footprint:
-    """The pixels of one view that each Gaussian is blended into: those where its alpha is not skipped and that have not
-    stopped before it.
+    """Facts of the pixels of one view that each Gaussian is blended into.
 
-    All are [N] and carry no gradient; where there is no such pixel, all but ``depths`` are 0.
+    These are the pixels where its alpha is not skipped and that have not stopped before it. All fields are [N] and have
+    no gradient. For a Gaussian without such pixels, all but ``depths`` are 0.
     """
 
-    pixels: Tensor  # int32, how many
+    pixels: Tensor  # int32, number of pixels
     depths: Tensor  # view z of the mean, world units
-    values: Tensor  # sum over them of the values that were asked about; 0 where none were
-    distances: Tensor  # sum over them of the distance from the projected mean to the pixel's centre, px
+    values: Tensor  # sum over the pixels of the given values; 0 if none were given
+    distances: Tensor  # px, sum over the pixels of the distance from the projected mean to the pixel's centre
 
 
 def view_depths(gaussians: Gaussians, camera: Camera) -> Tensor:
@@ -75,8 +75,8 @@ def view_depths(gaussians: Gaussians, camera: Camera) -> Tensor:
     return gaussians.means.detach() @ gaussians.means.new_tensor(camera.rotation[2]) + camera.translation[2]
 
 
-class FootprintOf(Protocol):
-    """A request for a footprint, for one view that was rendered."""
+class FootprintFunction(Protocol):
+    """Computes the footprint of one rendered view."""
 
     def __call__(self, values: Tensor | None = None) -> Footprint: ...
 
@@ -85,21 +85,18 @@ class FootprintOf(Protocol):
 class RenderOutput:
     """One rendered view.
 
-    ``image`` is [H, W, 3], not clamped above; ``alpha`` is [H, W]; ``radii`` is [N] int32 in px, 0 where a Gaussian was
-    culled. ``screen_points`` is [N, 2], all zero, and a leaf: after ``backward`` its ``.grad`` is the gradient of the
-    loss with respect to the projected means in NDC units, as 3DGS's densification reads it (pixel gradient times W/2,
-    H/2). ``screen_gradient_abs`` is [N, 2], filled by ``backward`` with the same sum over pixels of absolute values
-    (AbsGS, arXiv 2404.10484), or None if it was not asked for.
-
-    ``footprint()`` says which pixels each Gaussian was blended into; ``footprint(values)`` sums ``values`` [H, W] over
-    them too. It takes its time when it is called, which may be after ``backward``. None where the rasterizer cannot
-    say.
-
-    ``splitting_probe`` is [N, 3, 3], all zero, and a leaf, or None if it was not asked for: after ``backward`` its
-    ``.grad`` is each Gaussian's splitting matrix in this view, per world unit squared (SteepGS, arXiv 2505.05587): the
-    sum over pixels of (d loss / d s) times the second derivative of s by the position of the mean, for s the opacity
-    times the density at the pixel, before the clamp to ``alpha_max``. The projection is taken as linear there and the
-    covariance on the image as fixed.
+    - ``image`` is [H, W, 3], not clamped above; ``alpha`` is [H, W].
+    - ``radii`` is [N] int32 in px, 0 for culled Gaussians.
+    - ``screen_points`` is [N, 2], a leaf of zeros. After ``backward``, its ``.grad`` is the gradient of the loss by the
+      projected means in NDC units, as in 3DGS (pixel gradient times W/2, H/2).
+    - ``screen_gradient_abs`` is [N, 2], or None if not requested. ``backward`` fills it with the same gradient, but
+      with the absolute value taken at each pixel before the sum (AbsGS, arXiv 2404.10484).
+    - ``footprint()`` computes the `Footprint` of this view, also after ``backward``; ``footprint(values)`` sums
+      ``values`` [H, W] over its pixels, too. None if the rasterizer has no footprints.
+    - ``splitting_probe`` is [N, 3, 3], a leaf of zeros, or None if not requested. After ``backward``, its ``.grad`` is
+      the splitting matrix of each Gaussian in this view, per world unit squared (SteepGS, arXiv 2505.05587): the sum
+      over pixels of (d loss / d s) times the second derivative of s by the mean. s is the opacity times the density at
+      the pixel, before the clamp to ``alpha_max``. Here the projection is linearised and the 2D covariance is constant.
     """
 
     image: Tensor
@@ -107,7 +104,7 @@ class RenderOutput:
     radii: Tensor
     screen_points: Tensor
     screen_gradient_abs: Tensor | None = None
-    footprint: FootprintOf | None = None
+    footprint: FootprintFunction | None = None
     splitting_probe: Tensor | None = None
 
     @property
@@ -116,14 +113,14 @@ class RenderOutput:
         return self.radii > 0
 
     def require_footprint(self, values: Tensor | None = None) -> Footprint:
-        """``footprint(values)``. Raises RuntimeError where the rasterizer cannot say."""
+        """Return ``footprint(values)``. Raises RuntimeError if the rasterizer has no footprints."""
         if self.footprint is None:
             raise RuntimeError("this densifier needs RenderOutput.footprint, which the rasterizer does not give")
         return self.footprint(values)
 
     def require_splitting_matrix(self) -> Tensor:
-        """The splitting matrices [N, 3, 3] of this view. Raises RuntimeError where they were not asked for, or before
-        ``backward``."""
+        """Return the splitting matrices [N, 3, 3] of this view. Raises RuntimeError if they were not requested, and
+        before ``backward``."""
         if self.splitting_probe is None or self.splitting_probe.grad is None:
             raise RuntimeError(
                 "this densifier needs splitting matrices: render with splitting_matrix=True, then backward"
@@ -132,14 +129,14 @@ class RenderOutput:
 
 
 class Rasterizer(Protocol):
-    """An executor of the contract; every one passes ``tests/raster/test_contract.py``.
+    """The contract of rasterizers; ``tests/raster/test_contract.py`` tests all executors.
 
-    One of a user's that gives ``RenderOutput.footprint``, which is optional, has a class attribute ``has_footprint =
-    True``; one that gives splitting matrices has ``has_splitting_matrix = True``, and its ``render`` has one argument
-    more, ``splitting_matrix: bool = False``.
+    Two outputs are optional. A class that gives ``RenderOutput.footprint`` has the class attribute ``has_footprint =
+    True``. A class that gives splitting matrices has ``has_splitting_matrix = True``, and its ``render`` has a further
+    argument ``splitting_matrix: bool = False``.
 
     Examples:
-        The reference without colours; `departures` says what is not as the contract wants it.
+        The reference without colours. `departures` lists where it differs from the contract.
 
         >>> from gsbench.raster.contract import Case, departures
         >>> from gsbench.raster.reference import ReferenceRasterizer
@@ -169,7 +166,7 @@ class Rasterizer(Protocol):
     ) -> RenderOutput:
         """Render ``gaussians`` from ``camera`` with harmonics up to ``sh_degree`` (0 to 3) over ``background`` [3].
 
-        Differentiable in the six tensors of ``gaussians`` and in ``screen_points``. Pixel (column i, row j) is sampled
-        at its centre: a point projects to ``fx x/z + cx - 0.5`` in units where pixel centres are integers.
+        Differentiable in the six tensors of ``gaussians`` and in ``screen_points``. Pixels are sampled at their
+        centres, which are integers: a point projects to ``fx x/z + cx - 0.5``.
         """
         ...

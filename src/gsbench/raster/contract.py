@@ -1,6 +1,6 @@
-"""Test of the contract of ``raster.base``: a rasterizer's seeded scenes against the float64 reference.
+"""A test of the contract of ``raster.base``: it compares a rasterizer with the float64 reference on seeded scenes.
 
-gsbench's own executors are tested with the same scenes. For a rasterizer of your own, in a test of yours:
+gsbench tests its own executors with the same scenes. To test yours:
 
     assert departures(MyRasterizer()) == []
 """
@@ -19,12 +19,12 @@ from gsbench.scene.camera import Camera
 
 VALUE_TOLERANCE = 1e-4  # of image and alpha
 GRADIENT_TOLERANCE = 1e-3  # of the largest entry of each gradient
-FOOTPRINT_TOLERANCE = 1e-3  # of each sum: a pixel at the edge of being skipped may fall on the other side
+FOOTPRINT_TOLERANCE = 1e-3  # of each sum: rounding may skip a pixel whose alpha is nearly 1/255, or not
 
 
 @dataclass(frozen=True)
 class Case:
-    """One seeded scene with its camera; ``principal`` is the offset of the principal point in px."""
+    """A seeded scene with its camera. ``principal`` is the offset of the principal point from the image centre, px."""
 
     width: int
     height: int
@@ -54,7 +54,7 @@ class Case:
         )
 
     def gaussians(self) -> Gaussians:
-        """float64 values that float32 holds exactly; some lie behind the camera or outside the image."""
+        """float64 values that are exact in float32; some Gaussians are behind the camera or outside the image."""
         generator = torch.Generator().manual_seed(self.width * 1000 + self.count)
 
         def normal(*shape: int) -> Tensor:
@@ -87,20 +87,20 @@ CASES = (
 def render_with_gradients(
     rasterizer: Rasterizer, case: Case, dtype: torch.dtype, device: str = "cpu"
 ) -> tuple[RenderOutput, dict[str, Tensor]]:
-    """A render of ``case`` and the gradients of a fixed random weighting of the image and its alpha, in float64.
+    """Render ``case``; also return gradients, as float64 on the CPU, of a fixed random weighting of image and alpha.
 
-    With the splitting matrices, where the rasterizer offers them.
+    Includes the splitting matrices if the rasterizer offers them.
     """
     gaussians = case.gaussians().map(lambda tensor: tensor.to(device, dtype).requires_grad_())
     background = torch.tensor([0.2, 0.5, 0.9], dtype=dtype, device=device)
-    beyond = {"splitting_matrix": True} if offers(rasterizer.name, "has_splitting_matrix", rasterizer) else {}
-    output = rasterizer.render(gaussians, case.camera(), case.sh_degree, background, absolute_gradient=True, **beyond)
+    extra = {"splitting_matrix": True} if offers(rasterizer.name, "has_splitting_matrix", rasterizer) else {}
+    output = rasterizer.render(gaussians, case.camera(), case.sh_degree, background, absolute_gradient=True, **extra)
     generator = torch.Generator().manual_seed(7)
     weights = torch.randn(case.height, case.width, 4, generator=generator, dtype=torch.float64).to(device, dtype)
     ((output.image * weights[..., :3]).sum() + (output.alpha * weights[..., 3]).sum()).backward()
     gradients = {name: tensor.grad for name, tensor in gaussians.tensors().items()}
     gradients |= {"screen_points": output.screen_points.grad, "screen_gradient_abs": output.screen_gradient_abs}
-    if beyond:
+    if extra:
         gradients["splitting_probe"] = output.require_splitting_matrix()
     return output, {
         name: torch.zeros(()) if gradient is None else gradient.detach().cpu().double()
@@ -109,10 +109,10 @@ def render_with_gradients(
 
 
 def departures(rasterizer: Rasterizer, device: str = "cpu", cases: tuple[Case, ...] = CASES) -> list[str]:
-    """List the departures of ``rasterizer``, in float32 on ``device``, from the contract, one line each; [] if none.
+    """List where ``rasterizer``, in float32 on ``device``, departs from the contract, one line each; [] if nowhere.
 
-    Compares image, alpha, radii, all gradients and, where they are offered, the footprint and the splitting matrices of
-    ``cases`` with the reference, and looks at a scene without Gaussians. Takes seconds.
+    For all ``cases``, it compares image, alpha, radii, all gradients and, if offered, footprint and splitting matrices
+    with the reference. It also tests a scene without Gaussians. Takes seconds.
     """
     return [line for case in cases for line in _compare(rasterizer, case, device)] + _without_gaussians(
         rasterizer, device
@@ -125,56 +125,56 @@ def _compare(rasterizer: Rasterizer, case: Case, device: str) -> list[str]:
         output, gradients = render_with_gradients(rasterizer, case, torch.float32, device)
     except (RuntimeError, ValueError, TypeError, NotImplementedError) as error:
         return [f"{case}: {type(error).__name__}: {error}"]
-    found = []
+    lines = []
     for name in ("image", "alpha"):
         value, reference = getattr(output, name).detach().cpu().double(), getattr(expected, name).detach()
         if value.shape != reference.shape:
-            found.append(f"{case}: {name} has shape {tuple(value.shape)}, expected {tuple(reference.shape)}")
+            lines.append(f"{case}: {name} has shape {tuple(value.shape)}, expected {tuple(reference.shape)}")
         elif not (off := _largest(value - reference)) < VALUE_TOLERANCE:
-            found.append(f"{case}: {name} is off by up to {off:.2e}")
+            lines.append(f"{case}: {name} is off by up to {off:.2e}")
     if output.radii.dtype != torch.int32:
-        found.append(f"{case}: radii are {output.radii.dtype}, expected torch.int32")
+        lines.append(f"{case}: radii are {output.radii.dtype}, expected torch.int32")
     elif not torch.equal(output.radii.cpu(), expected.radii):
         different = int((output.radii.cpu() != expected.radii).sum())
-        found.append(f"{case}: radii differ for {different} of {case.count} Gaussians")
+        lines.append(f"{case}: radii differ for {different} of {case.count} Gaussians")
     for name, reference in references.items():
         if name == "splitting_probe" and name not in gradients:
-            continue  # it is an offer
-        if reference.dim() == 0:  # autograd found none: at degree 0 nothing depends on ``sh_rest``
+            continue  # optional
+        if reference.dim() == 0:  # no gradient: at degree 0 nothing depends on ``sh_rest``
             reference = torch.zeros_like(gradients[name])
         if gradients[name].shape != reference.shape:
-            found.append(f"{case}: there is no gradient of {name}")
+            lines.append(f"{case}: there is no gradient of {name}")
             continue
         off = _largest(gradients[name] - reference) / max(_largest(reference), 1e-30)
         if not off < GRADIENT_TOLERANCE:
-            found.append(f"{case}: the gradient of {name} is off by {off:.2e} of its largest entry")
+            lines.append(f"{case}: the gradient of {name} is off by {off:.2e} of its largest entry")
     if output.footprint is not None:
         for name, off in footprint_errors(output, expected).items():
             if not off < FOOTPRINT_TOLERANCE:
-                found.append(f"{case}: the {name} of the footprint are off by {off:.2e} of their sum")
-    return found
+                lines.append(f"{case}: the {name} of the footprint are off by {off:.2e} of their sum")
+    return lines
 
 
 def footprint_errors(output: RenderOutput, expected: RenderOutput) -> dict[str, float]:
-    """The error of each part of ``output``'s footprint against that of ``expected``, relative to the sum of all."""
+    """The error of each field of ``output``'s footprint against ``expected``, relative to the field's sum."""
     height, width = expected.alpha.shape
     values = torch.rand(height, width, generator=torch.Generator().manual_seed(8), dtype=torch.float64)
     assert output.footprint is not None
     assert expected.footprint is not None
     footprint, reference = output.footprint(values.to(output.alpha)), expected.footprint(values)
     errors = {}
-    for name, right in vars(reference).items():
-        error = (getattr(footprint, name).cpu().double() - right).abs().sum()
-        errors[name] = float(error / right.abs().sum().double().clamp_min(1e-30))
+    for name, correct in vars(reference).items():
+        error = (getattr(footprint, name).cpu().double() - correct).abs().sum()
+        errors[name] = float(error / correct.abs().sum().double().clamp_min(1e-30))
     return errors
 
 
 def _without_gaussians(rasterizer: Rasterizer, device: str) -> list[str]:
     case = CASES[0]
-    none = case.gaussians().map(lambda tensor: tensor[:0].to(device, torch.float32).requires_grad_())
+    empty = case.gaussians().map(lambda tensor: tensor[:0].to(device, torch.float32).requires_grad_())
     background = torch.tensor([0.1, 0.2, 0.3], device=device)
     try:
-        output = rasterizer.render(none, case.camera(), case.sh_degree, background)
+        output = rasterizer.render(empty, case.camera(), case.sh_degree, background)
         output.image.sum().backward()
     except (RuntimeError, ValueError, TypeError, IndexError, ZeroDivisionError) as error:
         return [f"without Gaussians: {type(error).__name__}: {error}"]

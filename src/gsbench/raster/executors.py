@@ -1,6 +1,6 @@
-"""The executors that come with gsbench, as one table of facts that everything asks, and the setting that picks one.
+"""The table of gsbench's executors, and the settings that choose one. Does not import torch.
 
-Loads no torch. A rasterizer of your own needs no entry: ``raster._target_=mine.MyRasterizer`` (docs/rasterizer.md).
+A rasterizer of your own needs no entry: ``raster._target_=mine.MyRasterizer`` (docs/rasterizer.md).
 """
 
 import importlib.metadata
@@ -27,30 +27,30 @@ AUTO = "auto"
 
 @dataclass(frozen=True)
 class Executor:
-    """Facts of an executor that are known before it is loaded."""
+    """Facts of an executor that are known before its module is imported."""
 
     name: str  # as in ``raster=NAME``, in results and in tables
     target: str  # import path of its class
-    devices: tuple[str, ...]  # types of torch devices that it runs on; empty: on any
-    text: str  # what it is, in one line
-    package: str | None = None  # what it imports beyond gsbench's own requirements
+    devices: tuple[str, ...]  # types of torch devices that it runs on; empty: all
+    text: str  # description in one line
+    package: str | None = None  # a package that it needs beyond gsbench's own requirements
     install: str = ""  # how to get that package
-    minimum: tuple[int, int] | None = None  # the oldest version of it that works
+    minimum: tuple[int, int] | None = None  # the oldest version of the package that works
     upgrade: str = ""  # how to get that version
     takes_threads: bool = False  # its class has an argument ``threads``
-    has_footprint: bool = True  # its renders say which pixels each Gaussian covers
-    has_splitting_matrix: bool = True  # its backward pass gives splitting matrices
+    has_footprint: bool = True  # it gives ``RenderOutput.footprint``
+    has_splitting_matrix: bool = True  # it gives ``RenderOutput.splitting_probe``
 
     @property
     def is_installed(self) -> bool:
-        """Return whether the executor's package can be found; nothing is imported."""
+        """Return whether its package is installed; imports nothing."""
         return self.package is None or importlib.util.find_spec(self.package) is not None
 
     def runs_on(self, device_type: str) -> bool:
         return not self.devices or device_type in self.devices
 
     def obstacle(self, device_type: str) -> str | None:
-        """The reason why it cannot run here on a device of this type, and what to do about it; None if it can."""
+        """Why it cannot run here on a device of this type, and the remedy; None if it can run."""
         if not self.runs_on(device_type):
             needed = " or ".join(self.devices)
             others = ", ".join(other.name for other in EXECUTORS if other.runs_on(device_type))
@@ -60,21 +60,21 @@ class Executor:
         return self.too_old()
 
     def too_old(self) -> str | None:
-        """Advice about a package that is older than ``minimum``; None if it is not, or its version is not known."""
+        """The remedy if its package is older than ``minimum``; None if it is new enough or of unknown version."""
         if self.package is None or self.minimum is None:
             return None
         try:
-            found = importlib.metadata.version(self.package)
-        except importlib.metadata.PackageNotFoundError:  # for one GPU or another it goes by other names
+            installed = importlib.metadata.version(self.package)
+        except importlib.metadata.PackageNotFoundError:  # the distribution for some GPUs has another name
             return None
-        numbers = [int(number) for number in re.findall(r"\d+", found)[:2]]
+        numbers = [int(number) for number in re.findall(r"\d+", installed)[:2]]
         if tuple(numbers) >= self.minimum:
             return None
-        wanted = ".".join(map(str, self.minimum))
-        return f"needs {self.package} {wanted} or newer, and {found} is installed: {self.upgrade}"
+        minimum = ".".join(map(str, self.minimum))
+        return f"needs {self.package} {minimum} or newer, and {installed} is installed: {self.upgrade}"
 
 
-EXECUTORS = (  # of those for one type of device, ``auto`` takes the first that is installed
+EXECUTORS = (  # ``auto`` takes the first that is made for the type of device and installed
     Executor(
         "reference",
         "gsbench.raster.reference.ReferenceRasterizer",
@@ -95,7 +95,7 @@ EXECUTORS = (  # of those for one type of device, ``auto`` takes the first that 
         text="Triton kernels, compiled at first use by what torch brings along; the same bits on every run",
         package="triton",
         install="pip install triton, in the version that your torch asks for",
-        minimum=(3, 4),  # 3.3 has no `knobs`, and its kernels take no named tuple
+        minimum=(3, 4),  # 3.3 has no `knobs`, and its kernels accept no named tuples
         upgrade="pip install 'torch>=2.8', which brings it along",
     ),
     Executor(
@@ -116,8 +116,8 @@ def names() -> tuple[str, ...]:
     return (AUTO, *(executor.name for executor in EXECUTORS))
 
 
-def find(name: str) -> Executor:
-    """The executor called ``name``; raises InputError that lists the names."""
+def find_executor(name: str) -> Executor:
+    """Return the executor called ``name``. Raises InputError, which lists the names, if there is none."""
     for executor in EXECUTORS:
         if executor.name == name:
             return executor
@@ -127,22 +127,22 @@ def find(name: str) -> Executor:
 
 
 def offers(name: str, fact: str, own: object = None) -> bool:
-    """Return whether the rasterizer called ``name`` has an offer beyond the contract, such as ``has_footprint``.
+    """Return whether the rasterizer called ``name`` offers an optional output; ``fact`` is such as ``has_footprint``.
 
-    ``own`` is the rasterizer if it is a user's, whose attribute of that name says it.
+    If ``name`` is not an executor of gsbench, the attribute ``fact`` of the rasterizer ``own`` decides.
     """
-    given = {executor.name: bool(getattr(executor, fact)) for executor in EXECUTORS}
-    return given.get(name, bool(getattr(own, fact, False)))
+    offered = {executor.name: bool(getattr(executor, fact)) for executor in EXECUTORS}
+    return offered.get(name, bool(getattr(own, fact, False)))
 
 
 def resolve(name: str, device_type: str) -> Executor:
-    """The executor that ``name`` (``auto`` included) means on a device of this type.
+    """Return the executor that ``name``, perhaps ``auto``, selects on a device of this type.
 
-    Raises InputError where it cannot run there. ``auto`` says so where only the slow reference is left.
+    Raises InputError if it cannot run there. ``auto`` logs a warning if only the slow reference can run.
     """
     if name == AUTO:
         return _automatic(device_type)
-    executor = find(name)
+    executor = find_executor(name)
     obstacle = executor.obstacle(device_type)
     if obstacle is not None:
         raise InputError(f"raster={name} {obstacle}")
@@ -150,26 +150,28 @@ def resolve(name: str, device_type: str) -> Executor:
 
 
 def _automatic(device_type: str) -> Executor:
-    wanted = [executor for executor in EXECUTORS if device_type in executor.devices]
-    for executor in wanted:
+    candidates = [executor for executor in EXECUTORS if device_type in executor.devices]
+    for executor in candidates:
         if executor.obstacle(device_type) is None:
             return executor
-    hints = "; ".join(f"{executor.name} needs {executor.package}: {executor.install}" for executor in wanted)
+    hints = "; ".join(f"{executor.name} needs {executor.package}: {executor.install}" for executor in candidates)
     log.warning("raster=auto: the slow reference rasterizer runs%s", f" ({hints})" if hints else "")
-    return find("reference")
+    return find_executor("reference")
 
 
 def missing_tools() -> list[str]:
-    """List what Triton lacks of a C compiler and Python's headers, by which it compiles the piece of C that starts its
-    kernels; each with the package that has it."""
+    """List what Triton lacks to compile the C code that launches its kernels: a C compiler, Python's headers.
+
+    Each line names the package to install.
+    """
     missing = []
     compiler = os.environ.get("CC")
-    found = shutil.which(compiler.split()[0]) if compiler else shutil.which("gcc") or shutil.which("clang")
-    if found is None:
+    path = shutil.which(compiler.split()[0]) if compiler else shutil.which("gcc") or shutil.which("clang")
+    if path is None:
         named = f" (CC is {compiler}, which is not there)" if compiler else ""
         missing.append(f"a C compiler{named}: install the package gcc")
     scheme = sysconfig.get_default_scheme()
-    if scheme == "posix_local":  # Debian's own; the headers are where they always were
+    if scheme == "posix_local":  # Debian's scheme for packages; its headers are still in the usual place
         scheme = "posix_prefix"
     header = Path(sysconfig.get_paths(scheme=scheme)["include"]) / "Python.h"
     if not header.exists():
@@ -180,7 +182,7 @@ def missing_tools() -> list[str]:
 
 @cache
 def load_driver() -> None:
-    """Let Triton find the GPU and load its launcher, compiling it if need be; InputError says what is missing."""
+    """Make Triton load its launcher for the GPU, which may compile it. Raises InputError that names what is missing."""
     try:
         from triton import knobs
         from triton.runtime import driver
@@ -191,7 +193,7 @@ def load_driver() -> None:
     except (RuntimeError, OSError, AssertionError, ImportError) as error:
         missing = missing_tools()
         reason = "Triton needs " + " and ".join(missing) if missing else f"Triton cannot start: {error}"
-        if old := find("triton").too_old():
+        if old := find_executor("triton").too_old():
             reason = f"raster=triton {old}"
         raise InputError(reason) from error
 
@@ -199,7 +201,7 @@ def load_driver() -> None:
 @dataclass
 class RasterConfig:
     name: str = MISSING  # auto, or an executor of gsbench.raster.executors
-    _target_: TargetName | None = None  # a class of your own, instead; its options are further keys
+    _target_: TargetName | None = None  # a class of your own instead; its options are further keys
 
     def __post_init__(self) -> None:
         check_settings(self, "raster")

@@ -1,17 +1,16 @@
-"""gsplat's CUDA kernels (Ye et al., arXiv 2409.06765) under the contract of ``raster.base``: a peer to measure against.
+"""gsplat's CUDA kernels (Ye et al., arXiv 2409.06765) under the contract of ``raster.base``, for comparison.
 
-gsplat's parts are put together here so that the conventions of 3DGS hold where its own ``rasterization`` has others:
-the near plane is 0.2, and a Gaussian reaches the tiles of a square of 3 sigma along its larger axis, whatever its
-opacity. It works with gsplat 1.5.3 and with 1.6, whose harmonics take other arguments. What still
-differs, since it stands in gsplat's kernels, in the terms of ``RenderOutput``:
+This module calls gsplat's functions one by one, so that the conventions of 3DGS hold, which gsplat's ``rasterization``
+does not follow: the near plane is 0.2, and a Gaussian reaches the tiles of a square of 3 sigma along its larger axis at
+any opacity. It works with gsplat 1.5.3 and with 1.6, whose harmonics take other arguments. Some differences are inside
+gsplat's kernels and remain:
 
-- ``image`` and ``alpha``: gsplat 1.5 clamps a contribution to 0.999 (1.6, as the contract, to 0.99), and no gradient
-  passes the clamp. A tile at the edge of the square is taken in when any part of it is reached, not only its first
-  pixel.
-- ``radii`` and ``visible``: a Gaussian is culled by a box of 3.33 sigma along each image axis, not by the square. One
-  whose square reaches the image but whose box does not has radius 0 here; it would contribute less than 1/255 anywhere.
-  Densifiers that count the iterations in which a Gaussian was visible count fewer.
-- All gradients, ``screen_points`` included: sums are made with atomics, so two runs differ in the last bits.
+- ``image`` and ``alpha``: gsplat 1.5 clamps alpha to 0.999 (1.6 to 0.99, as the contract), and the clamp blocks the
+  gradient. A tile at the edge of the square is included if any part of it is reached, not only if its first pixel is.
+- ``radii`` and ``visible``: a Gaussian is culled by a box of 3.33 sigma along each image axis, not by the square. If
+  the square reaches the image but the box does not, the radius is 0; such a Gaussian would contribute less than 1/255
+  everywhere. Densifiers that count the iterations in which a Gaussian was visible count fewer.
+- All gradients, also that of ``screen_points``: sums use atomics, so two runs differ in the last bits.
 """
 
 from __future__ import annotations
@@ -30,19 +29,16 @@ from torch.autograd.function import once_differentiable
 from gsbench.errors import InputError
 from gsbench.gaussians.model import Gaussians
 from gsbench.raster.base import CONSTANTS, RasterConstants, RenderOutput
-from gsbench.raster.executors import find
+from gsbench.raster.executors import find_executor
 from gsbench.raster.staged import Readback, bad_values, check_settings, raise_for_values
 from gsbench.scene.camera import Camera
 
-MAX_RADIUS = 2**24  # px; keeps the tile arithmetic of an absurdly large Gaussian inside int32
-COEFFICIENTS = {0: 1, 1: 4, 2: 9, 3: 16}  # harmonics up to each degree
+MAX_RADIUS = 2**24  # px; keeps the tile numbers of a huge Gaussian within int32
+COEFFICIENTS = {0: 1, 1: 4, 2: 9, 3: 16}  # number of harmonics up to each degree
 
 
 class GsplatRasterizer:
-    """Renders with gsplat on a CUDA device; float32.
-
-    ``library`` is the module ``gsplat``, or one with the same functions.
-    """
+    """Renders with gsplat on a CUDA device, float32. ``library`` is the module ``gsplat`` or one with its functions."""
 
     name = "gsplat"
 
@@ -51,7 +47,7 @@ class GsplatRasterizer:
             try:
                 library = importlib.import_module("gsplat")
             except ImportError as error:
-                raise InputError(f"raster=gsplat needs gsplat: {find('gsplat').install}") from error
+                raise InputError(f"raster=gsplat needs gsplat: {find_executor('gsplat').install}") from error
         self.library = library
         self.constants = constants
         # gsplat 1.5 takes directions, 1.6 means and poses.
@@ -66,7 +62,7 @@ class GsplatRasterizer:
         background: Tensor,
         absolute_gradient: bool = False,
     ) -> RenderOutput:
-        """Render as ``raster.base.Rasterizer`` says; raises ValueError naming the parameter that cannot be used."""
+        """See `gsbench.raster.base.Rasterizer`. Raises ValueError that names a parameter that cannot be used."""
         check_settings(gaussians, camera, sh_degree, background)
         points = torch.zeros_like(gaussians.means[:, :2], requires_grad=True)
         absolute = torch.zeros_like(points) if absolute_gradient else None
@@ -90,11 +86,11 @@ class GsplatRasterizer:
         seen = (radii > 0).all(-1)  # [1, N]
         square = _square_radii(conics.detach(), seen, constants)  # [1, N] int32
         tiles_x, tiles_y = -(-width // constants.tile), -(-height // constants.tile)
-        both = square.unsqueeze(-1).expand(-1, -1, 2).contiguous()
-        _, crossings, members = self.library.isect_tiles(means, both, depths, constants.tile, tiles_x, tiles_y)
-        if bad.values():  # no wait: gsplat has just waited for the number of crossings
+        axis_radii = square.unsqueeze(-1).expand(-1, -1, 2).contiguous()
+        _, pairs, members = self.library.isect_tiles(means, axis_radii, depths, constants.tile, tiles_x, tiles_y)
+        if bad.values():  # no wait: gsplat has just waited for the number of pairs
             raise_for_values(gaussians, background)
-        offsets = self.library.isect_offset_encode(crossings, 1, tiles_x, tiles_y)
+        offsets = self.library.isect_offset_encode(pairs, 1, tiles_x, tiles_y)
         frame = _Frame(width, height, constants.tile, offsets, members, on_device.half_size, absolute)
         colors = self._colors(gaussians, on_device, sh_degree, seen)  # [N, 3]
         image, alpha = _Composite.apply(
@@ -111,11 +107,11 @@ class GsplatRasterizer:
         return RenderOutput(image, alpha, torch.where(reached, square[0], 0), points, absolute)
 
     def _on_device(self, camera: Camera, like: Tensor) -> _DeviceCamera:
-        """``camera`` as tensors beside ``like``, uploaded once."""
-        known = self._cameras.get(camera)
-        if known is None or known.view.device != like.device or known.view.dtype != like.dtype:
-            known = self._cameras[camera] = _DeviceCamera.of(camera, like)
-        return known
+        """``camera`` as tensors with the dtype and on the device of ``like``, uploaded once."""
+        cached = self._cameras.get(camera)
+        if cached is None or cached.view.device != like.device or cached.view.dtype != like.dtype:
+            cached = self._cameras[camera] = _DeviceCamera.of(camera, like)
+        return cached
 
     def _colors(self, gaussians: Gaussians, camera: _DeviceCamera, sh_degree: int, seen: Tensor) -> Tensor:
         used = gaussians.sh_rest[:, : COEFFICIENTS[sh_degree] - 1]
@@ -130,7 +126,7 @@ class GsplatRasterizer:
 
 @dataclass(frozen=True)
 class _DeviceCamera:
-    """A camera as gsplat takes it."""
+    """A camera as tensors for gsplat."""
 
     view: Tensor  # [1, 4, 4] world to camera
     intrinsics: Tensor  # [1, 3, 3]
@@ -151,23 +147,23 @@ class _DeviceCamera:
 
 @dataclass(frozen=True)
 class _Frame:
-    """Values that compositing needs besides tensors with a gradient."""
+    """Inputs of compositing that have no gradient."""
 
     width: int
     height: int
     tile: int
     offsets: Tensor  # [1, tiles_y, tiles_x]
-    members: Tensor  # [crossings]
+    members: Tensor  # [pairs] of Gaussian and tile
     half_size: Tensor  # [2] px
     absolute: Tensor | None  # [N, 2] NDC, filled by the backward pass
 
 
 class _Composite(torch.autograd.Function):
-    """gsplat's compositing on leaves of its own, so that the gradient of the means comes by here.
+    """gsplat's compositing on leaves of its own graph, so that ``backward`` here sees the gradient of the means.
 
-    gsplat leaves the absolute gradient as an attribute of the means that it was given. A hook on these means that reads
-    it would be a cycle through C++ that no collector frees: every step would stay alive. Here nothing refers to
-    its own graph.
+    gsplat stores the absolute gradient as an attribute of the means that it was given. A hook on these means that reads
+    the attribute would be a reference cycle through C++, which the garbage collector cannot free: the memory of every
+    step would leak. This function avoids the cycle.
     """
 
     @staticmethod
@@ -183,9 +179,9 @@ class _Composite(torch.autograd.Function):
         screen_points: Tensor,
     ) -> tuple[Tensor, Tensor]:
         needed = ctx.needs_input_grad
-        wanted = (needed[2] or needed[7], *needed[3:6])  # the screen points ask for the means' gradient too
+        requires = (needed[2] or needed[7], *needed[3:6])  # the screen points need the gradient of the means
         leaves = (tensor.detach() for tensor in (means, conics, colors, opacities))
-        ctx.leaves = [leaf.requires_grad_(want) for leaf, want in zip(leaves, wanted, strict=True)]
+        ctx.leaves = [leaf.requires_grad_(flag) for leaf, flag in zip(leaves, requires, strict=True)]
         with torch.enable_grad():
             ctx.outputs = library.rasterize_to_pixels(
                 *ctx.leaves,
@@ -209,8 +205,8 @@ class _Composite(torch.autograd.Function):
         g_image = torch.zeros_like(image) if g_image is None else g_image.unsqueeze(0)
         g_alpha = torch.zeros_like(alpha) if g_alpha is None else g_alpha.unsqueeze(0).unsqueeze(-1)
         wanted = [leaf for leaf in ctx.leaves if leaf.requires_grad]
-        found = iter(torch.autograd.grad((image, alpha), wanted, (g_image, g_alpha), retain_graph=True))
-        gradients = [next(found) if leaf.requires_grad else None for leaf in ctx.leaves]
+        computed = iter(torch.autograd.grad((image, alpha), wanted, (g_image, g_alpha), retain_graph=True))
+        gradients = [next(computed) if leaf.requires_grad else None for leaf in ctx.leaves]
         frame: _Frame = ctx.frame
         g_means = gradients[0]
         g_screen = None if g_means is None else g_means[0] * frame.half_size
@@ -221,15 +217,15 @@ class _Composite(torch.autograd.Function):
 
 
 def _empty(camera: Camera, background: Tensor, points: Tensor, absolute: Tensor | None) -> RenderOutput:
-    """The background, joined to the graph so that ``backward`` works."""
-    nothing = 0 * points.sum()
-    image = background.expand(camera.height, camera.width, 3) + nothing
-    alpha = torch.zeros_like(image[..., 0]) + nothing
+    """Return the background, connected with the graph so that ``backward`` works."""
+    zero = 0 * points.sum()
+    image = background.expand(camera.height, camera.width, 3) + zero
+    alpha = torch.zeros_like(image[..., 0]) + zero
     return RenderOutput(image, alpha, torch.zeros_like(points[:, 0], dtype=torch.int32), points, absolute)
 
 
 def _square_radii(conics: Tensor, seen: Tensor, constants: RasterConstants) -> Tensor:
-    """ceil(3 sqrt(lambda_max)) px of the covariances whose inverses are ``conics`` [1, N, 3]; 0 where not ``seen``."""
+    """ceil(3 sqrt(lambda_max)) px, for covariances with the inverses ``conics`` [1, N, 3]; 0 if not ``seen``."""
     a, b, c = conics.double().unbind(-1)  # the inverse of the covariance: yy, -xy, xx over its determinant
     determinant = 1 / (a * c - b * b)
     middle = 0.5 * (a + c) * determinant
@@ -239,7 +235,7 @@ def _square_radii(conics: Tensor, seen: Tensor, constants: RasterConstants) -> T
 
 
 def _reaches_image(means: Tensor, radii: Tensor, width: int, height: int) -> Tensor:
-    """[N] bool: whether the square around the mean (px, first pixel centre at 0.5) touches the image."""
+    """Mask [N]: whether the square around the mean touches the image; px, with the first pixel centre at 0.5."""
     x, y = means.unbind(-1)
     inside = (x + radii > 0) & (x - radii < width) & (y + radii > 0) & (y - radii < height)
     return inside & (radii > 0)

@@ -1,7 +1,7 @@
-"""The readable definition of the rasterizer: pure torch, tile by tile, any device, float32 or float64.
+"""The readable definition of the rasterizer in torch, tile by tile, for any device, float32 or float64.
 
-Faster executors are tested against this one in float64. Formulas: EWA splatting (Zwicker et al. 2001) as used by 3DGS
-(Kerbl et al. 2023); the constants stand in ``raster.base.RasterConstants``.
+Tests compare the faster executors with this one in float64. The formulas are those of EWA splatting (Zwicker et al.
+2001) as in 3DGS (Kerbl et al. 2023); the constants are in ``raster.base.RasterConstants``.
 """
 
 from dataclasses import dataclass
@@ -16,12 +16,12 @@ from gsbench.raster.base import CONSTANTS, Footprint, RasterConstants, RenderOut
 from gsbench.raster.staged import check_inputs
 from gsbench.scene.camera import Camera
 
-MAX_RADIUS = 2**24  # px; keeps the radius of an absurdly large Gaussian inside int32
+MAX_RADIUS = 2**24  # px; keeps the radius of a huge Gaussian within int32
 
 
 @dataclass
 class Projection:
-    """The M Gaussians in front of the camera whose 2D covariance is usable, in image space."""
+    """The M Gaussians in front of the camera with a usable 2D covariance, in image space."""
 
     index: Tensor  # [M] into the N Gaussians
     means: Tensor  # [M, 2] px, integer pixel centres
@@ -31,7 +31,7 @@ class Projection:
 
 
 class ReferenceRasterizer:
-    """The contract of ``raster.base`` in plain torch operations; gradients come from autograd."""
+    """The contract of ``raster.base`` in torch operations; autograd computes the gradients."""
 
     name = "reference"
 
@@ -59,34 +59,36 @@ class ReferenceRasterizer:
         radii[projected.index[reached]] = projected.radii[reached].to(torch.int32)
 
         means = projected.means + screen_points[projected.index] * half_size  # [M, 2]
-        probe, bends = None, None
+        probe, image_probe = None, None
         if splitting_matrix:
             probe = gaussians.means.new_zeros(len(gaussians), 3, 3, requires_grad=True)
-            linear = mean_jacobians(gaussians.means.detach()[projected.index], camera)  # [M, 2, 3]
-            bends = linear @ probe[projected.index] @ linear.mT  # [M, 2, 2] all zero
+            jacobians = mean_jacobians(gaussians.means.detach()[projected.index], camera)  # [M, 2, 3]
+            image_probe = jacobians @ probe[projected.index] @ jacobians.mT  # [M, 2, 2] all zero
         rgb = self._colors(gaussians, projected.index, camera, sh_degree)  # [M, 3]
         opacities = gaussians.opacities[projected.index]  # [M]
 
-        # Adding zero joins image and graph even where no tile is reached, so that ``backward`` always works.
+        # Adding zero connects the image with the graph even if no tile is reached, so that ``backward`` always works.
         image = background.expand(camera.height, camera.width, 3) + 0 * screen_points.sum()
         alpha = torch.zeros(camera.height, camera.width, dtype=image.dtype, device=image.device)
         tiles_x = -(-camera.width // self.constants.tile)
         for tile, members in bin_gaussians(projected.depths, tile_min, tile_max, tiles_x):
             x0, y0, x1, y1 = self._bounds(tile, tiles_x, camera)
             pixels = pixel_centres(x0, y0, x1, y1, image)
-            spread = means[members].expand(len(pixels), -1, -1)  # [P, K, 2]
-            if gradient_abs is not None and spread.requires_grad:
-                spread.register_hook(_absolute_sum_into(gradient_abs, projected.index[members], half_size))
-            tile_image, tile_alpha = checkpoint(  # recomputing a tile keeps memory at one tile's size
+            # One mean per pixel, so that the hook sees the gradient of each pixel before the sum.
+            pixel_means = means[members].expand(len(pixels), -1, -1)  # [P, K, 2]
+            if gradient_abs is not None and pixel_means.requires_grad:
+                pixel_means.register_hook(_absolute_sum_into(gradient_abs, projected.index[members], half_size))
+            # Recomputed in the backward pass: memory for intermediate results is that of one tile.
+            tile_image, tile_alpha = checkpoint(
                 composite,
                 pixels,
-                spread,
+                pixel_means,
                 projected.conics[members],
                 opacities[members],
                 rgb[members],
                 background,
                 self.constants,
-                None if bends is None else bends[members],
+                None if image_probe is None else image_probe[members],
                 use_reentrant=False,
                 preserve_rng_state=False,
             )
@@ -115,7 +117,7 @@ class ReferenceRasterizer:
         return Footprint(covered, view_depths(gaussians, camera), sums, distances)
 
     def _bounds(self, tile: int, tiles_x: int, camera: Camera) -> tuple[int, int, int, int]:
-        """First and past-the-last pixel of a tile: x, y, x, y."""
+        """The pixels of a tile: first x, first y, past-the-last x, past-the-last y."""
         x, y = tile % tiles_x * self.constants.tile, tile // tiles_x * self.constants.tile
         return x, y, min(x + self.constants.tile, camera.width), min(y + self.constants.tile, camera.height)
 
@@ -127,7 +129,7 @@ class ReferenceRasterizer:
 
 
 def pixel_centres(x0: int, y0: int, x1: int, y1: int, like: Tensor) -> Tensor:
-    """The pixels of a rectangle, row by row, [P, 2] (x, y) with the dtype and on the device of ``like``."""
+    """The pixel centres of a rectangle, row by row, [P, 2] (x, y), with the dtype and on the device of ``like``."""
     return torch.cartesian_prod(
         torch.arange(y0, y1, dtype=like.dtype, device=like.device),
         torch.arange(x0, x1, dtype=like.dtype, device=like.device),
@@ -135,10 +137,10 @@ def pixel_centres(x0: int, y0: int, x1: int, y1: int, like: Tensor) -> Tensor:
 
 
 def project(gaussians: Gaussians, camera: Camera, constants: RasterConstants = CONSTANTS) -> Projection:
-    """Project the Gaussians to the image plane; those behind ``near`` or with an unusable covariance are left out.
+    """Project the Gaussians to the image plane; leave out those behind ``near`` or with an unusable covariance.
 
-    Which are usable is decided without a graph first, so that overflow in a Gaussian that is left out cannot reach the
-    gradients of the others.
+    A first pass without a graph selects the usable ones, so that an overflow in another Gaussian cannot reach their
+    gradients.
     """
     with torch.no_grad():
         depths = view_depths(gaussians, camera)  # [N]
@@ -158,7 +160,7 @@ def project(gaussians: Gaussians, camera: Camera, constants: RasterConstants = C
 def _to_image(
     gaussians: Gaussians, camera: Camera, constants: RasterConstants
 ) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor], Tensor]:
-    """Means [M, 2] px, the entries xx, xy, yy of the blurred 2D covariances (each [M], px^2) and view depths [M]."""
+    """Means [M, 2] px; entries xx, xy, yy of the blurred 2D covariances, each [M], px^2; view depths [M]."""
     rotation = gaussians.means.new_tensor(camera.rotation)  # [3, 3]
     translation = gaussians.means.new_tensor(camera.translation)  # [3]
     x, y, z = (gaussians.means @ rotation.T + translation).unbind(-1)  # each [M]
@@ -173,15 +175,15 @@ def _to_image(
         -2,
     )  # [M, 2, 3]
     axes = gaussians.rotations * gaussians.scales.unsqueeze(-2)  # [M, 3, 3] columns: scaled axes
-    spread = jacobian @ rotation @ axes  # [M, 2, 3]
-    covariance = spread @ spread.mT  # [M, 2, 2]
+    image_axes = jacobian @ rotation @ axes  # [M, 2, 3]
+    covariance = image_axes @ image_axes.mT  # [M, 2, 2]
     means = torch.stack([camera.fx * x / z + camera.cx - 0.5, camera.fy * y / z + camera.cy - 0.5], -1)
     blurred = (covariance[:, 0, 0] + constants.blur, covariance[:, 0, 1], covariance[:, 1, 1] + constants.blur)
     return means, blurred, z
 
 
 def mean_jacobians(means: Tensor, camera: Camera) -> Tensor:
-    """The derivatives [M, 2, 3] of projected means, px, by ``means`` [M, 3], without the limits on the slopes."""
+    """The Jacobians [M, 2, 3] of the projected means, px, by ``means`` [M, 3], without the limits on the slopes."""
     rotation = means.new_tensor(camera.rotation)  # [3, 3]
     x, y, z = (means @ rotation.T + means.new_tensor(camera.translation)).unsqueeze(-1).unbind(1)  # each [M, 1]
     row_x = camera.fx / z * (rotation[0] - x / z * rotation[2])  # [M, 3]
@@ -190,10 +192,10 @@ def mean_jacobians(means: Tensor, camera: Camera) -> Tensor:
 
 
 def tile_rectangles(projected: Projection, camera: Camera, tile: int) -> tuple[Tensor, Tensor]:
-    """The tiles that each Gaussian's square of two radii touches: first and past-the-last, int64 [M, 2] (x, y)."""
+    """The tiles that each Gaussian's square of side 2 radius touches: first and past-the-last, int64 [M, 2] (x, y)."""
     means, radii = projected.means.detach(), projected.radii.unsqueeze(-1)
     grid = torch.tensor([-(-camera.width // tile), -(-camera.height // tile)], device=means.device)  # [2]
-    limit = torch.tensor(2.0**30, dtype=means.dtype, device=means.device)  # keeps the conversion to integers defined
+    limit = torch.tensor(2.0**30, dtype=means.dtype, device=means.device)  # so that the conversion to int64 is defined
     first = ((means - radii) / tile).clamp(-limit, limit).floor().long()
     past = ((means + radii + tile - 1) / tile).clamp(-limit, limit).floor().long()
     zero = torch.zeros_like(grid)
@@ -201,11 +203,11 @@ def tile_rectangles(projected: Projection, camera: Camera, tile: int) -> tuple[T
 
 
 def bin_gaussians(depths: Tensor, tile_min: Tensor, tile_max: Tensor, tiles_x: int) -> list[tuple[int, Tensor]]:
-    """List every tile that is reached: its row-major number and its Gaussians [K], front to back (ties by index)."""
+    """List all tiles with Gaussians: the row-major number, and the Gaussians [K], front to back (ties by index)."""
     order = torch.sort(depths, stable=True).indices  # [M]
     low, size = tile_min[order], (tile_max - tile_min)[order].clamp_min(0)  # [M, 2]
     counts = size.prod(-1)  # [M]
-    owner = torch.repeat_interleave(counts)  # [pairs] into order
+    owner = torch.repeat_interleave(counts)  # [pairs] indices into ``order``
     within = torch.arange(len(owner), device=owner.device) - (counts.cumsum(0) - counts)[owner]  # [pairs]
     column, row = within % size[owner, 0], within // size[owner, 0]
     tiles = (low[owner, 1] + row) * tiles_x + low[owner, 0] + column  # [pairs]
@@ -223,15 +225,15 @@ def composite(
     rgb: Tensor,
     background: Tensor,
     constants: RasterConstants = CONSTANTS,
-    bends: Tensor | None = None,
+    image_probe: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Blend K Gaussians, front to back, at P pixels.
 
-    ``pixels`` [P, 2], ``means`` [P, K, 2], ``conics`` [K, 3], ``opacities`` [K], ``rgb`` [K, 3]; returns [P, 3] and the
-    opacity [P]. A pixel stops before the Gaussian that would bring its transmittance below ``transmittance_min``.
-    ``bends`` as in ``blending_weights``.
+    ``pixels`` [P, 2], ``means`` [P, K, 2], ``conics`` [K, 3], ``opacities`` [K], ``rgb`` [K, 3]. Returns colours [P, 3]
+    and opacities [P]. A pixel stops before the Gaussian that would lower its transmittance below
+    ``transmittance_min``. ``image_probe`` as in ``blending_weights``.
     """
-    weight = blending_weights(pixels, means, conics, opacities, constants, bends)  # [P, K]
+    weight = blending_weights(pixels, means, conics, opacities, constants, image_probe)  # [P, K]
     opacity = weight.sum(1)  # [P]
     return weight @ rgb + (1 - opacity).unsqueeze(-1) * background, opacity
 
@@ -242,23 +244,23 @@ def blending_weights(
     conics: Tensor,
     opacities: Tensor,
     constants: RasterConstants = CONSTANTS,
-    bends: Tensor | None = None,
+    image_probe: Tensor | None = None,
 ) -> Tensor:
     """Alpha times transmittance, [P, K], for the arguments of ``composite``; 0 where a Gaussian is not blended.
 
-    ``bends`` [K, 2, 2] is zero: its gradient is the sum over pixels of the gradient of each opacity times density times
-    that one's second derivative by the projected mean.
+    ``image_probe`` [K, 2, 2] is zero. Its gradient is the sum over pixels of (d loss / d s) times the second derivative
+    of s by the projected mean, where s is the opacity times the density at the pixel.
     """
     dx, dy = (means - pixels.unsqueeze(1)).unbind(-1)  # [P, K]
     power = -0.5 * (conics[:, 0] * dx * dx + conics[:, 2] * dy * dy) - conics[:, 1] * dx * dy
     raw = opacities * power.clamp_max(0).exp()  # [P, K]
-    if bends is not None:
+    if image_probe is not None:
         offset = (means - pixels.unsqueeze(1)).detach()  # [P, K, 2]
         inverse = conics.detach()[:, [0, 1, 1, 2]].reshape(-1, 2, 2)  # [K, 2, 2]
         slope = (inverse @ offset.unsqueeze(-1)).squeeze(-1)  # [P, K, 2]
         second = slope.unsqueeze(-1) * slope.unsqueeze(-2) - inverse  # [P, K, 2, 2]
-        raw = raw + raw.detach() * (second * bends).sum((-2, -1))
-    saturated = raw + (raw.clamp_max(constants.alpha_max) - raw).detach()  # the gradient passes the clamp
+        raw = raw + raw.detach() * (second * image_probe).sum((-2, -1))
+    saturated = raw + (raw.clamp_max(constants.alpha_max) - raw).detach()  # the gradient passes the clamp, as in 3DGS
     alpha = torch.where((power <= 0) & (raw >= constants.alpha_min), saturated, 0.0)
     after = torch.cumprod(1 - alpha, dim=1)  # [P, K] transmittance behind each Gaussian
     before = torch.cat([torch.ones_like(after[:, :1]), after[:, :-1]], dim=1)

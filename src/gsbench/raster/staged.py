@@ -1,5 +1,4 @@
-"""Parts that executors share: checks of their inputs, values read back without a wait, and for compiled ones a bridge
-between their stages and autograd."""
+"""Code that executors share: checks of inputs, asynchronous reads from a device, and autograd for compiled stages."""
 
 from abc import ABC, abstractmethod
 from functools import partial
@@ -13,18 +12,18 @@ from gsbench.gaussians.model import MAX_SH_DEGREE, Gaussians
 from gsbench.raster.base import Footprint, RenderOutput
 from gsbench.scene.camera import Camera
 
-MAX_SIDE = 16384  # px; beyond it an image is taken for a slip in the settings, not for a wish
-MIN_QUATERNION_NORM = 1e-12  # below, torch's ``normalize`` no longer gives a unit quaternion, so no rotation
+MAX_SIDE = 16384  # px; a larger image is most likely a mistake in the settings
+MIN_QUATERNION_NORM = 1e-12  # below, torch's ``normalize`` no longer gives a unit quaternion
 FOCAL_RANGE = (1e-3, 1e6)  # focal length over image side: fields of view between 0.2 arc seconds and 179.8 degrees
-MAX_PRINCIPAL_OFFSET = 100.0  # image sides that the principal point may lie outside the image
+MAX_PRINCIPAL_OFFSET = 100.0  # image sides; the largest distance of the principal point from the image corner
 
 
 def check_inputs(gaussians: Gaussians, camera: Camera, sh_degree: int, background: Tensor) -> None:
-    """Raise ValueError, naming the parameter, on anything that ``Rasterizer.render`` cannot use.
+    """Raise ValueError, which names the parameter, for anything that ``Rasterizer.render`` cannot use.
 
-    Looks at every value of ``gaussians``, and waits for a device once. An executor that meets the values anyway calls
-    ``check_settings`` alone and ``raise_for_values`` when it finds a bad one; one that waits for its device later asks
-    ``bad_values`` and reads the answer then.
+    Reads every value of ``gaussians`` and waits for a device once. To avoid that, executors call ``check_settings``
+    first. If their kernels then find a bad value, or ``bad_values``, read later, is True, they call
+    ``raise_for_values``.
     """
     check_settings(gaussians, camera, sh_degree, background)
     if bad_values(gaussians, background):
@@ -32,9 +31,9 @@ def check_inputs(gaussians: Gaussians, camera: Camera, sh_degree: int, backgroun
 
 
 def bad_values(gaussians: Gaussians, background: Tensor) -> Tensor:
-    """One bool, still on the device: whether ``raise_for_values`` has to look.
+    """One bool, still on the device: whether ``raise_for_values`` must search for a bad value.
 
-    It may be True for sound values whose sum overflows; it is never False for a bad one.
+    It may be True without a bad value, if a sum overflows; it is never False if there is one.
     """
     tensors = [background, *gaussians.tensors().values()]
     bad = ~torch.stack([tensor.detach().sum() for tensor in tensors]).isfinite().all()
@@ -44,7 +43,7 @@ def bad_values(gaussians: Gaussians, background: Tensor) -> Tensor:
 
 
 def check_settings(gaussians: Gaussians, camera: Camera, sh_degree: int, background: Tensor) -> None:
-    """The part of ``check_inputs`` that looks at no value that a device would have to be waited for."""
+    """The checks of ``check_inputs`` that do not wait for a device."""
     if not 0 <= sh_degree <= MAX_SH_DEGREE:
         raise ValueError(f"sh_degree: must be 0 to {MAX_SH_DEGREE}, got {sh_degree}")
     dtype, device = gaussians.means.dtype, gaussians.means.device
@@ -80,13 +79,13 @@ def _check_background(background: Tensor) -> None:
 
 
 def raise_for_values(gaussians: Gaussians, background: Tensor | None = None) -> None:
-    """Raise ValueError on the first parameter that has a non-finite value or, of quaternions, no length."""
+    """Raise ValueError for the first parameter with a non-finite value, or for a quaternion of length zero."""
     if background is not None:
         _check_background(background)
     for name, tensor in gaussians.tensors().items():
         finite = torch.isfinite(tensor.detach())
         while finite.dim() > 1:
-            finite = finite.all(-1)  # in the end [N]
+            finite = finite.all(-1)  # finally [N]
         if not finite.all():
             index = int((~finite).nonzero()[0])
             raise ValueError(f"{name}: not finite at Gaussian {index} ({int((~finite).sum())} in all)")
@@ -97,11 +96,11 @@ def raise_for_values(gaussians: Gaussians, background: Tensor | None = None) -> 
 
 
 class Readback:
-    """The values of a small tensor, copied to the host behind the device's back.
+    """An asynchronous copy of a small tensor to the host.
 
-    On a CUDA device the copy is put into the stream and the host goes on; ``values`` waits for it, which costs nothing
-    once the device has come so far, for example an iteration later. On any other device the values are there at once.
-    ``waits`` counts, over all of them, how often that was too early.
+    On a CUDA device, the copy is queued in the stream and the host continues. ``values`` waits for the copy, which
+    takes no time if the device has finished it, for example an iteration later. On other devices the copy is immediate.
+    The class variable ``waits`` counts how often any ``values`` had to wait.
     """
 
     waits: ClassVar[int] = 0
@@ -119,7 +118,7 @@ class Readback:
 
     @property
     def arrived(self) -> bool:
-        """Return whether ``values`` would not wait."""
+        """Return whether ``values`` returns without waiting."""
         return self._event is None or self._event.query()
 
     def values(self) -> Tensor:
@@ -136,11 +135,11 @@ FrameT = TypeVar("FrameT")
 
 
 class Lifetime:
-    """Lives as long as what was leased for it is needed: pools take memory back when it is freed."""
+    """A token for leased memory: the pools take the memory back when the token is freed."""
 
 
-class Request(NamedTuple):
-    """Settings of one render, beside the Gaussians. ``absolute`` [N, 2] is filled by the backward pass."""
+class RenderRequest(NamedTuple):
+    """The inputs of one render besides the Gaussians. The backward pass fills ``absolute`` [N, 2]."""
 
     camera: Camera
     degree: int
@@ -149,7 +148,7 @@ class Request(NamedTuple):
 
 
 class Gradients(NamedTuple):
-    """Gradients of the six tensors, of ``screen_points`` and, where they are asked for, the splitting matrices."""
+    """Gradients by the six tensors and ``screen_points``, and the splitting matrices, if requested."""
 
     tensors: list[Tensor]
     screen: Tensor  # [N, 2]
@@ -157,35 +156,35 @@ class Gradients(NamedTuple):
 
 
 class StagedRasterizer(ABC, Generic[FrameT]):
-    """A rasterizer whose forward pass leaves a frame for its backward pass and for questions after its footprint.
+    """A rasterizer with separate stages: its forward pass leaves a frame for the backward pass and the footprint.
 
-    The render of the contract is here, and the bridge to autograd; a subclass has the stages. What these get is
-    contiguous.
+    This class implements ``render`` of the contract and the connection with autograd. A subclass implements the
+    stages, whose tensors are contiguous.
     """
 
     name: str
 
     @abstractmethod
     def check(self, gaussians: Gaussians) -> None:
-        """Raise ValueError where the stages cannot use tensors of this type or device."""
+        """Raise ValueError if the stages cannot use tensors of this dtype or device."""
 
     @abstractmethod
     def forward(
-        self, lifetime: Lifetime, gaussians: Gaussians, request: Request
+        self, lifetime: Lifetime, gaussians: Gaussians, request: RenderRequest
     ) -> tuple[Tensor, Tensor, Tensor, FrameT]:
-        """Return image [H, W, 3], alpha [H, W], radii [N], and the frame, whose memory is held by ``lifetime``."""
+        """Return image [H, W, 3], alpha [H, W], radii [N] and the frame, whose memory is leased for ``lifetime``."""
 
     @abstractmethod
     def backward(
         self,
         frame: FrameT,
         gaussians: Gaussians,
-        request: Request,
+        request: RenderRequest,
         g_image: Tensor,
         g_alpha: Tensor | None,
         want_splitting: bool,
     ) -> Gradients:
-        """Carry the gradients of image and alpha back."""
+        """Compute the gradients, given those by image and alpha."""
 
     @abstractmethod
     def footprint(self, frame: FrameT, gaussians: Gaussians, camera: Camera, values: Tensor | None = None) -> Footprint:
@@ -200,22 +199,22 @@ class StagedRasterizer(ABC, Generic[FrameT]):
         absolute_gradient: bool = False,
         splitting_matrix: bool = False,
     ) -> RenderOutput:
-        """Render as ``raster.base.Rasterizer`` says. Raises ValueError naming the parameter that cannot be used."""
+        """See `gsbench.raster.base.Rasterizer`. Raises ValueError that names a parameter that cannot be used."""
         check_settings(gaussians, camera, sh_degree, background)
         self.check(gaussians)
         screen_points = torch.zeros_like(gaussians.means[:, :2], requires_grad=True)
         absolute = torch.zeros_like(screen_points) if absolute_gradient else None
         probe = screen_points.new_zeros(len(gaussians), 3, 3, requires_grad=True) if splitting_matrix else None
-        request = Request(camera, sh_degree, background.detach().contiguous(), absolute)
-        kept: _Kept[FrameT] = _Kept()
+        request = RenderRequest(camera, sh_degree, background.detach().contiguous(), absolute)
+        state: _RenderState[FrameT] = _RenderState()
         tensors = gaussians.tensors().values()
-        image, alpha, radii = _Render.apply(self, kept, request, background, screen_points, probe, *tensors)
-        footprint = partial(_footprint, self, kept, gaussians.map(Tensor.detach), camera)
+        image, alpha, radii = _Render.apply(self, state, request, background, screen_points, probe, *tensors)
+        footprint = partial(_footprint, self, state, gaussians.map(Tensor.detach), camera)
         return RenderOutput(image, alpha, radii, screen_points, absolute, footprint, probe)
 
 
-class _Kept(Generic[FrameT]):
-    """State that a render keeps for the backward pass and for its footprint, and the hold on the memory of it."""
+class _RenderState(Generic[FrameT]):
+    """What a render keeps for its backward pass and its footprint, with the token of the leased memory."""
 
     frame: FrameT
     lifetime: Lifetime
@@ -223,33 +222,33 @@ class _Kept(Generic[FrameT]):
 
 def _footprint(
     rasterizer: StagedRasterizer[FrameT],
-    kept: _Kept[FrameT],
+    state: _RenderState[FrameT],
     gaussians: Gaussians,
     camera: Camera,
     values: Tensor | None = None,
 ) -> Footprint:
-    """See ``raster.base.RenderOutput``; the frame's memory stays held as long as this can be asked for."""
-    return rasterizer.footprint(kept.frame, gaussians, camera, values)
+    """See ``raster.base.RenderOutput``. The reference to ``state`` keeps the frame's memory leased."""
+    return rasterizer.footprint(state.frame, gaussians, camera, values)
 
 
 class _Render(torch.autograd.Function):
-    """The node of a render in autograd's graph. Nothing that it keeps refers back to it."""
+    """The node of a render in autograd's graph. It keeps no reference to itself, so it is freed with the graph."""
 
     @staticmethod
     def forward(
         ctx: Any,
         rasterizer: StagedRasterizer[Any],
-        kept: _Kept[Any],
-        request: Request,
+        state: _RenderState[Any],
+        request: RenderRequest,
         background: Tensor,
         screen_points: Tensor,
         probe: Tensor | None,
         *tensors: Tensor,
     ) -> tuple[Tensor, Tensor, Tensor]:
         gaussians = Gaussians(*(tensor.contiguous() for tensor in tensors))
-        kept.lifetime = Lifetime()
-        image, alpha, radii, kept.frame = rasterizer.forward(kept.lifetime, gaussians, request)
-        ctx.rasterizer, ctx.kept, ctx.request = rasterizer, kept, request
+        state.lifetime = Lifetime()
+        image, alpha, radii, state.frame = rasterizer.forward(state.lifetime, gaussians, request)
+        ctx.rasterizer, ctx.state, ctx.request = rasterizer, state, request
         _, _, _, wants_background, *_ = ctx.needs_input_grad
         ctx.save_for_backward(alpha if wants_background else None, *gaussians.tensors().values())
         ctx.set_materialize_grads(False)
@@ -260,12 +259,13 @@ class _Render(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, g_image: Tensor | None, g_alpha: Tensor | None, _: None) -> tuple[Tensor | None, ...]:
         alpha, *tensors = ctx.saved_tensors
-        request: Request = ctx.request
+        request: RenderRequest = ctx.request
         if g_image is None:
             g_image = request.background.new_zeros(request.camera.height, request.camera.width, 3)
         g_image = g_image.contiguous()
         g_alpha = None if g_alpha is None else g_alpha.contiguous()
         _, _, _, _, _, wants_splitting, *_ = ctx.needs_input_grad
-        found = ctx.rasterizer.backward(ctx.kept.frame, Gaussians(*tensors), request, g_image, g_alpha, wants_splitting)
+        frame, gaussians = ctx.state.frame, Gaussians(*tensors)
+        gradients = ctx.rasterizer.backward(frame, gaussians, request, g_image, g_alpha, wants_splitting)
         g_background = None if alpha is None else (g_image * (1 - alpha).unsqueeze(-1)).sum((0, 1))
-        return None, None, None, g_background, found.screen, found.splitting, *found.tensors
+        return None, None, None, g_background, gradients.screen, gradients.splitting, *gradients.tensors

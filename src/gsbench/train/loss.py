@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gsbench.eval.images import as_unit_range
 from gsbench.eval.ssim import ssim_map
-from gsbench.raster.executors import find
+from gsbench.raster.executors import find_executor
 
 SSIM_WEIGHT = 0.2
 
@@ -71,7 +71,7 @@ class PhotometricLoss:
             from gsbench.train.loss_cpu import CompiledLoss
 
             return CompiledLoss(self.ssim_weight, self._threads)
-        if find("triton").obstacle(device_type) is None:
+        if find_executor("triton").obstacle(device_type) is None:
             from gsbench.train.loss_triton import TritonLoss
 
             return TritonLoss(self.ssim_weight)

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-from gsbench.raster.executors import EXECUTORS, find, resolve
+from gsbench.raster.executors import EXECUTORS, find_executor, resolve
 from gsbench.runs.made_of import version_of
 from gsbench.system.install import install_command
 from gsbench.system.resources import available_threads, installed_gpus
@@ -102,7 +102,7 @@ def check_triton() -> Iterator[Finding]:
 
     if version_of("triton") is None:  # it comes with torch for CUDA, so there is no GPU to run it on
         return
-    if fault := find("triton").too_old():
+    if fault := find_executor("triton").too_old():
         yield Finding("note", "triton", f"raster=triton {fault}")
     elif missing := missing_tools():
         yield Finding("note", "triton", f"at its first run on a GPU it needs {' and '.join(missing)}")

@@ -1,8 +1,8 @@
 """Lists of the records that each tile composites, front to back.
 
-The records are sorted once by depth; shards of the sorted order are then counted and filled in that order, so the list
-of every tile comes out sorted. A tile that the contour alpha = 1/255 does not reach is left out: nothing there could be
-seen.
+The records are sorted once by depth. Then shards of the sorted order are counted and written to the lists in that
+order, so the list of each tile is sorted, too. Tiles that the contour alpha = 1/255 does not reach are left out,
+because the Gaussian is invisible there.
 """
 
 import math
@@ -14,22 +14,23 @@ from gsbench.raster.cpu import layout as at
 from gsbench.raster.cpu.simd import prefetch
 from gsbench.system.jit import inlined, kernel
 
-LOG2_ALPHA_MIN_MARGIN = 1e-3  # of the contour's reach, for float32
+# Margins for float32 rounding: it must not lose a pixel of the contour.
+LOG2_ALPHA_MIN_MARGIN = 1e-3  # of log2(alpha)
 PIXEL_MARGIN = 0.02  # px
-LOW_WORD = np.uint64(0xFFFFFFFF)  # of a key: the record
-AHEAD = 12  # records that the prefetch runs ahead
-TILE_WORK = 16  # list entries that the fixed work of a tile weighs
-DIGIT = 11  # bits that one pass of the sort looks at
+LOW_WORD = np.uint64(0xFFFFFFFF)  # the bits of a key that hold the record
+AHEAD = 12  # records ahead that are prefetched
+TILE_WORK = 16  # fixed work of a tile, in list entries
+DIGIT = 11  # bits that one pass of the radix sort handles
 BUCKETS = 1 << DIGIT
 PASSES = 3  # over the 31 bits of a positive float32
 
 
 @kernel
 def sort_by_depth(begins: Any, visible: Any, keys: Any, order: Any, spare: Any, counts: Any) -> None:
-    """Sort the ``keys`` of all shards, ``visible[s]`` of them from ``begins[s]`` on, by depth into ``order``.
+    """Sort the ``keys`` of all shards by depth into ``order``; shard s has ``visible[s]`` keys from ``begins[s]`` on.
 
-    Equal depths stay in their order. ``spare`` is as long as ``order``, ``counts`` [PASSES, BUCKETS] is scratch. By
-    digits, the lowest first (Knuth, TAOCP 3, 5.2.5): 3 to 8 times as fast as numpy's sort.
+    The sort is stable. ``spare`` is as long as ``order``; ``counts`` [PASSES, BUCKETS] is scratch. It is a radix sort,
+    lowest digit first (Knuth, TAOCP 3, 5.2.5), 3 to 8 times as fast as numpy's sort.
     """
     for digit in range(PASSES):
         for bucket in range(BUCKETS):
@@ -64,15 +65,15 @@ def _put(key: Any, digit: int, counts: Any, target: Any) -> None:
 
 @inlined
 def _columns(records: Any, base: int, tile_y: int, first: int, past: int, reach: Any, flatness: Any) -> Any:
-    """Tiles of row ``tile_y``, within ``first`` to ``past``, that the contour reaches: first, past the last.
+    """The tiles of row ``tile_y``, within ``first`` to ``past``, that the contour reaches: first, past-the-last.
 
     The contour is t^2 = ``reach`` - ``flatness`` dy^2, with t = dx + shear dy.
     """
     shear, mean_y = np.float64(records[base + at.SHEAR]), np.float64(records[base + at.MEAN_Y])
     top = tile_y * at.TILE - mean_y - PIXEL_MARGIN
     bottom = top + (at.TILE - 1) + 2 * PIXEL_MARGIN
-    # The contour's x over y is concave on the right and convex on the left: the extremes within the row are at its
-    # rightmost and leftmost points, clamped to the row.
+    # As a function of y, the contour's right side is concave and its left side convex. So the extremes within the row
+    # are at the rightmost and the leftmost point, clamped to the row.
     rightmost = np.float64(records[base + at.RIGHTMOST_Y])
     y_right = min(max(rightmost, top), bottom)
     y_left = min(max(-rightmost, top), bottom)
@@ -98,11 +99,10 @@ def pair_shards(
     pairs: Any,
     made: Any,
 ) -> None:
-    """Write the pairs of tile and record (tile in the high word) of the sorted ``keys``, of which each of the shards
-    ``first`` to ``past`` has those between two ``edges``, to the shard's ``pairs``.
+    """For the shards ``first`` to ``past`` of the sorted ``keys``, write all pairs of tile (high word) and record.
 
-    Its ``counts`` [tiles] get how many each tile has, ``made`` how many there are in all; where that is more than
-    ``pairs`` has room for, the rest is not written.
+    Shard s has the keys from ``edges[s]`` to ``edges[s + 1]`` and writes to ``pairs[s]``. ``counts[s]`` [tiles] gets
+    the number of pairs of each tile, ``made[s]`` the total. Pairs for which ``pairs`` has no room are only counted.
     """
     for shard in range(first, past):
         begin, end = edges[shard], edges[shard + 1]
@@ -140,7 +140,7 @@ def _pair(
 
 @kernel
 def start_tiles(counts: Any, starts: Any) -> None:
-    """Turn ``counts`` [shards, tiles] into places of first entries; ``starts`` [tiles + 1] gets those of tiles."""
+    """Replace ``counts`` [shards, tiles] by places of first entries; fill ``starts`` [tiles + 1], those of tiles."""
     shards, tiles = counts.shape
     place = 0
     for tile in range(tiles):
@@ -154,8 +154,10 @@ def start_tiles(counts: Any, starts: Any) -> None:
 
 @kernel
 def fill_shards(first: int, past: int, made: Any, pairs: Any, places: Any, entries: Any) -> None:
-    """Write the records of the first ``made`` of each shard's ``pairs`` to their tiles' lists, at its ``places``
-    [tiles]."""
+    """Write the records of the shards ``first`` to ``past`` to the lists of their tiles.
+
+    Shard s has ``made[s]`` of ``pairs[s]``; ``places[s]`` [tiles] is where its next entry of each tile goes.
+    """
     for shard in range(first, past):
         own_pairs, own_places = pairs[shard], places[shard]
         for k in range(np.uint64(made[shard])):
@@ -166,7 +168,7 @@ def fill_shards(first: int, past: int, made: Any, pairs: Any, places: Any, entri
 
 @kernel
 def balance_tiles(starts: Any, shards: int, bounds: Any, tile_shard: Any) -> None:
-    """Cut the tiles into ``shards`` runs of about equal work: ``bounds`` [shards + 1], and the run of each tile."""
+    """Divide the tiles into ``shards`` runs of similar work; fill ``bounds`` [shards + 1] and ``tile_shard``."""
     tiles = len(tile_shard)
     total = starts[tiles] + TILE_WORK * tiles
     tile = 0

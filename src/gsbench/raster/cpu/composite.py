@@ -1,7 +1,7 @@
-"""Compositing of tiles, forward and backward, 4x4 pixels at a time; and which pixels each Gaussian was blended into.
+"""Compositing of tiles, forward and backward, 4x4 pixels at a time; and footprints.
 
-A tile is 16 blocks of 4x4 pixels; a block's state is one vector per quantity. A bit mask says which blocks a record can
-touch; the forward pass leaves it in ``masks`` for the backward pass.
+A tile is 16 blocks of 4x4 pixels. The state of a block is one vector per quantity. A bit mask has the blocks that a
+record may touch; the forward pass stores it in ``masks`` for the backward pass.
 """
 
 import math
@@ -36,22 +36,22 @@ from gsbench.system.jit import inlined, kernel
 LOG2_ALPHA_MIN = np.float32(math.log2(CONSTANTS.alpha_min))
 ALPHA_MAX = np.float32(CONSTANTS.alpha_max)
 TRANSMITTANCE_MIN = np.float32(CONSTANTS.transmittance_min)
-# A block is kept if it comes this close to alpha = 1/255: rounding must not lose a pixel.
+# A block is kept if its largest alpha is almost 1/255: rounding must not lose a pixel.
 LOG2_BLOCK_MIN = np.float32(math.log2(CONSTANTS.alpha_min) - 0.01)
 ONE = np.float32(1)
 ZERO = np.float32(0)
 BLOCK_SPAN = np.float32(BLOCK - 1)
 TO_PRECISION = np.float32(2 * math.log(2.0))  # -curve to entry of the inverse covariance, up to sign
-BATCH = 64  # entries that the forward pass blends block by block: as many as a word has bits
-BATCH_AHEAD = 24  # list entries that the forward pass's prefetch runs ahead
-AHEAD = 6  # and that of the backward pass, which does more for each
-NEVER_STOPPED = np.float32(1e9)  # more entries than a tile can have
-# Of a Gaussian's row: how many pixels, the sum of their values, and of their distances; as ``lane_sums`` leaves them.
+BATCH = 64  # entries that the forward pass blends at a time, block by block: the number of bits of a word
+BATCH_AHEAD = 24  # entries ahead that the forward pass prefetches
+AHEAD = 6  # entries ahead that the backward pass prefetches; it works longer on each
+NEVER_STOPPED = np.float32(1e9)  # larger than the number of entries of any tile
+# Lanes of a footprint's row: number of pixels, sum of values, sum of distances; in the order of ``lane_sums``.
 COVERED, VALUES, DISTANCES = at.SUM_H, at.SUM_H_T, at.SUM_H_Y
 
 LANE_X = (np.arange(LANES) % BLOCK).astype(np.float32)  # px within a block
 LANE_Y = (np.arange(LANES) // BLOCK).astype(np.float32)
-# px within a tile, in the order by block and lane
+# px within a tile, by block and lane
 PIXEL_X = np.concatenate([block % BLOCK * BLOCK + LANE_X for block in range(LANES)]).astype(np.float32)
 PIXEL_Y = np.concatenate([block // BLOCK * BLOCK + LANE_Y for block in range(LANES)]).astype(np.float32)
 
@@ -60,8 +60,8 @@ PIXEL_Y = np.concatenate([block // BLOCK * BLOCK + LANE_Y for block in range(LAN
 def _touched_blocks(records: Any, base: int, tile_x: Any, tile_y: Any, column: Any, row: Any) -> Any:
     """Bit b: block b of the tile at pixel (tile_x, tile_y) may have a pixel with alpha >= 1/255.
 
-    alpha is largest in a block at the mean or, if that lies outside, on an edge that faces it; on a vertical or
-    horizontal line the best point is known, and is clamped to the block. Lane b is block b.
+    Within a block, alpha is largest at the mean or, if the mean is outside, on an edge that faces the mean. The maximum
+    on a vertical or horizontal line has a closed form, which is clamped to the block. Lane b is block b.
     """
     left = column + (tile_x - records[base + at.MEAN_X])  # [16] dx of the first column of each block
     top = row + (tile_y - records[base + at.MEAN_Y])
@@ -92,8 +92,8 @@ def composite_tiles(
 ) -> None:
     """Blend the tiles ``first`` to ``past`` into ``image`` [H * W * 3] and ``alpha`` [H * W].
 
-    Of ``frame`` it fills what the backward pass needs: ``masks``, ``processed``, ``transmittance`` and ``last``, which
-    is `NEVER_STOPPED` where no entry stopped the pixel, and 0 outside the image.
+    It fills ``masks``, ``processed``, ``transmittance`` and ``last`` of ``frame`` for the backward pass. ``last`` is
+    `NEVER_STOPPED` for pixels that no entry stopped, and 0 outside the image.
     """
     entries, masks, records = frame.entries, frame.masks, frame.records
     transmittance, last = frame.transmittance, frame.last
@@ -121,10 +121,10 @@ def composite_tiles(
             if live[block] != 0:
                 alive |= np.uint64(1) << np.uint64(block)
 
-        # A batch of entries at a time, and within it block by block. Entry by entry, a block's state would be loaded
-        # and stored for every entry that touches it, each store waited for by the next load; so it stays in registers
-        # through a batch. The first loop has no branch that depends on a record, so nothing is guessed wrongly there,
-        # and it leaves the records in the first-level cache, where the second loop reads them up to 16 times.
+        # Entries are blended in batches, and within a batch block by block. So the state of a block stays in registers
+        # for a whole batch; entry by entry, it would be loaded and stored for every entry, and each load would wait for
+        # the store before it. The first loop has no branch that depends on a record, so no branch is mispredicted. It
+        # also brings the records into the first-level cache, where the second loop reads them up to 16 times.
         begin, end = frame.starts[tile], frame.starts[tile + 1]
         entry = begin
         while entry < end and alive != 0:
@@ -136,7 +136,7 @@ def composite_tiles(
                 touched[k] = blocks
                 masks[entry + k] = blocks
                 store(batch, k * at.RECORD, load(records, base))
-                batch[k * at.RECORD + at.MEAN_X] = tile_x - records[base + at.MEAN_X]  # from the mean to the tile
+                batch[k * at.RECORD + at.MEAN_X] = tile_x - records[base + at.MEAN_X]  # from mean to tile
                 batch[k * at.RECORD + at.MEAN_Y] = tile_y - records[base + at.MEAN_Y]
             for k in range(count, BATCH):
                 touched[k] = 0
@@ -175,7 +175,7 @@ def composite_tiles(
                         blend = blend & ~stop
                         if live[block] == 0:
                             alive &= ~bit
-                            while todo != 0:  # entries behind reach nothing here, and the backward pass skips them
+                            while todo != 0:  # later entries do not change this block: the backward pass skips them
                                 masks[entry + np.int64(lowest_bit(todo))] &= ~bit
                                 todo &= todo - np.uint64(1)
                     weight = select(blend, weight, ZERO)
@@ -216,7 +216,7 @@ def composite_tiles(
 
 @inlined
 def place_in_tile(x: int, y: int) -> int:
-    """The place of pixel (x, y) of a tile in the order by block and lane."""
+    """The index of pixel (x, y) of a tile in the order by block and lane."""
     return (((y >> 2) * 4 + (x >> 2)) << 4) + (y & 3) * 4 + (x & 3)
 
 
@@ -231,14 +231,15 @@ def composite_backward_tiles(
     all_rows: Any,
     want_absolute: bool,
 ) -> None:
-    """Add the gradient sums of the tiles ``first`` to ``past``, back to front, to those of their shards among
+    """Add the gradient sums of the tiles ``first`` to ``past``, back to front, to the rows of their shards in
     ``all_rows`` [shards, N * 16].
 
-    With U = (sum over the later of (c . g) alpha T, and the background's part) / T, all T counted from behind a record,
-    the loss changes with its alpha by T (c . g - U), where T is the transmittance before it; then U of the record
-    before is U + alpha (c . g - U). Going back to front U grows from the background's part by weighted means, so that
-    nothing cancels, and one division a record, that for T, is enough. ``g_alpha`` may be empty for zero.
-    ``want_absolute`` is True or None: a value that numba compiles out.
+    c is the colour of a record, g the gradient of the pixel, T the transmittance before the record. U is the sum over
+    the later records and the background of (c . g) alpha T, divided by the transmittance behind the record. The
+    derivative of the loss by the record's alpha is T (c . g - U), and U for the previous record is U + alpha (c . g -
+    U). So, back to front, U is a sequence of weighted means that starts with the background: nothing cancels, and the
+    only division per record is that for T. An empty ``g_alpha`` stands for zero. ``want_absolute`` is True or None, so
+    that numba removes its branch at compilation.
     """
     entries, masks, records = frame.entries, frame.masks, frame.records
     tiles_x, width, height = frame.camera.tiles_x, frame.camera.width, frame.camera.height
@@ -363,10 +364,11 @@ def cover_tiles(
     sums: Any,
     distances: Any,
 ) -> None:
-    """Add the tiles ``first`` to ``past`` to ``covered`` [N] int32, ``sums`` and ``distances`` [N] of their shards.
+    """Add the footprints of the tiles ``first`` to ``past`` to ``covered`` [N] int32, ``sums`` and ``distances`` [N] of
+    their shards.
 
-    ``values`` [H * W] may be empty for zero. The arithmetic of the compositing kernels decides here too which pixels
-    are blended.
+    An empty ``values`` [H * W] stands for zero. The arithmetic is that of the compositing kernels, so that the same
+    pixels count as blended.
     """
     entries, masks, records = frame.entries, frame.masks, frame.records
     tiles_x, width, height = frame.camera.tiles_x, frame.camera.width, frame.camera.height

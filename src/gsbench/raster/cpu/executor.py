@@ -1,4 +1,4 @@
-"""The compiled CPU rasterizer: its stages in order, forward and backward, shared out among threads."""
+"""The compiled CPU rasterizer: the stages of the forward and the backward pass, run on several threads."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -24,30 +24,30 @@ from gsbench.raster.cpu.composite import LOG2_ALPHA_MIN, composite_backward_tile
 from gsbench.raster.cpu.projection import BAD_VALUE, VISIBLE, backproject_shards, project_shards
 from gsbench.raster.cpu.shuffle import REST
 from gsbench.raster.cpu.workspace import HEADROOM, Arena, ArenaPool, ShardRunner, TensorPool
-from gsbench.raster.staged import Gradients, Lifetime, Request, StagedRasterizer, raise_for_values
+from gsbench.raster.staged import Gradients, Lifetime, RenderRequest, StagedRasterizer, raise_for_values
 from gsbench.scene.camera import Camera
 from gsbench.system.resources import available_cores
 
-# Fixed, so that the bits of every result are the same for any number of threads: each shard of tiles sums gradients in
-# rows of its own (64 bytes a Gaussian), and another number of shards would add them in another order.
+# Fixed numbers, so that results have the same bits for any number of threads. Each shard of tiles sums gradients in its
+# own rows (64 bytes per Gaussian); other numbers of shards would change the order of additions.
 GAUSSIAN_SHARDS = 16
 TILE_SHARDS = 8
 
 
 @dataclass
 class ForwardPass:
-    """The arrays that the forward pass leaves; their memory belongs to an arena."""
+    """Results of the forward pass for the backward pass; the memory belongs to an arena."""
 
-    frame: at.Frame
+    frame: at.CpuFrame
     degree: int
-    visible: NDArray[np.int64]  # [GAUSSIAN_SHARDS] records
+    visible: NDArray[np.int64]  # [GAUSSIAN_SHARDS] number of records of each shard
 
 
 class CpuRasterizer(StagedRasterizer[ForwardPass]):
-    """float32 on the CPU, compiled by numba at first use; the same bits on every run and for any number of ``threads``.
+    """float32 on the CPU, compiled by numba at first use. Same bits on every run and for any number of ``threads``.
 
-    Each render keeps its intermediate results until its graph is freed; memory is kept and used again. Safe to call
-    from several threads.
+    Each render keeps its intermediate results until its graph is freed; then their memory is reused. Several threads
+    may call it at once.
     """
 
     name = "cpu"
@@ -62,19 +62,19 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
         self._tensors = TensorPool()
         self._frames = ArenaPool()
         self._scratch = ArenaPool()
-        self._pairs_of_shard = 0  # of tile and record: the room that sufficed so far
+        self._pairs_of_shard = 0  # room for pairs of tile and record that has sufficed so far
 
     def check(self, gaussians: Gaussians) -> None:
-        """Raise ValueError where tensors are not float32 on the CPU."""
+        """Raise ValueError if tensors are not float32 on the CPU."""
         means = gaussians.means
         if means.dtype != torch.float32 or means.device.type != "cpu":
             raise ValueError(f"means: raster=cpu needs float32 on the cpu, got {means.dtype} on {means.device}")
 
     def forward(
-        self, lifetime: Lifetime, gaussians: Gaussians, request: Request
+        self, lifetime: Lifetime, gaussians: Gaussians, request: RenderRequest
     ) -> tuple[Tensor, Tensor, Tensor, ForwardPass]:
         """Project, sort, bin, composite; see `StagedRasterizer`."""
-        count, view = len(gaussians), at.make_view(request.camera)
+        count, view = len(gaussians), at.make_camera(request.camera)
         image, alpha = self._tensors.empty((view.height, view.width, 3)), self._tensors.empty((view.height, view.width))
         radii = torch.empty(count, dtype=torch.int32)
         arena = self._frames.lease(lifetime)
@@ -96,7 +96,7 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
         sort_by_depth(edges[:-1], flags[:, VISIBLE].copy(), keys, order, spare, np.empty((PASSES, BUCKETS), np.int64))
         starts, entries = self._list_tiles(arena, view, order, records)
         tiles, total = view.tiles_x * view.tiles_y, len(entries)
-        frame = at.Frame(
+        frame = at.CpuFrame(
             view,
             request.background.numpy(),
             records,
@@ -120,13 +120,13 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
         return image, alpha, radii, ForwardPass(frame, request.degree, flags[:, VISIBLE])
 
     def _list_tiles(
-        self, arena: Arena, view: at.View, order: NDArray[np.uint64], records: NDArray[np.float32]
+        self, arena: Arena, view: at.CpuCamera, order: NDArray[np.uint64], records: NDArray[np.float32]
     ) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
-        """Starts of the tiles' lists, [tiles + 1], and the records of all lists, front to back."""
+        """Starts of the lists of tiles, [tiles + 1], and the records of all lists, front to back."""
         tiles = view.tiles_x * view.tiles_y
         counts = arena.take("counts", (GAUSSIAN_SHARDS, tiles), np.int64)
         starts = arena.take("starts", (tiles + 1,), np.int64)
-        made = np.zeros(GAUSSIAN_SHARDS, np.int64)  # pairs of tile and record
+        made = np.zeros(GAUSSIAN_SHARDS, np.int64)  # number of pairs of tile and record
         in_order = (_edges(len(order)), order, records, records.view(np.int32))
 
         def pair(first: int, past: int) -> None:
@@ -135,7 +135,7 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
         room = self._pairs_of_shard
         pairs = arena.take("pairs", (GAUSSIAN_SHARDS, room), np.uint64)
         self._runner.run(GAUSSIAN_SHARDS, pair)
-        if made.max() > room:  # once in a while, as the scene grows
+        if made.max() > room:  # rare: as the scene grows
             room = self._pairs_of_shard = int(made.max() * HEADROOM)
             pairs = arena.take("pairs", (GAUSSIAN_SHARDS, room), np.uint64)
             self._runner.run(GAUSSIAN_SHARDS, pair)
@@ -152,7 +152,7 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
         self,
         passed: ForwardPass,
         gaussians: Gaussians,
-        request: Request,
+        request: RenderRequest,
         g_image: Tensor,
         g_alpha: Tensor | None,
         want_splitting: bool,
@@ -165,11 +165,16 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
             self._composite_backward(passed.frame, request, g_image, g_alpha, rows)
             return self._backproject(passed, gaussians, request.absolute, rows, want_splitting)
         except BaseException:
-            arena.drop("rows")  # it must be all zero, and an interrupt may have left sums in it
+            arena.drop("rows")  # kernels expect zeros and clear what they add; an interrupt may have left sums
             raise
 
     def _composite_backward(
-        self, frame: at.Frame, request: Request, g_image: Tensor, g_alpha: Tensor | None, rows: NDArray[np.float32]
+        self,
+        frame: at.CpuFrame,
+        request: RenderRequest,
+        g_image: Tensor,
+        g_alpha: Tensor | None,
+        rows: NDArray[np.float32],
     ) -> None:
         g_pixels = g_image.numpy().reshape(-1)
         g_alphas = np.empty(0, np.float32) if g_alpha is None else g_alpha.numpy().reshape(-1)
@@ -188,7 +193,7 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
         rows: NDArray[np.float32],
         want_splitting: bool,
     ) -> Gradients:
-        """The gradients, and those in absolute values where there is room for them."""
+        """Compute all gradients from the gradient sums in ``rows``; fill ``absolute``, if given."""
         count, take = len(gaussians), self._tensors.empty
         gradients = gaussians.map(lambda tensor: take(tuple(tensor.shape)))
         g_screen = take((count, 2))
@@ -219,10 +224,10 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
         count = len(gaussians)
         covered = np.zeros((TILE_SHARDS, count), np.int32)
         sums, distances = np.zeros((2, TILE_SHARDS, count), np.float32)
-        asked = np.empty(0, np.float32) if values is None else values.detach().float().contiguous().numpy().reshape(-1)
+        given = np.empty(0, np.float32) if values is None else values.detach().float().contiguous().numpy().reshape(-1)
 
         def cover(first: int, past: int) -> None:
-            cover_tiles(*_tiles(passed.frame, first, past), asked, covered, sums, distances)
+            cover_tiles(*_tiles(passed.frame, first, past), given, covered, sums, distances)
 
         self._runner.run(TILE_SHARDS, cover)
         totals = (torch.from_numpy(shards.sum(0, dtype=shards.dtype)) for shards in (covered, sums, distances))
@@ -230,12 +235,12 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
 
 
 def _edges(count: int) -> NDArray[np.int64]:
-    """Starts of the shards of so many Gaussians or records, and the end of the last."""
+    """The starts of the shards of ``count`` Gaussians or records, and the end of the last shard."""
     return np.arange(GAUSSIAN_SHARDS + 1) * count // GAUSSIAN_SHARDS
 
 
-def _tiles(frame: at.Frame, first: int, past: int) -> tuple[Any, ...]:
-    """The arguments that all kernels share which walk through the entries of tiles, for those of a range of shards."""
+def _tiles(frame: at.CpuFrame, first: int, past: int) -> tuple[Any, ...]:
+    """The first arguments of the kernels that process tiles, for a range of shards."""
     return at.kernel_memory(), int(frame.bounds[first]), int(frame.bounds[past]), frame
 
 

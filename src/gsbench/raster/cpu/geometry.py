@@ -1,8 +1,8 @@
-"""The geometry of projection and spherical harmonics, for 16 Gaussians at a time, in float32; for both passes.
+"""Projection geometry and spherical harmonics for 16 Gaussians at a time, float32, for both passes.
 
-Matrices are tuples of rows, vectors tuples. Nothing here subtracts large numbers: see ``spread``. The basis of the
-harmonics of 16 Gaussians is a 16x16 matrix: first a row for each function, which the kernels transpose into a row for
-each Gaussian, to be multiplied with its coefficients.
+Matrices are tuples of rows, and vectors are tuples. No formula subtracts large numbers (see ``spread``). The harmonics
+of 16 Gaussians are a 16x16 matrix with one row per basis function. The kernels transpose it into one row per Gaussian
+and multiply that by the coefficients.
 """
 
 import math
@@ -18,7 +18,7 @@ from gsbench.system.jit import inlined
 
 LOG2_E = 1.0 / math.log(2.0)
 BLUR = CONSTANTS.blur
-MAX_LOG2 = 126.0  # beyond, exp2 is undefined; a scale of 2^126 has a variance that is not finite, and is culled
+MAX_LOG2 = 126.0  # beyond, exp2 is undefined. The variance of a scale of 2^126 is not finite, so it is culled
 F0, F1 = np.float32(C0), np.float32(C1)
 D0, D1, D2, D3, D4 = (np.float32(value) for value in C2)
 T0, T1, T2, T3, T4, T5, T6 = (np.float32(value) for value in C3)
@@ -46,7 +46,7 @@ def rotation_matrix(w: Any, x: Any, y: Any, z: Any) -> Any:
 def from_camera(mean: Any, v: Any) -> Any:
     """The vector from the camera centre to the mean, in world axes.
 
-    Everything goes through this difference: rotating it loses no digits however far the scene is from its origin.
+    It is computed first: rotating the difference loses no digits, even if the scene is far from the origin.
     """
     return mean[0] - v.center_x, mean[1] - v.center_y, mean[2] - v.center_z
 
@@ -61,7 +61,7 @@ def to_view(offset: Any, v: Any) -> Any:
 
 @inlined
 def image_axes(slope_x: Any, slope_y: Any, inverse_z: Any, v: Any) -> Any:
-    """A = J W, the derivative of the pixel with respect to the world position, as two rows; the clamped slopes."""
+    """A = J W, the derivative of the pixel by the world position, as two rows; and the clamped slopes."""
     slope_x = minimum(maximum(slope_x, v.slope_x_min), v.slope_x_max)
     slope_y = minimum(maximum(slope_y, v.slope_y_min), v.slope_y_max)
     first, second = image_rows(slope_x, slope_y, inverse_z, v)
@@ -70,7 +70,7 @@ def image_axes(slope_x: Any, slope_y: Any, inverse_z: Any, v: Any) -> Any:
 
 @inlined
 def image_rows(slope_x: Any, slope_y: Any, inverse_z: Any, v: Any) -> Any:
-    """The derivative of the pixel with respect to the world position at x/z, y/z = the slopes, as two rows."""
+    """The derivative of the pixel by the world position at given slopes x/z, y/z, as two rows."""
     jx, jy = inverse_z * v.fx, inverse_z * v.fy
     first = (jx * (v.r00 - slope_x * v.r20), jx * (v.r01 - slope_x * v.r21), jx * (v.r02 - slope_x * v.r22))
     second = (jy * (v.r10 - slope_y * v.r20), jy * (v.r11 - slope_y * v.r21), jy * (v.r12 - slope_y * v.r22))
@@ -104,7 +104,7 @@ def gather_vectors(array: Any, indices: Any) -> Any:
 
 @inlined
 def gather_quaternions(quaternions: Any, indices: Any) -> Any:
-    """The unit quaternions, and the inverse norm and squared norm of what is stored."""
+    """The unit quaternions, and the inverse norm and the squared norm of the stored ones."""
     w, x = gather(quaternions, indices, 4, 0), gather(quaternions, indices, 4, 1)
     y, z = gather(quaternions, indices, 4, 2), gather(quaternions, indices, 4, 3)
     squared = w * w + x * x + y * y + z * z
@@ -114,10 +114,10 @@ def gather_quaternions(quaternions: Any, indices: Any) -> Any:
 
 @inlined
 def spread(m0: Any, m1: Any) -> Any:
-    """Spread of the rows of M: xx, xy, yy of the covariance C = M M^T + BLUR I, and a = yy / det C.
+    """xx, xy, yy of the covariance C = M M^T + BLUR I, for the rows of M; and a = yy / det C.
 
-    1/a is the variance of x given y. det(M M^T) is the squared cross product of the rows; dividing a row by the square
-    root of yy first gives 1/a without cancellation and without overflow.
+    1/a is the variance of x given y. det(M M^T) is the squared cross product of the rows. Dividing one row by sqrt(yy)
+    first gives 1/a without cancellation and overflow.
     """
     xx, xy, yy = dot(m0, m0), dot(m0, m1), dot(m1, m1) + BLUR
     inverse = 1 / square_root(yy)
@@ -129,16 +129,16 @@ def spread(m0: Any, m1: Any) -> Any:
 
 @inlined
 def normalized(offset: Any) -> Any:
-    """Scale ``offset`` to length 1; with the inverse of its length."""
+    """``offset`` scaled to length 1, and the inverse of its length."""
     inverse = 1 / square_root(dot(offset, offset))
     return scaled(offset, (inverse, inverse, inverse)), inverse
 
 
 @inlined
 def fill_basis(degree: int, x: Any, y: Any, z: Any, matrix: Any) -> None:
-    """Write function k + 1 at the unit directions (x, y, z) to column k of ``matrix`` [16 * 16], a row a Gaussian.
+    """Write basis function k + 1 at the unit directions (x, y, z) to column k of ``matrix`` [16 * 16].
 
-    The columns of functions above ``degree``, and the last one, are zero.
+    Each row is one Gaussian. The columns of functions above ``degree`` and the last column are zero.
     """
     for k in range((degree + 1) * (degree + 1) - 1, LANES):
         store(matrix, k * LANES, splat(ZERO))
@@ -166,9 +166,9 @@ def fill_basis(degree: int, x: Any, y: Any, z: Any, matrix: Any) -> None:
 
 @inlined
 def direction_gradient(degree: int, x: Any, y: Any, z: Any, matrix: Any) -> Any:
-    """The gradient (not yet tangential) at (x, y, z) of ``sum_k g[k] basis[k + 1]``.
+    """The gradient of ``sum_k g[k] basis[k + 1]`` by (x, y, z), not yet projected to the tangent of the unit sphere.
 
-    ``matrix`` [16 * 16] has g as a row for each Gaussian; it is transposed.
+    ``matrix`` [16 * 16] has g of one Gaussian in each row; this function transposes it.
     """
     gx, gy, gz = splat(ZERO), splat(ZERO), splat(ZERO)
     if degree >= 1:

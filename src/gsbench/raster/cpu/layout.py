@@ -1,4 +1,4 @@
-"""Layout of what the kernels pass to each other: the camera as numbers, the places in a record and a gradient row."""
+"""Memory layout of the data that kernels exchange: camera, records, gradient rows."""
 
 from typing import NamedTuple
 
@@ -9,12 +9,12 @@ from gsbench.raster.base import projection_numbers
 from gsbench.raster.cpu.simd import LANES, SUM_LANES
 from gsbench.scene.camera import Camera
 
-TILE = 16  # px; a tile is 4x4 blocks, row by row; fixed by the 16-bit masks, checked against RasterConstants.tile
+TILE = 16  # px; a tile is 4x4 blocks, row by row. Fixed by the 16-bit masks; must equal RasterConstants.tile
 TILE_PIXELS = TILE * TILE
 
-# A record: what compositing needs of one visible Gaussian, 16 float32, one cache line. With d = pixel - mean and
-# t = dx + SHEAR dy, log2(alpha) = LOG2_OPACITY + CURVE_T t^2 + CURVE_Y dy^2: the conic as a sum of squares, which,
-# unlike a dx^2 + 2b dx dy + c dy^2, does not cancel for needles and is never positive.
+# A record has what compositing needs of one visible Gaussian: 16 float32, one cache line. With d = pixel - mean and
+# t = dx + SHEAR dy, log2(alpha) = LOG2_OPACITY + CURVE_T t^2 + CURVE_Y dy^2. The conic is a sum of squares here: unlike
+# a dx^2 + 2b dx dy + c dy^2, it has no cancellation for needles, and the exponent is never positive.
 RECORD = LANES
 MEAN_X, MEAN_Y = 0, 1  # px, integer pixel centres
 SHEAR = 2  # b / a
@@ -24,12 +24,12 @@ RED, GREEN, BLUE = 6, 7, 8
 SLOPE = 9  # -b / c: dy / dx of the highest point of a vertical line
 RIGHTMOST_Y = 10  # px; dy of the rightmost point of the contour alpha = 1/255
 DEPTH = 11  # view z
-# int32 from here on
-TILES_X, TILES_Y = 12, 13  # tiles that the contour can touch: first + past-the-last * 65536
+# The remaining entries are int32.
+TILES_X, TILES_Y = 12, 13  # tiles that the contour can touch: first + 65536 past-the-last
 INDEX = 14  # of the Gaussian
 CLAMPED = 15  # bit c: colour channel c was below 0
 
-# A row: the gradient sums of one Gaussian over the pixels of one shard of tiles; h = d loss / d log(alpha).
+# A row has the gradient sums of one Gaussian over the pixels of one shard of tiles, with h = d loss / d log(alpha).
 ROW = LANES
 SUM_H, SUM_H_T, SUM_H_Y, SUM_H_TT, SUM_H_TY, SUM_H_YY = SUM_LANES[:6]
 SUM_RED, SUM_GREEN, SUM_BLUE = SUM_LANES[6:9]
@@ -37,11 +37,11 @@ SUM_ABS_T, SUM_ABS_Y = SUM_LANES[9:11]  # |h t|, |h (d power / d dy)|
 
 
 def kernel_memory() -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """Scratch memory for one call of a kernel; kernels allocate nothing themselves."""
+    """Scratch memory for one call of a kernel. Kernels cannot allocate memory (see `gsbench.system.jit.kernel`)."""
     return np.empty(8 * TILE_PIXELS, np.float32), np.empty(2 * LANES, np.int64)
 
 
-class View(NamedTuple):
+class CpuCamera(NamedTuple):
     """A camera as plain numbers for the kernels."""
 
     width: int
@@ -71,7 +71,7 @@ class View(NamedTuple):
 
 
 class Parameters(NamedTuple):
-    """The tensors of Gaussians, or their gradients, as arrays that share their memory."""
+    """The tensors of Gaussians, or their gradients, as numpy arrays on the same memory."""
 
     means: NDArray[np.float32]  # [N, 3]
     log_scales: NDArray[np.float32]  # [N, 3]
@@ -81,23 +81,23 @@ class Parameters(NamedTuple):
     sh_rest: NDArray[np.float32]  # [N, 45]
 
 
-class Frame(NamedTuple):
-    """Results of the forward pass, as its later kernels fill them and those of the backward pass read them."""
+class CpuFrame(NamedTuple):
+    """Arrays of one render: kernels of the forward pass fill them, kernels of the backward pass read them."""
 
-    camera: View
+    camera: CpuCamera
     background: NDArray[np.float32]  # [3]
     records: NDArray[np.float32]  # [N * RECORD]
-    record_ints: NDArray[np.int32]  # the memory of ``records``
-    starts: NDArray[np.int64]  # [tiles + 1] of each tile's entries
+    record_ints: NDArray[np.int32]  # the same memory as ``records``
+    starts: NDArray[np.int64]  # [tiles + 1] first entry of each tile
     entries: NDArray[np.int32]  # [pairs] records, by tile, front to back
-    masks: NDArray[np.uint16]  # [pairs] blocks of the tile that may be touched
-    processed: NDArray[np.int64]  # [tiles] end of the entries that were looked at
-    transmittance: NDArray[np.float32]  # [tiles * TILE_PIXELS] at the end, by tile, block and lane
-    last: NDArray[np.float32]  # [tiles * TILE_PIXELS] entries before the one that stopped the pixel
-    bounds: NDArray[np.int64]  # [shards + 1] tiles of each shard
-    tile_shard: NDArray[np.uint8]  # [tiles]
+    masks: NDArray[np.uint16]  # [pairs] bit b: the record may touch block b of the tile
+    processed: NDArray[np.int64]  # [tiles] end of the entries that compositing has read
+    transmittance: NDArray[np.float32]  # [tiles * TILE_PIXELS] final, by tile, block and lane
+    last: NDArray[np.float32]  # [tiles * TILE_PIXELS] number of entries before the one that stopped the pixel
+    bounds: NDArray[np.int64]  # [shards + 1] first tile of each shard
+    tile_shard: NDArray[np.uint8]  # [tiles] shard of each tile
 
 
-def make_view(camera: Camera) -> View:
+def make_camera(camera: Camera) -> CpuCamera:
     tiles = -(-camera.width // TILE), -(-camera.height // TILE)
-    return View(camera.width, camera.height, *tiles, *projection_numbers(camera))
+    return CpuCamera(camera.width, camera.height, *tiles, *projection_numbers(camera))

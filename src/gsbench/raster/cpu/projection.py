@@ -1,7 +1,7 @@
-"""Projection of Gaussians to records, and its gradients, derived by hand; 16 at a time.
+"""Projection of Gaussians to records, and its gradients, derived by hand; 16 Gaussians at a time.
 
-Of a shard, the Gaussians ``begin`` to ``end``, the visible ones become the records ``begin``, ``begin + 1``, ... in the
-order of their index.
+A shard has the Gaussians ``begin`` to ``end``. Its visible Gaussians become the records ``begin``, ``begin + 1``, …, in
+the order of their indices.
 """
 
 import math
@@ -66,15 +66,15 @@ from gsbench.system.jit import inlined, kernel
 
 NEAR, SIGMA_EXTENT, EIGENVALUE_FLOOR = CONSTANTS.near, CONSTANTS.sigma_extent, CONSTANTS.eigenvalue_floor
 ALPHA_MIN, LOG2_ALPHA_MIN = CONSTANTS.alpha_min, math.log2(CONSTANTS.alpha_min)
-MAX_RADIUS = 2.0**24  # px; keeps the radius of an absurdly large Gaussian inside int32
-MAX_CENTER = 1e9  # px; a centre so far outside the image cannot be told apart in float32
-MAX_VARIANCE = 1e18  # px^2; nor can a standard deviation; squares stay finite
-CONTOUR_MARGIN = 0.01  # px, and relative: rounding of the contour alpha = 1/255 must not lose a pixel
+MAX_RADIUS = 2.0**24  # px; keeps the radius of a huge Gaussian within int32
+MAX_CENTER = 1e9  # px; so far outside the image, float32 cannot resolve a pixel
+MAX_VARIANCE = 1e18  # px^2; the same for standard deviations; also keeps squares finite
+CONTOUR_MARGIN = 0.01  # px, and relative: rounding must not lose a pixel of the contour alpha = 1/255
 ZERO, HALF, ONE, TWO, FOUR = (np.float32(value) for value in (0, 0.5, 1, 2, 4))
 
-AHEAD = 16  # records that the backward pass's prefetch runs ahead
+AHEAD = 16  # records ahead that the backward pass prefetches
 ALL_LANES = np.uint64((1 << LANES) - 1)
-VISIBLE, BAD_VALUE = 0, 1  # places of a shard's flags
+VISIBLE, BAD_VALUE = 0, 1  # entries of a shard's flags: number of visible Gaussians; 1 if a value is bad
 
 
 @inlined
@@ -100,8 +100,11 @@ def project_shards(
     radii: Any,
     flags: Any,
 ) -> None:
-    """Fill, for the shards ``first`` to ``past`` between ``edges``, ``records`` [N * 16], ``keys`` [N] (depth, then
-    record), ``radii`` [N], and two ``flags`` a shard."""
+    """Project the shards ``first`` to ``past``; shard s has the Gaussians from ``edges[s]`` to ``edges[s + 1]``.
+
+    Fills ``records`` [N * 16], ``keys`` [N] (depth in the high word, record in the low word), ``radii`` [N] and
+    ``flags`` [shards, 2].
+    """
     for shard in range(first, past):
         begin, end = edges[shard], edges[shard + 1]
         _project(memory, begin, end, gaussians, degree, v, records, record_ints, keys, radii, flags[shard])
@@ -124,7 +127,7 @@ def _project(
     floats, indices = memory
     basis, rows, scratch = floats[:MATRIX], floats[MATRIX : 2 * MATRIX], floats[2 * MATRIX :]
     out = begin
-    bad = splat(ZERO)  # stays 0 as long as every value is finite
+    bad = splat(ZERO)  # sum of 0 * value: 0 if every value is finite, else NaN
     short = np.uint64(0)
     for start in range(begin, end, LANES):
         count = min(LANES, end - start)
@@ -157,7 +160,7 @@ def _project(
         visible = visible & (dot(m0, m0) + dot(m1, m1) < MAX_VARIANCE)
         xx, xy, yy, a = spread(m0, m1)
         half = (xx - yy) * HALF
-        # middle^2 - det as a sum of squares
+        # The discriminant middle^2 - det, written as a sum of squares.
         largest = (xx + yy) * HALF + square_root(maximum(half * half + xy * xy, EIGENVALUE_FLOOR))
         radius = minimum(ceil(square_root(largest) * SIGMA_EXTENT), MAX_RADIUS)
         first_x, past_x = _tile_range(column - radius, column + radius, v.tiles_x)
@@ -167,7 +170,7 @@ def _project(
         for lane in range(count):
             radii[start + lane] = np.int32(scratch[lane])
 
-        # Of the tiles of the 3 sigma square, those that the contour alpha = 1/255 can touch.
+        # Of the tiles of the 3 sigma square, keep those that the contour alpha = 1/255 can touch.
         opacity = ONE / (exponential(-logit) + ONE)
         log2_opacity = log2(maximum(opacity, ALPHA_MIN))
         reach = (log2_opacity - LOG2_ALPHA_MIN) * (2 / LOG2_E)  # squared Mahalanobis distance of the contour
@@ -224,17 +227,17 @@ def _project(
             lane = lowest_bit(todo)
             todo &= todo - np.uint64(1)
             store(records, out * at.RECORD, load(rows, lane * np.uint64(LANES)))
-            # The bits of a positive float32 sort like its value; equal depths in the order of the index.
+            # The bits of positive float32 numbers sort like the numbers. Equal depths sort by index.
             keys[out] = (np.uint64(record_ints[out * at.RECORD + at.DEPTH]) << np.uint64(32)) | np.uint64(out)
             out += 1
     flags[VISIBLE] = out - begin
-    sound = mask_bits(absolute(bad) <= ZERO)  # false for NaN
+    sound = mask_bits(absolute(bad) <= ZERO)  # False for NaN
     flags[BAD_VALUE] = 0 if short == 0 and sound == ALL_LANES else 1
 
 
 @inlined
 def _row_sums(array: Any, place: int) -> Any:
-    """The sums of the 16 rows of the 16x16 numbers at ``array[place:]``, row k in lane k."""
+    """The sums of the 16 rows of the 16x16 matrix at ``array[place:]``; row k in lane k."""
     transpose(array, place)
     total = load(array, place)
     for k in range(1, LANES):
@@ -246,12 +249,12 @@ def _row_sums(array: Any, place: int) -> Any:
 def _take_rows(
     record: int, count: int, past: int, v: Any, record_ints: Any, tile_shard: Any, rows: Any, indices: Any, sums: Any
 ) -> None:
-    """Sum the rows of ``count`` records over the shards of their tiles; clear the rows.
+    """Sum the gradient rows of ``count`` records over the shards of their tiles, and clear the rows.
 
-    ``sums`` [16 * 16] gets a row for each place of a row, and ``indices`` [16] the Gaussians; where there are fewer
-    than 16, the last one again.
+    ``sums`` [16 * 16] gets one row per entry of a gradient row; ``indices`` [16] gets the Gaussians. If there are fewer
+    than 16 records, the last one is repeated.
     """
-    # Cleared while they are in the cache: clearing all before each backward pass would go to memory once more.
+    # Rows are cleared here, while they are in the cache; clearing them before the backward pass would load them again.
     shard_rows = len(record_ints)  # a row is as long as a record
     for lane in range(count):
         ahead = min(record + lane + AHEAD, past - 1) * at.RECORD
@@ -293,10 +296,11 @@ def backproject_shards(
     g_absolute: Any,
     g_splitting: Any,
 ) -> None:
-    """Write all ``gradients`` of the shards ``first`` to ``past`` of Gaussians, which lie between ``edges``; read and
-    clear their ``rows`` [shards of tiles * N * 16].
+    """Write all ``gradients`` of the shards ``first`` to ``past``; shard s has the Gaussians from ``edges[s]`` to
+    ``edges[s + 1]``, of which ``visible[s]`` have records.
 
-    ``visible`` counts the records of each shard; ``g_absolute`` and ``g_splitting`` [N, 9] may be empty.
+    Reads and clears their ``rows`` [shards of tiles * N * 16]. ``g_absolute`` [N, 2] and ``g_splitting`` [N, 9] are
+    empty if not requested.
     """
     for shard in range(first, past):
         begin, end = edges[shard], edges[shard + 1]
@@ -337,7 +341,7 @@ def _backproject(
         mean, log_scale = gather_vectors(gaussians.means, indices), gather_vectors(gaussians.log_scales, indices)
         offset = from_camera(mean, v)
 
-        # Colour; a channel below 0 is clamped and passes nothing.
+        # Colour. A channel below 0 was clamped and has no gradient.
         to, inverse_distance = normalized(offset)
         red, green, blue = _unclamped(record, count, record_ints, sums, colors)
         scatter(g_sh_dc, indices, 3, 0, red * F0)
@@ -356,7 +360,7 @@ def _backproject(
                 store_rest(g_sh_rest, indices[lane] * REST, (splat(ZERO), splat(ZERO), splat(ZERO)))
         through = direction_gradient(degree, to[0], to[1], to[2], pulled)
 
-        # The forward geometry once more.
+        # Repeat the geometry of the forward pass.
         quaternion, inverse_norm, _ = gather_quaternions(gaussians.quaternions, indices)
         qw, qx, qy, qz = quaternion
         matrix = rotation_matrix(qw, qx, qy, qz)
@@ -380,8 +384,9 @@ def _backproject(
             absolute_y = load(sums, at.SUM_ABS_Y * LANES)
             scatter(g_absolute, indices, 2, 1, absolute_y * (0.5 * v.height))
 
-        # M = N S, N = A R: d loss / d M = U^T Q U M with Q = D G D, D = diag(a, e), U = [[1, shear], [0, 1]], G the
-        # second moments of h over (t, dy). The first row of U M is short for a needle: U N comes first.
+        # Covariance: M = N S and N = A R. d loss / d M = U^T Q U M with Q = D G D, D = diag(a, e), U = [[1, shear], [0,
+        # 1]] and G the second moments of h over (t, dy). For a needle the first row of U M is small, so U N is computed
+        # first, before large numbers can cancel.
         q00 = a * a * load(sums, at.SUM_H_TT * LANES)
         q01 = a * e * load(sums, at.SUM_H_TY * LANES)
         q11 = e * e * load(sums, at.SUM_H_YY * LANES)
@@ -397,9 +402,10 @@ def _backproject(
         scatter(g_log_scales, indices, 3, 1, (u0[1] * g0[1] + n1[1] * g1[1]) * variances[1])
         scatter(g_log_scales, indices, 3, 2, (u0[2] * g0[2] + n1[2] * g1[2]) * variances[2])
 
-        # Turned by small angles w about its own axes, R S^2 R^T changes by a commutator: the gradient at w has
-        # differences of variances as factors. Taken first, they make that of a ball 0, where the rounding of terms that
-        # cancel would become full steps of Adam. The quaternion moves by q (0, w) / 2.
+        # Rotation by small angles w about the Gaussian's own axes changes R S^2 R^T by a commutator, so the gradient by
+        # w has differences of variances as factors. Computing these differences first makes the gradient of a sphere
+        # exactly 0; otherwise rounding errors would remain, which Adam scales to full steps. The quaternion changes by
+        # q (0, w) / 2.
         w_x = (u0[1] * g0[2] + n1[1] * g1[2]) * _difference(scales[1], scales[2])
         w_y = (u0[2] * g0[0] + n1[2] * g1[0]) * _difference(scales[2], scales[0])
         w_z = (u0[0] * g0[1] + n1[0] * g1[1]) * _difference(scales[0], scales[1])
@@ -409,7 +415,7 @@ def _backproject(
         scatter(g_quaternions, indices, 4, 2, (qw * w_y + qz * w_x - qx * w_z) * twice)
         scatter(g_quaternions, indices, 4, 3, (qw * w_z + qx * w_y - qy * w_x) * twice)
 
-        # A = J W: d loss / d A, then J's entries, then the position in the view.
+        # A = J W: d loss / d A, then by the entries of J, then by the position in view space.
         s0, s1 = scaled(g0, variances), scaled(g1, variances)
         s1 = (s1[0] + shear * s0[0], s1[1] + shear * s0[1], s1[2] + shear * s0[2])
         a0 = (dot(s0, matrix[0]), dot(s0, matrix[1]), dot(s0, matrix[2]))
@@ -418,7 +424,7 @@ def _backproject(
         j11, j12 = a1[0] * v.r10 + a1[1] * v.r11 + a1[2] * v.r12, a1[0] * v.r20 + a1[1] * v.r21 + a1[2] * v.r22
         fx_z, fy_z = inverse_z * v.fx, inverse_z * v.fy
         free_x, free_y = x * inverse_z, y * inverse_z
-        # The clamp of the slope passes the gradient only within its limits.
+        # The clamp of a slope passes the gradient only within the limits.
         g_slope_x = select((free_x >= v.slope_x_min) & (free_x <= v.slope_x_max), -fx_z * j02, ZERO)
         g_slope_y = select((free_y >= v.slope_y_min) & (free_y <= v.slope_y_max), -fy_z * j12, ZERO)
         view_x = g_column * fx_z + g_slope_x * inverse_z
@@ -426,7 +432,7 @@ def _backproject(
         through_focal = fx_z * (j00 - slope_x * j02) + fy_z * (j11 - slope_y * j12)
         view_z = -(through_focal * inverse_z + view_x * free_x + view_y * free_y)
 
-        # Position: through the image and through the direction of the colour.
+        # Mean: its gradient through the image position, and through the view direction of the colour.
         radial = dot(through, to)
         from_x = (through[0] - radial * to[0]) * inverse_distance
         from_y = (through[1] - radial * to[1]) * inverse_distance
@@ -442,10 +448,11 @@ def _backproject(
 
 @inlined
 def _scatter_splitting(g_splitting: Any, indices: Any, d00: Any, d01: Any, d11: Any, shear: Any, rows: Any) -> None:
-    """Write F^T U^T (D G D - h D) U F for the derivative F = ``rows`` of the mean on the image, ``d`` what is between.
+    """Write the splitting matrices F^T U^T (D G D - h D) U F. F = ``rows`` is the derivative of the projected mean;
+    ``d00``, ``d01`` and ``d11`` are the entries of D G D - h D.
 
-    The second derivative of alpha by the mean on the image is alpha (u u^T - C), with u = C (dx, dy) and the conic
-    C = U^T D U; summed with weights h / alpha that is U^T (D G D - h D) U.
+    The second derivative of alpha by the projected mean is alpha (u u^T - C), with u = C (dx, dy) and the conic C = U^T
+    D U. Its sum with weights h / alpha is U^T (D G D - h D) U.
     """
     r0 = (rows[0][0] + shear * rows[1][0], rows[0][1] + shear * rows[1][1], rows[0][2] + shear * rows[1][2])
     r1 = rows[1]
@@ -465,13 +472,13 @@ def _scatter_splitting(g_splitting: Any, indices: Any, d00: Any, d01: Any, d11: 
 
 @inlined
 def _difference(a: Any, b: Any) -> Any:
-    """a^2 - b^2, to the last digits and without overflow of what does not overflow."""
+    """a^2 - b^2 without cancellation, and without overflow of the squares."""
     return (a - b) * (a + b)
 
 
 @inlined
 def _unclamped(record: int, count: int, record_ints: Any, sums: Any, colors: Any) -> Any:
-    """The gradients of red, green and blue, zero where the channel was clamped; also written to ``colors`` [3 * 16]."""
+    """The gradients by red, green and blue, 0 if the channel was clamped; also written to ``colors`` [3 * 16]."""
     for lane in range(LANES):
         clamped = record_ints[(record + min(lane, count - 1)) * at.RECORD + at.CLAMPED]
         colors[lane] = ZERO if clamped & 1 else sums[at.SUM_RED * LANES + lane]
@@ -482,7 +489,7 @@ def _unclamped(record: int, count: int, record_ints: Any, sums: Any, colors: Any
 
 @inlined
 def _clear(gradient: Any, first: int, past: int) -> None:
-    """Zero the rows ``first`` to ``past`` of ``gradient`` [N, C]."""
+    """Set the rows ``first`` to ``past`` of ``gradient`` [N, C] to 0."""
     for i in range(first, past):
         for c in range(gradient.shape[1]):
             gradient[i, c] = ZERO

@@ -1,7 +1,7 @@
-"""Vectors turned into other vectors: 16x16 transposition, blocks of pixels, integers in the bits of lanes, harmonics.
+"""Rearrangement of vectors: 16x16 transposition, blocks of pixels, integers in the bits of lanes, harmonics.
 
-The kernels hold a quantity of 16 Gaussians in a vector; records, gradient rows and the coefficients of one Gaussian lie
-side by side in memory. Here one becomes the other.
+Kernels hold one quantity of 16 Gaussians in a vector, but in memory the values of one Gaussian (record, gradient row,
+coefficients) are adjacent. These functions convert between the two layouts.
 """
 
 from collections.abc import Sequence
@@ -15,8 +15,8 @@ from gsbench.raster.cpu.simd import LANES, VECTOR, address, intrinsic, lane_indi
 
 CHANNELS = 3
 BLOCK = 4  # px, the sides of the 16 pixels of a vector
-REST = CHANNELS * NUM_SH_REST  # numbers of one Gaussian in ``sh_rest``: coefficient by coefficient, r g b
-REST_STARTS = (0, LANES, REST - LANES)  # of the three vectors that hold them; the last two share three numbers
+REST = CHANNELS * NUM_SH_REST  # numbers of one Gaussian in ``sh_rest``: r g b of each coefficient
+REST_STARTS = (0, LANES, REST - LANES)  # starts of the three vectors that hold them; the last two overlap by three
 
 
 def _load(builder: Any, pointer: Any, place: int) -> Any:
@@ -31,7 +31,7 @@ def _store(builder: Any, value: Any, pointer: Any, place: int) -> None:
 
 @intrinsic
 def transpose(typing_context: Any, array: Any, index: Any) -> Any:
-    """Transpose the 16x16 numbers at ``array.flat[index : index + 256]`` in place."""
+    """Transpose the 16x16 matrix at ``array.flat[index : index + 256]`` in place."""
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         pointer = address(context, builder, sig, args)
@@ -54,7 +54,7 @@ def transpose(typing_context: Any, array: Any, index: Any) -> Any:
 
 
 def _row_pointers(context: Any, builder: Any, sig: Any, args: Any, numbers: int) -> list[Any]:
-    """Pointers to the four rows of a block, ``numbers`` float32 each, that begin at ``args[1]``, ``args[2]`` apart."""
+    """Pointers to the four rows of a block: ``numbers`` float32 each, the first at ``args[1]``, ``args[2]`` apart."""
     first = address(context, builder, sig, args)
     stride = context.cast(builder, args[2], sig.args[2], types.intp)
     kind = ir.VectorType(ir.FloatType(), numbers).as_pointer()
@@ -64,7 +64,7 @@ def _row_pointers(context: Any, builder: Any, sig: Any, args: Any, numbers: int)
 
 @intrinsic
 def store_block(typing_context: Any, array: Any, index: Any, stride: Any, values: Any) -> Any:
-    """Write a block's 16 pixels to the image of one number a pixel whose rows are ``stride`` apart."""
+    """Write the 16 pixels of a block to an image with one number per pixel and rows ``stride`` apart."""
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         for row, pointer in enumerate(_row_pointers(context, builder, sig, args, BLOCK)):
@@ -77,7 +77,7 @@ def store_block(typing_context: Any, array: Any, index: Any, stride: Any, values
 
 @intrinsic
 def store_colors(typing_context: Any, array: Any, index: Any, stride: Any, red: Any, green: Any, blue: Any) -> Any:
-    """Write a block's 16 pixels to the image of three numbers a pixel whose rows are ``stride`` numbers apart."""
+    """Write the 16 pixels of a block to an image with three numbers per pixel and rows ``stride`` numbers apart."""
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         red, green, blue = args[3:]
@@ -94,7 +94,7 @@ def store_colors(typing_context: Any, array: Any, index: Any, stride: Any, red: 
 
 @intrinsic
 def load_colors(typing_context: Any, array: Any, index: Any, stride: Any) -> Any:
-    """The inverse of ``store_colors``: red, green and blue of a block's 16 pixels."""
+    """The inverse of ``store_colors``: red, green and blue of the 16 pixels of a block."""
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         pointers = _row_pointers(context, builder, sig, args, CHANNELS * BLOCK)
@@ -111,7 +111,7 @@ def load_colors(typing_context: Any, array: Any, index: Any, stride: Any) -> Any
 
 @intrinsic
 def as_integers(typing_context: Any, value: Any) -> Any:
-    """Whole numbers as int32, whose bits the lanes then hold: only to be stored, or read as int32."""
+    """Convert whole numbers to int32, kept as the bits of float32 lanes: only store them, or read them as int32."""
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         return builder.bitcast(builder.fptosi(args[0], VECTOR.bits_ir), VECTOR.ir)
@@ -121,7 +121,7 @@ def as_integers(typing_context: Any, value: Any) -> Any:
 
 @intrinsic
 def as_span(typing_context: Any, first: Any, past: Any) -> Any:
-    """``first + past * 65536`` as int32, in the bits of the lanes."""
+    """``first + past * 65536`` as int32, kept as the bits of float32 lanes."""
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         low, high = (builder.fptosi(value, VECTOR.bits_ir) for value in args)
@@ -132,7 +132,7 @@ def as_span(typing_context: Any, first: Any, past: Any) -> Any:
 
 @intrinsic
 def index_bits(typing_context: Any, start: Any) -> Any:
-    """``start`` + lane as int32, in the bits of the lanes."""
+    """``start`` + lane as int32, kept as the bits of float32 lanes."""
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         first = context.cast(builder, args[0], sig.args[0], types.int32)
@@ -146,7 +146,7 @@ def index_bits(typing_context: Any, start: Any) -> Any:
 
 @intrinsic
 def load_rest(typing_context: Any, array: Any, index: Any) -> Any:
-    """The 45 numbers ``array.flat[index : index + 45]`` as three vectors that start at ``REST_STARTS``."""
+    """Load the 45 numbers ``array.flat[index : index + 45]`` as three vectors that start at ``REST_STARTS``."""
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         pointer = address(context, builder, sig, args)
@@ -170,7 +170,7 @@ def store_rest(typing_context: Any, array: Any, index: Any, values: Any) -> Any:
 
 @intrinsic
 def by_channel(typing_context: Any, rest: Any) -> Any:
-    """Red, green and blue of ``load_rest``: coefficient k in lane k; lane 15 repeats lane 14."""
+    """Red, green and blue of the result of ``load_rest``: coefficient k in lane k; lane 15 repeats lane 14."""
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         first, second, third = (builder.extract_value(args[0], k) for k in range(CHANNELS))
@@ -188,7 +188,7 @@ def by_channel(typing_context: Any, rest: Any) -> Any:
 
 @intrinsic
 def outer_rest(typing_context: Any, basis: Any, red: Any, green: Any, blue: Any) -> Any:
-    """basis[k] times a colour, in the order of ``load_rest``; ``basis`` has coefficient k in lane k."""
+    """``basis[k]`` times a colour, in the layout of ``load_rest``; ``basis`` has coefficient k in lane k."""
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         row, *colors = args

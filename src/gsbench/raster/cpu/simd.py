@@ -1,12 +1,12 @@
-"""Explicit SIMD values inside numba kernels: 16 float32 in one LLVM vector, and 16 truth values in a mask.
+"""Explicit SIMD in numba kernels: vectors of 16 float32, and masks of 16 truth values.
 
-Auto-vectorisation of numba loops is fragile: an unlucky index type makes an inner loop scalar. Here a vector is a value
-like any other: ``load`` and ``store`` move it; ``+ - * /``, ``-x`` and comparisons work lane by lane (a Python or numpy
-number is broadcast); comparisons give a mask for ``&``, ``|``, ``~`` and ``select``. LLVM maps the vector to what the
-host has: one AVX-512 register, two of AVX2, four of SSE or NEON; the lanes' results do not depend on it, apart from
-``fma``, which is fused only where the host can.
+The auto-vectorisation of numba loops is fragile: one unsuitable index type makes an inner loop scalar. Here a vector is
+an ordinary value. ``load`` and ``store`` move it; ``+ - * /``, ``-x`` and comparisons work lane by lane, and Python or
+numpy numbers are broadcast. Comparisons give a mask for ``&``, ``|``, ``~`` and ``select``. LLVM maps a vector to one
+AVX-512 register, two of AVX2, or four of SSE or NEON. Results do not depend on this, except that ``fma`` is fused only
+on hosts with that instruction.
 
-Indices count array elements, are not checked and must not be negative. Arrays are contiguous.
+Indices count array elements; they are not checked and must not be negative. Arrays are contiguous.
 """
 
 import math
@@ -20,7 +20,7 @@ from numba.core import extending as numba_extending
 from numba.core.extending import lower_builtin, models, register_model
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
 
-intrinsic: Any = numba_extending.intrinsic  # its functions take one argument less than they are written with
+intrinsic: Any = numba_extending.intrinsic  # kernels call its functions without the first argument, typing_context
 
 LANES = 16  # of float32
 
@@ -33,7 +33,7 @@ class Vector(types.Type):
         self.scalar_ir = ir.FloatType()
         self.ir = ir.VectorType(self.scalar_ir, LANES)
         self.bits_ir = ir.VectorType(ir.IntType(32), LANES)
-        self.suffix = f"v{LANES}f32"  # of LLVM's intrinsic functions
+        self.suffix = f"v{LANES}f32"  # in the names of LLVM's intrinsic functions
         super().__init__(name=f"float32x{LANES}")
 
     def constant(self, value: float) -> ir.Constant:
@@ -63,12 +63,12 @@ class _Model(models.PrimitiveModel):
 
 
 def lane_indices(lanes: Sequence[int]) -> ir.Constant:
-    """Numbers of lanes, as LLVM's shuffles want them."""
+    """The numbers of lanes as a constant for LLVM's shuffles."""
     return ir.Constant(ir.VectorType(ir.IntType(32), len(lanes)), [ir.Constant(ir.IntType(32), lane) for lane in lanes])
 
 
 def as_vector(context: Any, builder: Any, value: Any, kind: Any, vector: Vector) -> Any:
-    """The operand ``value`` of the numba type ``kind`` as a vector: itself, or a number in all lanes."""
+    """The operand ``value`` of the numba type ``kind`` as a vector; a number is broadcast to all lanes."""
     if isinstance(kind, Vector):
         return value
     scalar = context.cast(builder, value, kind, vector.element)
@@ -78,14 +78,14 @@ def as_vector(context: Any, builder: Any, value: Any, kind: Any, vector: Vector)
 
 
 def common_vector(kinds: Sequence[Any]) -> Vector | None:
-    """The vector type of arguments of which each is that vector or a number; None if they are anything else."""
+    """The vector type if the arguments are vectors of one type and numbers, with at least one vector; else None."""
     vectors = {kind for kind in kinds if isinstance(kind, Vector)}
     fits = len(vectors) == 1 and all(isinstance(kind, Vector | types.Number) for kind in kinds)
     return vectors.pop() if fits else None
 
 
 def _register_operator(functions: Sequence[Any], arity: int, emit: Callable[..., Any], compares: bool = False) -> None:
-    """Let ``functions`` of vectors (or vectors and numbers) be what ``emit(builder, *operands)`` builds."""
+    """Make numba compile ``functions`` of vectors (or vectors and numbers) to ``emit(builder, *operands)``."""
 
     class _Template(AbstractTemplate):
         def generic(self, args: Sequence[Any], kws: Any) -> Any:
@@ -128,8 +128,7 @@ _register_mask_operator([operator.or_, operator.ior], 2, lambda builder, a, b: b
 _register_mask_operator([operator.invert], 1, lambda builder, a: builder.not_(a))
 
 
-# --- memory
-# -------------------------------------------------------------------------------------------------------------
+# Memory
 
 
 def address(context: Any, builder: Any, sig: Any, args: Any) -> Any:
@@ -150,8 +149,8 @@ def load(typing_context: Any, array: Any, index: Any) -> Any:
     vector = _vector_of(array)
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        # LLVM takes the stack to be aligned to 16 bytes. Vectors that it moves there when registers run short would lie
-        # across two cache lines in some processes and threads and not in others: a quarter of a kernel's time.
+        # LLVM aligns the stack to 16 bytes only. Vectors that it spills to the stack could then cross cache lines, in
+        # some processes and threads but not in others, which would cost a quarter of a kernel's time.
         builder.function.attributes.alignstack = 4 * LANES
         builder.function.attributes.add("nounwind")
         pointer = builder.bitcast(address(context, builder, sig, args), vector.ir.as_pointer())
@@ -162,7 +161,7 @@ def load(typing_context: Any, array: Any, index: Any) -> Any:
 
 @intrinsic
 def load_numbers(typing_context: Any, array: Any, index: Any) -> Any:
-    """``load`` of an array that may be uint8 instead."""
+    """``load``, also from a uint8 array."""
     is_bytes = isinstance(array, types.Array) and array.layout == "C" and array.dtype == types.uint8
     vector = VECTOR if is_bytes else _vector_of(array)
     kind = ir.VectorType(ir.IntType(8), LANES) if is_bytes else vector.ir
@@ -189,7 +188,7 @@ def store(typing_context: Any, array: Any, index: Any, value: Any) -> Any:
 
 
 def _places(context: Any, builder: Any, sig: Any, args: Any) -> Iterator[Any]:
-    """The addresses of ``array.flat[indices[k] * stride + offset]``, lane by lane, of the first four of ``args``."""
+    """The addresses of ``array.flat[indices[k] * stride + offset]`` for each lane k; ``args[:4]`` are these four."""
     data = context.make_array(sig.args[0])(context, builder, args[0]).data
     indices = context.make_array(sig.args[1])(context, builder, args[1]).data
     stride, offset = (context.cast(builder, args[k], sig.args[k], types.intp) for k in (2, 3))
@@ -213,7 +212,7 @@ def gather(typing_context: Any, array: Any, indices: Any, stride: Any, offset: A
 
 @intrinsic
 def scatter(typing_context: Any, array: Any, indices: Any, stride: Any, offset: Any, value: Any) -> Any:
-    """Write lane k of ``value`` to ``array.flat[indices[k] * stride + offset]``; of equal indices the last one wins."""
+    """Write lane k of ``value`` to ``array.flat[indices[k] * stride + offset]``; of equal indices the last wins."""
     _vector_of(array)
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
@@ -226,7 +225,7 @@ def scatter(typing_context: Any, array: Any, indices: Any, stride: Any, offset: 
 
 @intrinsic
 def prefetch(typing_context: Any, array: Any, index: Any) -> Any:
-    """Ask for the cache line of ``array.flat[index]``; never faults."""
+    """Prefetch the cache line of ``array.flat[index]``; never faults."""
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         byte_pointer, word = ir.IntType(8).as_pointer(), ir.IntType(32)
@@ -240,8 +239,7 @@ def prefetch(typing_context: Any, array: Any, index: Any) -> Any:
     return types.void(array, index), codegen
 
 
-# --- functions
-# ----------------------------------------------------------------------------------------------------------
+# Functions of vectors and masks
 
 
 def _call(builder: Any, name: str, vector: Vector, *operands: Any) -> Any:
@@ -250,7 +248,7 @@ def _call(builder: Any, name: str, vector: Vector, *operands: Any) -> Any:
 
 
 def _function(emit: Callable[..., Any], *kinds: Any) -> Any:
-    """An intrinsic that is ``emit(builder, vector type, *operands)`` of vectors, or of vectors and numbers."""
+    """An intrinsic of vectors, or vectors and numbers, that compiles to ``emit(builder, vector type, *operands)``."""
     vector = common_vector(kinds)
     if vector is None:
         return None
@@ -264,7 +262,7 @@ def _function(emit: Callable[..., Any], *kinds: Any) -> Any:
 
 @intrinsic
 def splat(typing_context: Any, scalar: Any) -> Any:
-    """``scalar`` in all of 16 float32."""
+    """A vector with ``scalar`` in all lanes."""
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         return as_vector(context, builder, args[0], sig.args[0], VECTOR)
@@ -274,19 +272,19 @@ def splat(typing_context: Any, scalar: Any) -> Any:
 
 @intrinsic
 def fma(typing_context: Any, a: Any, b: Any, c: Any) -> Any:
-    """``a * b + c``, fused where the host can do so fast."""
+    """``a * b + c``, fused if that is fast on the host."""
     return _function(lambda builder, vector, *v: _call(builder, "fmuladd", vector, *v), a, b, c)
 
 
 @intrinsic
 def minimum(typing_context: Any, a: Any, b: Any) -> Any:
-    """``a if a < b else b``: b where either is NaN."""
+    """``a if a < b else b``; so b if either is NaN."""
     return _function(lambda builder, _, x, y: builder.select(builder.fcmp_ordered("<", x, y), x, y), a, b)
 
 
 @intrinsic
 def maximum(typing_context: Any, a: Any, b: Any) -> Any:
-    """``a if a > b else b``: b where either is NaN."""
+    """``a if a > b else b``; so b if either is NaN."""
     return _function(lambda builder, _, x, y: builder.select(builder.fcmp_ordered(">", x, y), x, y), a, b)
 
 
@@ -313,7 +311,7 @@ def ceil(typing_context: Any, a: Any) -> Any:
 
 @intrinsic
 def select(typing_context: Any, mask: Any, a: Any, b: Any) -> Any:
-    """``a`` where ``mask``, else ``b``; one of the two may be a number."""
+    """``a`` where ``mask`` is True, else ``b``; one of the two may be a number."""
     vector = common_vector((a, b))
     if vector is None or mask != MASK:
         return None
@@ -327,7 +325,7 @@ def select(typing_context: Any, mask: Any, a: Any, b: Any) -> Any:
 
 @intrinsic
 def mask_bits(typing_context: Any, mask: Any) -> Any:
-    """The mask as an integer: lane k is bit k."""
+    """The mask as an integer with lane k in bit k."""
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         return builder.zext(builder.bitcast(args[0], ir.IntType(LANES)), ir.IntType(64))
@@ -337,7 +335,7 @@ def mask_bits(typing_context: Any, mask: Any) -> Any:
 
 @intrinsic
 def mask_from_bits(typing_context: Any, bits: Any) -> Any:
-    """The mask of 16 lanes whose lane k is bit k of an integer."""
+    """The mask whose lane k is bit k of an integer."""
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         wide_bits = context.cast(builder, args[0], sig.args[0], types.uint64)
@@ -348,7 +346,7 @@ def mask_from_bits(typing_context: Any, bits: Any) -> Any:
 
 @intrinsic
 def lanes_with_bit(typing_context: Any, masks: Any, index: Any, bit: Any) -> Any:
-    """A word whose bit k says whether ``masks.flat[index + k] & bit``, for 64 numbers of a uint16 array."""
+    """A 64-bit word whose bit k is 1 if ``masks.flat[index + k] & bit`` is not 0; ``masks`` is a uint16 array."""
     lanes = 64
     kind = ir.VectorType(ir.IntType(16), lanes)
 
@@ -366,7 +364,7 @@ def lanes_with_bit(typing_context: Any, masks: Any, index: Any, bit: Any) -> Any
 
 @intrinsic
 def lowest_bit(typing_context: Any, bits: Any) -> Any:
-    """The place of the lowest set bit of an integer that is not zero."""
+    """The number of the lowest set bit of an integer, which must not be 0."""
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         wide_bits = context.cast(builder, args[0], sig.args[0], types.uint64)
@@ -384,18 +382,18 @@ def _polynomial(builder: Any, vector: Vector, x: Any, coefficients: Sequence[flo
 
 
 MANTISSA_BITS = 23
-# 2^f on [-1/2, 1/2]: relative least-squares fit at 200 Chebyshev nodes, exact at 0, error 1.0e-7.
+# 2^f on [-1/2, 1/2]: least-squares fit of the relative error at 200 Chebyshev nodes; exact at 0, error 1.0e-7.
 _EXP2 = (1.0, 0.69314688444, 0.24022237957, 0.05550893024, 0.00967169832, 0.00132186722)
-# log2(m) = 2 / ln 2 artanh(s), s = (m - 1) / (m + 1), as a series in s^2; for m in [sqrt(1/2), sqrt(2)] error 2e-8
+# log2(m) = 2 / ln 2 artanh(s), s = (m - 1) / (m + 1), as a series in s^2; error 2e-8 for m in [sqrt(1/2), sqrt(2)].
 _LOG2_SERIES = tuple(2.0 / math.log(2.0) / (2 * k + 1) for k in range(5))
 _BITS_OF_ROOT_HALF = 0x3F3504F3
 
 
 @intrinsic
 def exp2(typing_context: Any, a: Any) -> Any:
-    """``2^a`` within 2.5e-7 for -126 <= a < 127.5; beyond, any value.
+    """``2^a`` with an error of at most 2.5e-7 for -126 <= a < 127.5; undefined elsewhere.
 
-    2^a = 2^n 2^f: adding 1.5 * 2^23 leaves the nearest integer n in the low bits of the mantissa.
+    2^a = 2^n 2^f. Adding 1.5 * 2^23 to a leaves the nearest integer n in the low bits of the mantissa.
     """
 
     def emit(builder: Any, vector: Vector, x: Any) -> Any:
@@ -411,10 +409,10 @@ def exp2(typing_context: Any, a: Any) -> Any:
 
 @intrinsic
 def log2(typing_context: Any, a: Any) -> Any:
-    """``log2(a)`` of positive, normal numbers, within 2e-7 of the larger of it and 1; any value elsewhere."""
+    """``log2(a)`` of positive normal numbers, with an error of at most 2e-7 max(1, |log2(a)|); undefined elsewhere."""
 
     def emit(builder: Any, vector: Vector, x: Any) -> Any:
-        # The bits above those of sqrt(1/2), shifted down, are the exponent n of x = 2^n m.
+        # x = 2^n m with m from sqrt(1/2) to sqrt(2): n is the difference of the bits and those of sqrt(1/2), shifted.
         bits = builder.bitcast(x, vector.bits_ir)
         exponent = builder.ashr(builder.sub(bits, vector.bits(_BITS_OF_ROOT_HALF)), vector.bits(MANTISSA_BITS))
         mantissa = builder.bitcast(builder.sub(bits, builder.shl(exponent, vector.bits(MANTISSA_BITS))), vector.ir)
@@ -425,16 +423,16 @@ def log2(typing_context: Any, a: Any) -> Any:
     return _function(emit, a)
 
 
-# Lane of ``lane_sums`` that holds the sum of its k-th argument: the bits of k reversed.
+# The lane of ``lane_sums`` with the sum of its k-th argument: the four bits of k, reversed.
 SUM_LANES = tuple(int(f"{k:04b}"[::-1], 2) for k in range(LANES))
 
 
 @intrinsic
 def lane_sums(typing_context: Any, vectors: Any) -> Any:
-    """Sum the 16 lanes of each of up to 16 vectors; the k-th sum stands in lane ``SUM_LANES[k]``, the rest is 0.
+    """Sum the 16 lanes of each of up to 16 vectors; the k-th sum is in lane ``SUM_LANES[k]``, other lanes are 0.
 
-    A tree of shuffles and additions: each level joins two vectors into one, so that the sums of eleven vectors cost
-    about as much as three single sums.
+    It is a tree of shuffles and additions in which each level merges pairs of vectors. So the sums of eleven vectors
+    take about as long as three single sums.
     """
     if not (isinstance(vectors, types.UniTuple) and vectors.dtype is VECTOR):
         return None
@@ -445,7 +443,7 @@ def lane_sums(typing_context: Any, vectors: Any) -> Any:
         while half:
             if len(level) % 2:
                 level.append(VECTOR.constant(0.0))
-            # Of each group of 2 * half lanes the first half comes from a, the second from b.
+            # In each group of 2 * half lanes, the first half is from a, the second from b.
             low = [lane // (2 * half) * 2 * half + lane % half + lane // half % 2 * LANES for lane in range(LANES)]
             first, second = lane_indices(low), lane_indices([lane + half for lane in low])
             level = [

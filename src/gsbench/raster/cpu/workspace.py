@@ -1,4 +1,4 @@
-"""Memory that is used again: fresh arrays of this size cost more in page faults than the kernels that fill them."""
+"""Pools of memory. Page faults of newly allocated arrays would take longer than the kernels that fill the arrays."""
 
 import threading
 import weakref
@@ -13,7 +13,7 @@ from numpy.typing import DTypeLike, NDArray
 from torch import Tensor
 
 CACHE_LINE = 64  # bytes
-HEADROOM = 1.25  # of a request, so that a scene that grows does not allocate at every step
+HEADROOM = 1.25  # times the requested size, so that a growing scene does not allocate at every step
 
 
 def aligned_bytes(size: int) -> NDArray[np.uint8]:
@@ -24,16 +24,17 @@ def aligned_bytes(size: int) -> NDArray[np.uint8]:
 
 
 class Arena:
-    """Named scratch arrays that only grow. ``take`` gives a view; its content is what the last user left."""
+    """Named scratch arrays that only grow. ``take`` returns a view with the contents of its previous use."""
 
     def __init__(self) -> None:
         self._blocks: dict[str, NDArray[np.uint8]] = {}
 
     def take(self, name: str, shape: tuple[int, ...], dtype: DTypeLike, zero: bool = False) -> NDArray[Any]:
-        """An array of ``shape``; ``zero`` clears it whenever it had to be allocated anew."""
+        """Return an array of ``shape``. With ``zero`` it is cleared when newly allocated, and only then."""
         size = prod(shape) * np.dtype(dtype).itemsize
         block = self._blocks.get(name)
         if block is None or block.size < size:
+            # Free the old block first, so that both never exist at once.
             self._blocks.pop(name, None)
             del block
             block = aligned_bytes(int(size * HEADROOM))
@@ -43,19 +44,19 @@ class Arena:
         return block[:size].view(dtype).reshape(shape)
 
     def drop(self, name: str) -> None:
-        """Forget an array whose content cannot be trusted."""
+        """Discard an array whose contents are not reliable."""
         self._blocks.pop(name, None)
 
 
 class ArenaPool:
-    """Arenas that outlive the graph of a render: an arena comes back when its ``holder`` is collected."""
+    """A pool of arenas. An arena returns to the pool when its ``holder`` is garbage-collected."""
 
     def __init__(self) -> None:
         self._free: list[Arena] = []
 
     def lease(self, holder: object) -> Arena:
         try:
-            arena = self._free.pop()  # atomic
+            arena = self._free.pop()  # atomic, so threads need no lock
         except IndexError:
             arena = Arena()
         weakref.finalize(holder, self._free.append, arena).atexit = False
@@ -63,7 +64,7 @@ class ArenaPool:
 
 
 class TensorPool:
-    """float32 tensors whose memory comes back to the pool when torch has freed the last tensor on it."""
+    """A pool of memory for float32 tensors. Memory returns to it when torch frees the last tensor that uses it."""
 
     def __init__(self) -> None:
         self._free: list[NDArray[np.uint8]] = []
@@ -83,14 +84,16 @@ class TensorPool:
             if fitting:
                 return self._free.pop(min(fitting, key=lambda k: self._free[k].size))
             if self._free:
-                self._free.pop(0)  # the one unused for longest: the pool keeps no more blocks than were ever in use
+                self._free.pop(
+                    0
+                )  # the block unused for longest, so the pool never has more blocks than were in use at once
         return aligned_bytes(int(size * HEADROOM))
 
 
 class ShardRunner:
-    """Runs the shards of a stage on ``threads`` threads. What a shard computes must not depend on who runs it.
+    """Runs the shards of a stage on ``threads`` threads. The result of a shard must not depend on the thread.
 
-    A single thread gets all of them in one call: to hand a kernel its arguments takes up to 40 microseconds.
+    A single thread runs all shards in one call, because each call of a kernel costs up to 40 microseconds.
     """
 
     def __init__(self, threads: int) -> None:
@@ -98,8 +101,8 @@ class ShardRunner:
         self._executor = ThreadPoolExecutor(threads, thread_name_prefix="gsbench-raster") if threads > 1 else None
 
     def run(self, shards: int, work: Callable[[int, int], None]) -> None:
-        """Call ``work(first, past)`` for ranges of shards until all were run; on an error or an interrupt, wait for
-        what was begun."""
+        """Call ``work(first, past)`` for ranges of shards until all have run. On an error or an interrupt, wait for
+        the calls that have begun."""
         if self._executor is None:
             work(0, shards)
             return
@@ -110,4 +113,4 @@ class ShardRunner:
         finally:
             for future in futures:
                 future.cancel()
-            wait(futures)  # nobody may write to memory that is about to be used again
+            wait(futures)  # no thread may still write to memory that returns to a pool

@@ -1,1 +1,1 @@
-"""The rasterizer for GPUs, in Triton kernels: needs nothing but torch and the Triton that torch brings along."""
+"""``raster=triton``: the rasterizer for GPUs. It needs only torch and the Triton that torch installs."""

@@ -1,8 +1,8 @@
-"""Compositing of blocks, forward and backward, and footprints: a program of one warp a block, four pixels a lane.
+"""Compositing of blocks, forward and backward, and footprints: one program of one warp per block, four pixels per lane.
 
-One warp, since then nothing has to be shared between warps: there is no barrier in the loop over a list, a record is
-read once for all 128 pixels, and gradient sums are made by shuffles. The four pixels of a lane lie in one row, so what
-depends on dy alone is computed once for them, and four chains of fma run side by side.
+With one warp, nothing is shared between warps: the loop over a list has no barrier, a record is read once for all 128
+pixels, and shuffles compute gradient sums. The four pixels of a lane are in one row, so terms that depend only on dy
+are computed once for all four, and four chains of fma run in parallel.
 """
 
 from __future__ import annotations
@@ -42,16 +42,18 @@ from gsbench.raster.triton.layout import (
 
 ALPHA_MAX = tl.constexpr(CONSTANTS.alpha_max)
 TRANSMITTANCE_MIN = tl.constexpr(CONSTANTS.transmittance_min)
-UNROLL = tl.constexpr(4)  # entries between two looks at whether all pixels have stopped
-UNROLL_BACK = tl.constexpr(2)  # entries of one round of the backward pass
+UNROLL = tl.constexpr(4)  # entries between two checks whether all pixels have stopped
+UNROLL_BACK = tl.constexpr(2)  # entries per iteration of the backward pass's loop
 TO_PRECISION = tl.constexpr(2 * math.log(2.0))  # -curve to entry of the inverse covariance, up to sign
-COVERED, VALUES, DISTANCES = tl.constexpr(0), tl.constexpr(1), tl.constexpr(2)  # of a footprint's row
+COVERED, VALUES, DISTANCES = tl.constexpr(0), tl.constexpr(1), tl.constexpr(2)  # entries of a footprint's row
 
 
 @triton.jit
 def block_pixels(block, blocks_x, width, height):
-    """The pixels of a block: a mask of those in the image, their numbers in it (both [STEPS, LANES]), and the column of
-    each lane's first and the row of all (both [LANES], px).
+    """The pixels of a block.
+
+    Returns a mask of the pixels in the image and their numbers in it, both [STEPS, LANES]; then for each lane the
+    column of its first pixel and the row of all four, both [LANES] px.
     """
     lane, step = tl.arange(0, LANES), tl.arange(0, STEPS)
     x = block % blocks_x * BLOCK_WIDTH + lane % LANE_COLUMNS
@@ -63,9 +65,9 @@ def block_pixels(block, blocks_x, width, height):
 
 @triton.jit
 def block_places():
-    """The places of a block's pixels in its memory, [STEPS, LANES]: those of a lane side by side.
+    """The places of a block's pixels in memory, [STEPS, LANES]; those of a lane are adjacent.
 
-    Triton then lays out all [STEPS, LANES] so that sums over steps stay within a lane.
+    With this order Triton chooses a layout of [STEPS, LANES] in which sums over steps stay within a lane.
     """
     return tl.arange(0, STEPS)[:, None] + tl.arange(0, LANES)[None, :] * STEPS
 
@@ -88,9 +90,9 @@ def load_record(records, entry):
 
 @triton.jit
 def log2_alpha(record, x, y):
-    """log2(alpha) [STEPS, LANES] before it is clamped, t [STEPS, LANES] and dy [LANES], at ``block_pixels``' x and y.
+    """log2(alpha) before the clamp and t, both [STEPS, LANES], and dy [LANES], at x and y of ``block_pixels``.
 
-    Every rounding is spelled out: the forward and the backward kernel have to agree on each pixel that is skipped.
+    Each fma is explicit, so that the forward and the backward kernel round alike and skip the same pixels.
     """
     mean_x, mean_y, shear, curve_t, curve_y, log2_opacity, _, _, _ = record
     dy = y - mean_y
@@ -120,23 +122,30 @@ def composite(
     slots,
     last_slots,
 ):
-    """Blend the block that ``order`` [blocks] has at the place of this program.
+    """Blend the block ``order[program]``.
 
-    In: ``starts`` [blocks + 1], ``entries`` [pairs] the Gaussians of the lists, ``records`` [N + 1, 16] with one that
-    cannot be seen at ``closing``. Out: ``image`` [H, W, 3], ``alpha`` [H, W]; for the backward pass, by block, lane and
-    step, the final ``transmittance`` and ``last``, past the last entry that was looked at before the pixel stopped;
-    ``past`` [blocks], their maximum; ``last_slots`` [blocks], the entry before it in ``slots`` [pairs], -1 for none;
-    the ``borders`` that were crossed.
+    In:
+
+    - ``order`` [blocks], ``starts`` [blocks + 1], ``entries`` [pairs] and ``slots`` [pairs], the lists;
+    - ``records`` [N + 1, 16], with an invisible one at ``closing``.
+
+    Out:
+
+    - ``image`` [H, W, 3], ``alpha`` [H, W];
+    - ``transmittance``, final, and ``last``, past the last entry that was read before the pixel stopped; both by block,
+      lane and step;
+    - ``past`` [blocks], the maximum of ``last``; ``last_slots`` [blocks], the slot of the entry before it, -1 if none;
+    - ``borders`` that compositing crossed.
     """
     block = tl.load(order + tl.program_id(0)).to(tl.int32)
     inside, pixel, x, y = block_pixels(block, blocks_x, width, height)
     begin, end = tl.load(starts + block), tl.load(starts + block + 1)
-    # A pixel that has stopped, or lies outside, has its transmittance with a minus sign: it stays as it is.
+    # The transmittance of a pixel that has stopped or is outside the image has a minus sign: it does not change again.
     light = tl.where(inside, 1.0, -1.0)
     red, green, blue = tl.zeros_like(light), tl.zeros_like(light), tl.zeros_like(light)
     seen = tl.where(inside, begin, 0)
 
-    # Records are loaded one entry ahead, entries two; past the end of the list stands what cannot be seen.
+    # Records are loaded one entry ahead, entries two ahead; behind the end of the list, the invisible record is used.
     ahead = load_record(records, tl.load(entries + begin, mask=begin < end, other=closing))
     entry = tl.load(entries + begin + 1, mask=begin + 1 < end, other=closing)
     alive = True
@@ -167,13 +176,14 @@ def composite(
         if (position < end) & alive:
             place = first_border + crossed * BORDER
             tl.store(place + TRANSMITTANCE, tl.abs(light))
-            tl.store(place + BEHIND_RED, red)  # for now, what the segment before it has
+            tl.store(place + BEHIND_RED, red)  # for now, the light of the segment before the border
             tl.store(place + BEHIND_GREEN, green)
             tl.store(place + BEHIND_BLUE, blue)
             red, green, blue = tl.zeros_like(light), tl.zeros_like(light), tl.zeros_like(light)
             crossed += 1
 
-    # Colours are those of the last segment. Sums from there on are what lies behind each border; none is a difference.
+    # Now the colours are those of the last segment. Adding segment by segment, back to front, gives the light behind
+    # each border without a subtraction.
     tl.debug_barrier()
     for k in range(0, crossed):
         place = first_border + (crossed - 1 - k) * BORDER
@@ -198,9 +208,9 @@ def composite(
 
 @triton.jit
 def _fold(a, b, lane, BIT: tl.constexpr):
-    """Sums over lanes that differ in ``BIT``: of ``a`` in the lanes without it, of ``b`` in those with it; all [LANES].
+    """Sums over pairs of lanes that differ in ``BIT``: of ``a`` in the lanes without it, of ``b`` in those with it.
 
-    Two sums for one exchange between lanes, where sums of one and the other would take two.
+    All are [LANES]. One exchange between lanes gives both sums, where two separate sums would take two.
     """
     low = (lane & BIT) == 0
     return tl.where(low, a, b) + tl.gather(tl.where(low, b, a), lane ^ BIT, 0)
@@ -208,13 +218,13 @@ def _fold(a, b, lane, BIT: tl.constexpr):
 
 @triton.jit
 def _sum_over(a, lane, BIT: tl.constexpr):
-    """Sums over lanes that differ in ``BIT``."""
+    """Sums over pairs of lanes that differ in ``BIT``."""
     return a + tl.gather(a, lane ^ BIT, 0)
 
 
 @triton.jit
 def _number_of_sum(lane, ABSOLUTE: tl.constexpr):
-    """Which sum ``_sums_over_lanes`` leaves in each lane, and which lanes are to store theirs."""
+    """The number of the sum that ``_sums_over_lanes`` leaves in each lane, and a mask of the lanes that store it."""
     four, three, two, one = (lane >> 4) & 1, (lane >> 3) & 1, (lane >> 2) & 1, (lane >> 1) & 1
     if ABSOLUTE:
         further = tl.where(three == 1, 10, 8 + four)
@@ -227,7 +237,7 @@ def _number_of_sum(lane, ABSOLUTE: tl.constexpr):
 
 @triton.jit
 def _sums_over_lanes(sums, lane, ABSOLUTE: tl.constexpr):
-    """The sums over all lanes of the nine (or eleven) ``sums``, each in the lanes that ``_number_of_sum`` says."""
+    """The sums over all lanes of the nine (or eleven) ``sums``; ``_number_of_sum`` says which lane has which."""
     first = _fold(_fold(sums[0], sums[1], lane, 16), _fold(sums[2], sums[3], lane, 16), lane, 8)
     second = _fold(_fold(sums[4], sums[5], lane, 16), _fold(sums[6], sums[7], lane, 16), lane, 8)
     if ABSOLUTE:
@@ -242,23 +252,24 @@ def _lane_sums(h, weight, t, dy, g, record, ABSOLUTE: tl.constexpr):
     """The nine (or eleven) gradient sums over the pixels of each lane, [LANES], in the order of a row."""
     ht = h * t
     sum_h, sum_ht = tl.sum(h, 0), tl.sum(ht, 0)
-    sum_hy = sum_h * dy  # within a lane dy is the same for all pixels
+    sum_hy = sum_h * dy  # all pixels of a lane have the same dy
     moments = (sum_h, sum_ht, sum_hy, tl.sum(ht * t, 0), sum_ht * dy, sum_hy * dy)
     colors = (tl.sum(weight * g[0], 0), tl.sum(weight * g[1], 0), tl.sum(weight * g[2], 0))
     if ABSOLUTE:
         # d power / d mean_y = shear a t + e dy, with a and e from the curves: curve = -log2(e)/2 a
         slope = tl.fma(record[2] * record[3], ht, record[4] * (h * dy[None, :]))
         return moments + colors + (tl.sum(tl.abs(ht), 0), tl.sum(tl.abs(slope), 0) * TO_PRECISION)
-    else:  # Triton compiles what follows a return, too
+    else:  # needed: Triton also compiles the code behind a return
         return moments + colors
 
 
 @triton.jit
 def _segment(order, starts, blocks, inner):
-    """The block and the first entry of the segment that this program has; perhaps one that is not there.
+    """The block and the first entry of this program's segment, which may not exist.
 
-    The ``inner`` first programs have those behind the border of their number p, which only the list can have that holds
-    the entry before (p + 1) * SEGMENT; then follow the first segments of the blocks in ``order``.
+    Program p of the first ``inner`` has the segment behind border p. Only the list with the entry before (p + 1) *
+    SEGMENT can have this border; bisection finds it. The other programs have the first segments of the blocks in
+    ``order``.
     """
     program = tl.program_id(0)
     if program >= inner:
@@ -300,12 +311,13 @@ def composite_backward(
     HAS_ALPHA: tl.constexpr,
     ABSOLUTE: tl.constexpr,
 ):
-    """Write the gradient sums of one segment's pairs to their rows of ``rows_out`` [pairs, 16], back to front.
+    """Write the gradient sums of the pairs of one segment to their rows in ``rows_out`` [pairs, 16], back to front.
 
-    Behind a Gaussian lies light S = sum of later (c . g) alpha T plus what the background gets; the loss changes with
-    its alpha by T (c . g) - S / (1 - alpha). Going back to front S grows from the background's part and what lies
-    behind the segment, so that nothing cancels. ``slots`` [pairs] has the row of each entry. Rows of entries that no
-    pixel came to stay as they are. ``g_alpha`` is read if ``HAS_ALPHA``.
+    c is the colour of a Gaussian, g the gradient of the pixel, T the transmittance before the Gaussian, and S the sum
+    of (c . g) alpha T over the later Gaussians and the background. The derivative of the loss by alpha is T (c . g) - S
+    / (1 - alpha). Back to front, S is a sum that starts with the background and the light behind the segment, so
+    nothing cancels. ``slots`` [pairs] has the row of each entry. Rows of entries that compositing did not reach are not
+    written. ``g_alpha`` is read only if ``HAS_ALPHA``.
     """
     block, begin = _segment(order, starts, blocks, inner)
     end = tl.load(past + block)
@@ -350,7 +362,7 @@ def composite_backward(
             raw = tl.where((power >= LOG2_ALPHA_MIN) & (position < seen), tl.exp2(power), 0.0)
             opacity = tl.minimum(raw, ALPHA_MAX)
             root = tl.rsqrt(1.0 - opacity)
-            inverse = root * root  # cheaper than a division
+            inverse = root * root  # 1 / (1 - alpha), cheaper than a division
             shine = tl.fma(g[0], record[6], tl.fma(g[1], record[7], g[2] * record[8]))
             h = raw * inverse * tl.fma(light, shine, -behind)
             light *= inverse
@@ -379,13 +391,16 @@ def cover(
     rows_out,
     HAS_VALUES: tl.constexpr,
 ):
-    """Write to the rows of ``rows_out`` [pairs, 16] of one block, for its entries up to ``past`` [blocks]: how many
-    pixels each Gaussian was blended into, and the sums over them of ``values`` [H, W], read if ``HAS_VALUES``, and of
-    the distances to its mean, px."""
+    """Write the footprints of one block, for its entries up to ``past`` [blocks], to their rows in ``rows_out``
+    [pairs, 16].
+
+    A footprint is the number of pixels that the Gaussian was blended into, and the sums over them of ``values`` [H, W],
+    read only if ``HAS_VALUES``, and of the distances to its mean, px.
+    """
     block = tl.program_id(0)
     inside, pixel, x, y = block_pixels(block, blocks_x, width, height)
     seen = tl.load(last + block * BLOCK_PIXELS + block_places())
-    asked = tl.load(values + pixel, mask=inside & HAS_VALUES, other=0.0)
+    given = tl.load(values + pixel, mask=inside & HAS_VALUES, other=0.0)
     columns = x[None, :] + (tl.arange(0, STEPS) * LANE_COLUMNS).to(tl.float32)[:, None]
     for position in range(tl.load(starts + block), tl.load(past + block)):
         record = load_record(records, tl.load(entries + position))
@@ -395,7 +410,7 @@ def cover(
         distance = tl.sqrt(tl.fma(dx, dx, (dy * dy)[None, :]))
         row = rows_out + tl.load(slots + position) * ROW
         tl.store(row + COVERED, tl.sum(tl.sum(tl.where(blended, 1.0, 0.0), 0), 0))
-        tl.store(row + VALUES, tl.sum(tl.sum(tl.where(blended, asked, 0.0), 0), 0))
+        tl.store(row + VALUES, tl.sum(tl.sum(tl.where(blended, given, 0.0), 0), 0))
         tl.store(row + DISTANCES, tl.sum(tl.sum(tl.where(blended, distance, 0.0), 0), 0))
 
 

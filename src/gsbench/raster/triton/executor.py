@@ -1,4 +1,4 @@
-"""The Triton rasterizer: its stages in order, forward and backward, and the footprint."""
+"""The Triton rasterizer: the stages of the forward and the backward pass, and the footprint."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torch import Tensor
 from gsbench.gaussians.model import Gaussians
 from gsbench.raster.base import CONSTANTS, Footprint, view_depths
 from gsbench.raster.executors import load_driver
-from gsbench.raster.staged import Gradients, Lifetime, Request, StagedRasterizer
+from gsbench.raster.staged import Gradients, Lifetime, RenderRequest, StagedRasterizer
 from gsbench.raster.triton.composite import composite, composite_backward, cover, sum_cover
 from gsbench.raster.triton.launch import Workspace, WorkspacePool, launch, launch_grid
 from gsbench.raster.triton.layout import (
@@ -21,10 +21,10 @@ from gsbench.raster.triton.layout import (
     ROW,
     TILE,
     Grid,
-    View,
+    TritonCamera,
     count_borders,
+    make_camera,
     make_grid,
-    make_view,
 )
 from gsbench.raster.triton.lists import Lists, Projected, Units, find_all_units, make_lists
 from gsbench.raster.triton.projection import backproject, project, sum_units
@@ -32,26 +32,26 @@ from gsbench.scene.camera import Camera
 
 
 @dataclass
-class Frame:
+class TritonFrame:
     """Results of the forward pass for the backward pass; the memory belongs to a workspace."""
 
     grid: Grid
-    view: View
+    view: TritonCamera
     projected: Projected
     units: Units
     lists: Lists
     transmittance: Tensor  # [blocks * BLOCK_PIXELS]
     last: Tensor  # [blocks * BLOCK_PIXELS] int32
-    past: Tensor  # [blocks] int32
+    past: Tensor  # [blocks] int32; see `composite` for these five
     borders: Tensor  # [count_borders(pairs) * BORDER]
     last_slots: Tensor  # [blocks] int64
 
 
-class TritonRasterizer(StagedRasterizer[Frame]):
-    """float32 on a GPU, compiled by Triton at first use; the same bits on every run of one GPU.
+class TritonRasterizer(StagedRasterizer[TritonFrame]):
+    """float32 on a GPU, compiled by Triton at first use. Same bits on every run on one GPU.
 
-    Each render keeps its intermediate results until its graph is freed; memory is kept and used again. A render makes
-    the host wait for the device once, to learn how much there is to composite.
+    Each render keeps its intermediate results until its graph is freed; then their memory is reused. A render waits for
+    the device once, for the sizes of the lists.
     """
 
     name = "triton"
@@ -63,32 +63,32 @@ class TritonRasterizer(StagedRasterizer[Frame]):
         self._scratch = WorkspacePool()
 
     def check(self, gaussians: Gaussians) -> None:
-        """Raise ValueError where tensors are not float32, or the device's driver cannot be loaded."""
+        """Raise ValueError if tensors are not float32, and InputError if Triton cannot use the GPU."""
         if gaussians.means.dtype != torch.float32:
             raise ValueError(f"means: raster=triton needs float32, got {gaussians.means.dtype}")
         if gaussians.means.device.type == "cuda":
             load_driver()
 
     def forward(
-        self, lifetime: Lifetime, gaussians: Gaussians, request: Request
-    ) -> tuple[Tensor, Tensor, Tensor, Frame]:
+        self, lifetime: Lifetime, gaussians: Gaussians, request: RenderRequest
+    ) -> tuple[Tensor, Tensor, Tensor, TritonFrame]:
         """Project, sort, bin, composite; see `StagedRasterizer`. Raises ValueError for bad values."""
         camera, device = request.camera, gaussians.means.device
         image = torch.empty(camera.height, camera.width, 3, dtype=torch.float32, device=device)
         alpha = torch.empty(camera.height, camera.width, dtype=torch.float32, device=device)
         radii = torch.empty(len(gaussians), dtype=torch.int32, device=device)
-        while_drawn = Lifetime()
+        call_lifetime = Lifetime()  # freed when this call returns
         with torch.cuda.device_of(image):
             memory = self._frames.lease(lifetime, device)
-            scratch = self._scratch.lease(while_drawn, device)
-            grid, view = make_grid(request.camera), make_view(request.camera)
+            scratch = self._scratch.lease(call_lifetime, device)
+            grid, view = make_grid(request.camera), make_camera(request.camera)
             count, blocks, background = len(gaussians), grid.blocks, request.background
             flags = scratch.take("flags", 1, torch.int32).zero_()
             keys = scratch.take("depth_keys", count, torch.int32)
             projected = _project(memory, gaussians, view, request.degree, keys, radii, flags)
             units, owners = find_all_units(memory, scratch, gaussians, projected, grid, keys, flags, background)
             lists = make_lists(memory, scratch, units, owners, blocks)
-            frame = Frame(
+            frame = TritonFrame(
                 grid,
                 view,
                 projected,
@@ -124,9 +124,9 @@ class TritonRasterizer(StagedRasterizer[Frame]):
 
     def backward(
         self,
-        frame: Frame,
+        frame: TritonFrame,
         gaussians: Gaussians,
-        request: Request,
+        request: RenderRequest,
         g_image: Tensor,
         g_alpha: Tensor | None,
         want_splitting: bool,
@@ -192,7 +192,9 @@ class TritonRasterizer(StagedRasterizer[Frame]):
             )
             return Gradients(gradients, g_screen, g_splitting)
 
-    def footprint(self, frame: Frame, gaussians: Gaussians, camera: Camera, values: Tensor | None = None) -> Footprint:
+    def footprint(
+        self, frame: TritonFrame, gaussians: Gaussians, camera: Camera, values: Tensor | None = None
+    ) -> Footprint:
         """See ``raster.base.RenderOutput``."""
         lifetime = Lifetime()
         with torch.cuda.device_of(gaussians.means):
@@ -200,8 +202,8 @@ class TritonRasterizer(StagedRasterizer[Frame]):
             units, lists, count, device = frame.units, frame.lists, len(gaussians), gaussians.means.device
             covered = torch.zeros(count, dtype=torch.int32, device=device)
             sums, distances = torch.zeros(2, count, device=device)
-            asked = sums if values is None else values.detach().float().contiguous()
-            rows = scratch.take("rows", units.pairs * ROW.value, torch.float32)  # ``cover`` fills three of 16
+            given = sums if values is None else values.detach().float().contiguous()
+            rows = scratch.take("rows", units.pairs * ROW.value, torch.float32)  # ``cover`` fills 3 of 16 columns
             launch_grid(cover, frame.grid.blocks)(
                 lists.starts,
                 lists.entries,
@@ -212,7 +214,7 @@ class TritonRasterizer(StagedRasterizer[Frame]):
                 frame.grid.blocks_x,
                 frame.last,
                 frame.past,
-                asked,
+                given,
                 rows,
                 HAS_VALUES=values is not None,
                 num_warps=1,
@@ -235,13 +237,13 @@ class TritonRasterizer(StagedRasterizer[Frame]):
 def _project(
     memory: Workspace,
     gaussians: Gaussians,
-    view: View,
+    view: TritonCamera,
     degree: int,
     keys: Tensor,
     radii: Tensor,
     flags: Tensor,
 ) -> Projected:
-    """Project all Gaussians; ``keys`` sort by depth, ``flags`` tell of values that cannot be used."""
+    """Project all Gaussians; fill ``keys``, by which depth is sorted, ``radii`` and ``flags``, 1 for bad values."""
     count = len(gaussians)
     projected = Projected(
         memory.take("records", (count + 1) * RECORD.value, torch.float32),
@@ -265,8 +267,8 @@ def _project(
     return projected
 
 
-def _sum_units(frame: Frame, rows: Tensor) -> None:
-    """Add up the ``rows`` of each unit's pairs, in place."""
+def _sum_units(frame: TritonFrame, rows: Tensor) -> None:
+    """Sum the ``rows`` of the pairs of each unit, in place."""
     units = frame.units
     launch(sum_units, units.number, 32)(
         units.pair_ends, units.widths, units.blocks, frame.last_slots, units.number, rows

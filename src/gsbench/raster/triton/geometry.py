@@ -1,6 +1,6 @@
-"""The geometry of projection and spherical harmonics, for both passes; float32, a lane a Gaussian.
+"""Projection geometry and spherical harmonics for both passes, float32, one lane per Gaussian.
 
-Matrices are tuples of rows, vectors tuples. Nothing here subtracts large numbers: see ``spread``.
+Matrices are tuples of rows, and vectors are tuples. No formula subtracts large numbers (see ``spread``).
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ BLUR = tl.constexpr(CONSTANTS.blur)
 F0, F1 = tl.constexpr(C0), tl.constexpr(C1)
 D0, D1, D2, D3, D4 = (tl.constexpr(value) for value in C2)
 T0, T1, T2, T3, T4, T5, T6 = (tl.constexpr(value) for value in C3)
-REST = tl.constexpr(3 * NUM_SH_REST)  # numbers of a Gaussian
+REST = tl.constexpr(3 * NUM_SH_REST)  # numbers of one Gaussian in ``sh_rest``
 
 
 @triton.jit
 def load_vector(array, index, mask):
-    """Three numbers of each row ``index`` of an array [N, 3]; 0 outside ``mask``."""
+    """Load the rows ``index`` of an array [N, 3]; 0 outside ``mask``."""
     place = array + 3 * index
     return (
         tl.load(place, mask=mask, other=0.0),
@@ -31,7 +31,7 @@ def load_vector(array, index, mask):
 
 @triton.jit
 def load_quaternion(quaternions, index, mask):
-    """The unit quaternions (w, x, y, z), and the inverse norm and squared norm of what is stored."""
+    """The unit quaternions (w, x, y, z), and the inverse norm and the squared norm of the stored ones."""
     place = quaternions + 4 * index
     w = tl.load(place, mask=mask, other=1.0)
     x = tl.load(place + 1, mask=mask, other=0.0)
@@ -77,7 +77,7 @@ def scaled(row, scales):
 def from_camera(mean, v):
     """The vector from the camera centre to the mean, in world axes.
 
-    Everything goes through this difference: rotating it loses no digits however far the scene is from its origin.
+    It is computed first: rotating the difference loses no digits, even if the scene is far from the origin.
     """
     return mean[0] - v.center_x, mean[1] - v.center_y, mean[2] - v.center_z
 
@@ -92,7 +92,7 @@ def to_view(offset, v):
 
 @triton.jit
 def image_axes(slope_x, slope_y, inverse_z, v):
-    """A = J W, the derivative of the pixel with respect to the world position, as two rows; the clamped slopes."""
+    """A = J W, the derivative of the pixel by the world position, as two rows; and the clamped slopes."""
     slope_x = tl.minimum(tl.maximum(slope_x, v.slope_x_min), v.slope_x_max)
     slope_y = tl.minimum(tl.maximum(slope_y, v.slope_y_min), v.slope_y_max)
     first, second = image_rows(slope_x, slope_y, inverse_z, v)
@@ -101,7 +101,7 @@ def image_axes(slope_x, slope_y, inverse_z, v):
 
 @triton.jit
 def image_rows(slope_x, slope_y, inverse_z, v):
-    """The derivative of the pixel with respect to the world position at x/z, y/z = the slopes, as two rows."""
+    """The derivative of the pixel by the world position at given slopes x/z, y/z, as two rows."""
     jx, jy = inverse_z * v.fx, inverse_z * v.fy
     first = (jx * (v.r00 - slope_x * v.r20), jx * (v.r01 - slope_x * v.r21), jx * (v.r02 - slope_x * v.r22))
     second = (jy * (v.r10 - slope_y * v.r20), jy * (v.r11 - slope_y * v.r21), jy * (v.r12 - slope_y * v.r22))
@@ -110,10 +110,10 @@ def image_rows(slope_x, slope_y, inverse_z, v):
 
 @triton.jit
 def spread(m0, m1):
-    """The covariance C = M M^T + blur I of the rows of M, as xx, xy, yy, and a = yy / det C.
+    """xx, xy, yy of the covariance C = M M^T + BLUR I, for the rows of M; and a = yy / det C.
 
-    1/a is the variance of x given y. det(M M^T) is the squared cross product of the rows; dividing a row by the square
-    root of yy first gives 1/a without cancellation and without overflow.
+    1/a is the variance of x given y. det(M M^T) is the squared cross product of the rows. Dividing one row by sqrt(yy)
+    first gives 1/a without cancellation and overflow.
     """
     xx, xy, yy = dot(m0, m0), dot(m0, m1), dot(m1, m1) + BLUR
     inverse = 1.0 / tl.sqrt(yy)
@@ -125,7 +125,7 @@ def spread(m0, m1):
 
 @triton.jit
 def basis(direction, DEGREE: tl.constexpr):
-    """The basis functions of degrees 1 to ``DEGREE``, at least 1, at unit directions."""
+    """The basis functions of degrees 1 to ``DEGREE`` at unit directions; ``DEGREE`` is at least 1."""
     x, y, z = direction
     values = (y * -F1, z * F1, x * -F1)
     if DEGREE >= 2:
@@ -148,7 +148,7 @@ def basis(direction, DEGREE: tl.constexpr):
 
 @triton.jit
 def _coefficients(sh_rest, index, k: tl.constexpr, mask):
-    """The k-th coefficients of degree 1 and up, in red, green and blue."""
+    """The k-th coefficients of red, green and blue, counted from degree 1."""
     place = index * REST + 3 * k
     red = tl.load(sh_rest + place, mask=mask, other=0.0)
     green = tl.load(sh_rest + place + 1, mask=mask, other=0.0)
@@ -174,8 +174,10 @@ def colors(
     mask,
     DEGREE: tl.constexpr,
 ):
-    """SH + 0.5 (not clamped) at the unit ``direction`` of each Gaussian ``index``, whose constant terms are ``dc``, and
-    its derivatives by x, y and z of the direction (not yet tangential), each for red, green and blue.
+    """The colours SH + 0.5, not clamped, of the Gaussians ``index`` at unit directions, and their derivatives by x, y
+    and z of the direction, not yet projected to the tangent of the unit sphere; each for red, green and blue.
+
+    ``dc`` are the coefficients of degree 0.
     """
     x, y, z = direction
     rgb = (dc[0] * F0 + 0.5, dc[1] * F0 + 0.5, dc[2] * F0 + 0.5)
@@ -228,7 +230,7 @@ def colors(
 
 @triton.jit
 def store_gradients(direction, g_rgb, g_sh_rest, index, mask, DEGREE: tl.constexpr):
-    """Store the gradients of the coefficients of degree 1 and up."""
+    """Store the gradients by the coefficients of degrees 1 to ``DEGREE``."""
     if DEGREE >= 1:
         values = basis(direction, DEGREE)
         for k in tl.static_range(0, (DEGREE + 1) * (DEGREE + 1) - 1):

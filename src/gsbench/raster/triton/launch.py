@@ -1,4 +1,4 @@
-"""Launches of Triton kernels, and the device memory that they use again."""
+"""Launches of Triton kernels, and pools of device memory for them."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-# Products and sums are contracted to fma: Triton's default today, but no longer from 3.10 on.
+# Contract products and sums to fma: the present default of Triton, but not from 3.10 on.
 OPTIONS = {"enable_fp_fusion": True}
 
 
 def launch(kernel: Any, count: int, group: int) -> Callable[..., None]:
-    """``kernel`` for ``count`` items, a lane an item and ``group`` a program; nothing at all for no items."""
+    """Return a launcher of ``kernel`` for ``count`` items, one per lane and ``group`` per program; no launch for 0."""
 
     def run(*arguments: Any, **constants: Any) -> None:
         if count:
@@ -25,7 +25,7 @@ def launch(kernel: Any, count: int, group: int) -> Callable[..., None]:
 
 
 def launch_grid(kernel: Any, *programs: int) -> Callable[..., None]:
-    """``kernel`` for a grid of ``programs``, at least one along each axis; ``num_warps`` is named beside constants."""
+    """Return a launcher of ``kernel`` on a grid of ``programs``, at least 1 on each axis; also takes ``num_warps``."""
 
     def run(*arguments: Any, **constants: Any) -> None:
         kernel[programs](*arguments, **OPTIONS, **constants)
@@ -34,33 +34,33 @@ def launch_grid(kernel: Any, *programs: int) -> Callable[..., None]:
 
 
 class Workspace:
-    """Named one-dimensional tensors that grow by doubling. ``take`` gives a view with what was left there."""
+    """Named 1D tensors that grow by doubling. ``take`` returns a view with the contents of the last use."""
 
     def __init__(self, device: torch.device) -> None:
         self.device = device
         self._buffers: dict[str, Tensor] = {}
 
     def take(self, name: str, count: int, dtype: torch.dtype) -> Tensor:
-        """``count`` numbers of ``dtype``; one name always has one dtype."""
+        """Return ``count`` numbers of ``dtype``. A name must always have the same dtype."""
         if count > self.capacity(name):
             grown = max(count, 2 * self.capacity(name))
-            self._buffers.pop(name, None)  # before the new one is made
-            with torch.inference_mode(False):  # it will be written to in other modes
+            self._buffers.pop(name, None)  # free the old one first, so that both never exist at once
+            with torch.inference_mode(False):  # an inference tensor could not be written to outside that mode
                 self._buffers[name] = torch.empty(grown, dtype=dtype, device=self.device)
         elif name not in self._buffers:
             return torch.empty(0, dtype=dtype, device=self.device)
         return self._buffers[name][:count]
 
     def capacity(self, name: str) -> int:
-        """The number of values that ``take`` gives without growing."""
+        """The number of values that ``take`` returns without growing."""
         buffer = self._buffers.get(name)
         return 0 if buffer is None else len(buffer)
 
 
 class WorkspacePool:
-    """Workspaces that outlive the graph of a render: one comes back when its ``holder`` is freed.
+    """A pool of workspaces. A workspace returns to the pool when its ``holder`` is freed.
 
-    One that comes back is given only to work on the same stream, which waits for what still reads it.
+    It is then leased only for the same stream, because work that still reads it is queued there first.
     """
 
     def __init__(self) -> None:
@@ -70,7 +70,7 @@ class WorkspacePool:
         stream = torch.cuda.current_stream(device).cuda_stream if device.type == "cuda" else 0
         free = self._free[device, stream]
         try:
-            workspace = free.pop()  # atomic
+            workspace = free.pop()  # atomic, so threads need no lock
         except IndexError:
             workspace = Workspace(device)
         weakref.finalize(holder, free.append, workspace).atexit = False

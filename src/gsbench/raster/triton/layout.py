@@ -1,4 +1,4 @@
-"""Layout of what the kernels pass to each other: the camera as numbers, blocks, places in a record and a row."""
+"""Memory layout of the data that kernels exchange: camera, blocks, borders, records, gradient rows."""
 
 from __future__ import annotations
 
@@ -11,28 +11,33 @@ import triton.language as tl
 from gsbench.raster.base import CONSTANTS, projection_numbers
 from gsbench.scene.camera import Camera
 
-# A block is what one program of one warp composites: half a tile of 3DGS, four pixels a lane. Lane l has the row
-# l // LANE_COLUMNS, and of it every LANE_COLUMNS-th pixel from column l % LANE_COLUMNS on.
+# One program of one warp composites one block: half a tile of 3DGS, four pixels per lane. Lane l has row
+# l // LANE_COLUMNS, and in it every LANE_COLUMNS-th pixel from column l % LANE_COLUMNS on.
 TILE = tl.constexpr(16)  # px
 BLOCK_WIDTH = tl.constexpr(16)  # px; as wide as a tile
-BLOCK_HEIGHT = tl.constexpr(8)  # px; BLOCK_ROWS of them in a tile
-BLOCK_ROWS = tl.constexpr(2)
+BLOCK_HEIGHT = tl.constexpr(8)  # px
+BLOCK_ROWS = tl.constexpr(2)  # blocks in a tile
 LANES = tl.constexpr(32)
 LANE_COLUMNS = tl.constexpr(4)
-STEPS = tl.constexpr(4)  # pixels of a lane
+STEPS = tl.constexpr(4)  # pixels per lane
 BLOCK_PIXELS = tl.constexpr(128)
 
-# The backward pass walks a list in segments, a program each. Where one ends and compositing went on is a border, with
-# what a program needs to begin there. The border behind the segment from entry e on has the number e // SEGMENT. Those
-# of a list are SEGMENT entries apart, and the first segment of the next begins behind them: no two have one number.
-SEGMENT = tl.constexpr(256)  # entries; a multiple of those of one round of the kernels
-BORDER = tl.constexpr(4 * 128)  # numbers of float32: of each pixel, by lane and step, those that follow
+# The backward pass divides a list into segments of SEGMENT entries, one program each. If compositing continued behind
+# a segment, a border stores the state that a program needs to start there. The border of the segment that starts at
+# entry e has the number e // SEGMENT. These numbers are unique: borders of one list are SEGMENT entries apart, and the
+# first segment of the next list starts behind them.
+SEGMENT = tl.constexpr(256)  # entries; a multiple of UNROLL and UNROLL_BACK
+BORDER = tl.constexpr(4 * 128)  # float32 numbers: the four quantities below of each pixel, by lane and step
 TRANSMITTANCE = tl.constexpr(0)
-BEHIND_RED, BEHIND_GREEN, BEHIND_BLUE = tl.constexpr(128), tl.constexpr(256), tl.constexpr(384)  # blended behind it
+BEHIND_RED, BEHIND_GREEN, BEHIND_BLUE = (
+    tl.constexpr(128),
+    tl.constexpr(256),
+    tl.constexpr(384),
+)  # light blended behind it
 
-# A record: what compositing needs of one Gaussian, 16 float32. With d = pixel - mean and t = dx + SHEAR dy,
-# log2(alpha) = LOG2_OPACITY + CURVE_T t^2 + CURVE_Y dy^2: the conic as a sum of squares, which, unlike
-# a dx^2 + 2b dx dy + c dy^2, does not cancel for needles and is never positive.
+# A record has what compositing needs of one Gaussian: 16 float32. With d = pixel - mean and t = dx + SHEAR dy,
+# log2(alpha) = LOG2_OPACITY + CURVE_T t^2 + CURVE_Y dy^2. The conic is a sum of squares here: unlike
+# a dx^2 + 2b dx dy + c dy^2, it has no cancellation for needles, and the exponent is never positive.
 RECORD = tl.constexpr(16)
 MEAN_X, MEAN_Y = tl.constexpr(0), tl.constexpr(1)  # px, integer pixel centres
 SHEAR = tl.constexpr(2)  # b / a
@@ -40,19 +45,19 @@ CURVE_T, CURVE_Y = tl.constexpr(3), tl.constexpr(4)  # -log2(e)/2 a and -log2(e)
 LOG2_OPACITY = tl.constexpr(5)
 RED, GREEN, BLUE = tl.constexpr(6), tl.constexpr(7), tl.constexpr(8)
 RIGHTMOST_Y = tl.constexpr(9)  # px; dy of the rightmost point of the contour alpha = 1/255
-# int32 from here on
-COLUMNS = tl.constexpr(10)  # of blocks that the contour can touch: first + past-the-last * 65536
-FIRST_ROW = tl.constexpr(11)  # of blocks
+# The remaining entries are int32.
+COLUMNS = tl.constexpr(10)  # of blocks that the contour can touch: first + 65536 past-the-last
+FIRST_ROW = tl.constexpr(11)  # of blocks that the contour can touch
 CLAMPED = tl.constexpr(12)  # bit c: colour channel c was below 0
 
-# A row: the gradient sums of one Gaussian over the pixels of one block, 16 float32; h = d loss / d log(alpha).
+# A row has the gradient sums of one Gaussian over the pixels of one block: 16 float32; h = d loss / d log(alpha).
 ROW = tl.constexpr(16)
 SUM_H, SUM_H_T, SUM_H_Y = tl.constexpr(0), tl.constexpr(1), tl.constexpr(2)
 SUM_H_TT, SUM_H_TY, SUM_H_YY = tl.constexpr(3), tl.constexpr(4), tl.constexpr(5)
 SUM_RED, SUM_GREEN, SUM_BLUE = tl.constexpr(6), tl.constexpr(7), tl.constexpr(8)
 SUM_ABS_T, SUM_ABS_Y = tl.constexpr(9), tl.constexpr(10)  # |h t|, |h (d power / d dy)|
 
-COLOR_SLOPES = tl.constexpr(9)  # derivatives of red by x, y and z of the direction, of green, of blue
+COLOR_SLOPES = tl.constexpr(9)  # derivatives of red by x, y, z of the direction; then of green; then of blue
 
 LOG2_E = tl.constexpr(1 / math.log(2.0))
 ALPHA_MIN = tl.constexpr(CONSTANTS.alpha_min)
@@ -61,7 +66,7 @@ LOG2_ALPHA_MIN = tl.constexpr(math.log2(CONSTANTS.alpha_min))
 
 @dataclass(frozen=True)
 class Grid:
-    """An image and its blocks."""
+    """The size of an image and its numbers of blocks."""
 
     width: int  # px
     height: int
@@ -73,10 +78,10 @@ class Grid:
         return self.blocks_x * self.blocks_y
 
 
-class View(NamedTuple):
-    """A camera and its grid as plain numbers for the kernels, where they are float32.
+class TritonCamera(NamedTuple):
+    """A camera and its grid as float numbers for the kernels.
 
-    None is an integer: Triton would compile a kernel anew for a 1, and for what 16 divides.
+    None is an integer, because Triton compiles a kernel again for the integer 1 and for multiples of 16.
     """
 
     width: float  # px
@@ -108,7 +113,7 @@ class View(NamedTuple):
 
 
 def count_borders(pairs: int) -> int:
-    """Borders that lists with so many entries can have at most."""
+    """The largest number of borders of lists with ``pairs`` entries in all."""
     return max(pairs - 1, 0) // SEGMENT.value
 
 
@@ -117,8 +122,8 @@ def make_grid(camera: Camera) -> Grid:
     return Grid(width, height, -(-width // BLOCK_WIDTH.value), -(-height // BLOCK_HEIGHT.value))
 
 
-def make_view(camera: Camera) -> View:
+def make_camera(camera: Camera) -> TritonCamera:
     grid = make_grid(camera)
     tiles = -(-grid.width // TILE.value), -(-grid.height // TILE.value)
     sizes = map(float, (grid.width, grid.height, *tiles, grid.blocks_x, grid.blocks_y))
-    return View(*sizes, *projection_numbers(camera))
+    return TritonCamera(*sizes, *projection_numbers(camera))

@@ -1,9 +1,8 @@
 """Lists of the Gaussians that each block composites, front to back.
 
-A Gaussian's blocks are found row by row: the contour alpha = 1/255 cuts a span of blocks from each row of blocks. One
-(Gaussian, row) is a *unit*, one (Gaussian, block) a *pair*. Units and pairs are numbered front to back and, within a
-Gaussian, in order; the number of a pair is its *slot*. Sorting the pairs by block, and else leaving them in
-order, gives every block its list.
+In each row of blocks, the contour alpha = 1/255 of a Gaussian covers a span of blocks. One (Gaussian, row) is a *unit*,
+one (Gaussian, block) a *pair*. Units and pairs are numbered by depth of the Gaussian, then by row and column; the
+number of a pair is its *slot*. A stable sort of the pairs by block gives the list of each block.
 """
 
 from __future__ import annotations
@@ -35,16 +34,16 @@ from gsbench.raster.triton.layout import (
     Grid,
 )
 
-# Rounding must not lose a pixel of the contour.
+# Margins for float32 rounding: it must not lose a pixel of the contour.
 REACH_MARGIN = tl.constexpr(1e-3)  # in log2(alpha)
 PIXEL_MARGIN = tl.constexpr(0.02)  # px
-FLOAT_MARGIN = tl.constexpr(1e-6)  # of a coordinate, several float32 roundings
-MAX_COLUMN = tl.constexpr(1e6)  # px; beyond every image, and inside int32
+FLOAT_MARGIN = tl.constexpr(1e-6)  # of a coordinate: several roundings of float32
+MAX_COLUMN = tl.constexpr(1e6)  # px; beyond every image, but within int32
 
 
 @triton.jit
 def _span(records, place, row, first, past, mask):
-    """Columns of blocks, within ``first`` to ``past``, that the contour reaches in ``row``: first, past the last."""
+    """The block columns, within ``first`` to ``past``, that the contour reaches in ``row``: first, past-the-last."""
     mean_x = tl.load(records + place + MEAN_X, mask=mask, other=0.0)
     mean_y = tl.load(records + place + MEAN_Y, mask=mask, other=0.0)
     shear = tl.load(records + place + SHEAR, mask=mask, other=0.0)
@@ -56,8 +55,8 @@ def _span(records, place, row, first, past, mask):
     margin_y = PIXEL_MARGIN + FLOAT_MARGIN * tl.abs(mean_y)
     top = (row * BLOCK_HEIGHT).to(tl.float32) - mean_y - margin_y
     bottom = top + (BLOCK_HEIGHT - 1) + 2 * margin_y
-    # The contour's x over y is concave on the right and convex on the left: the extremes within the row are at its
-    # rightmost and leftmost points, clamped to the row.
+    # As a function of y, the contour's right side is concave and its left side convex. So the extremes within the row
+    # are at the rightmost and the leftmost point, clamped to the row.
     y_right = tl.minimum(tl.maximum(rightmost, top), bottom)
     y_left = tl.minimum(tl.maximum(-rightmost, top), bottom)
     right = tl.sqrt(tl.maximum((reach + curve_y * y_right * y_right) / -curve_t, 0.0)) - shear * y_right
@@ -65,7 +64,7 @@ def _span(records, place, row, first, past, mask):
     margin_x = PIXEL_MARGIN + FLOAT_MARGIN * (tl.abs(mean_x) + tl.maximum(tl.abs(left), tl.abs(right)))
     low = tl.ceil(tl.minimum(tl.maximum(mean_x + left - margin_x, -MAX_COLUMN), MAX_COLUMN)).to(tl.int32)
     high = tl.floor(tl.minimum(tl.maximum(mean_x + right + margin_x, -MAX_COLUMN), MAX_COLUMN)).to(tl.int32)
-    # Below 0 the division truncates upwards, but ``first`` is at least 0.
+    # Triton's // truncates towards 0, which would be wrong below 0: hence the maximum.
     low, high = tl.maximum(low, 0) // BLOCK_WIDTH, tl.maximum(high + BLOCK_WIDTH, 0) // BLOCK_WIDTH
     return tl.maximum(low, first), tl.minimum(high, past)
 
@@ -86,11 +85,11 @@ def find_units(
     unit_widths,
     GROUP: tl.constexpr,
 ):
-    """Fill the units of the Gaussians in the ``order`` [N] of their depth; a lane a Gaussian.
+    """Find the units of all Gaussians, in the ``order`` [N] of depth; one lane per Gaussian.
 
-    ``unit_ends`` [N] is the running sum of ``row_counts`` in that order. Out: ``first_units`` [N], the first unit of
-    each Gaussian, and for each unit its Gaussian, its first block and its number of blocks (possibly 0), as far as
-    ``capacity`` goes.
+    In: ``unit_ends`` [N], the running sum of ``row_counts`` in that order. Out: ``first_units`` [N], the first unit of
+    each Gaussian; and for each unit its Gaussian, its first block and its number of blocks, which may be 0. Units from
+    ``capacity`` on are not written.
     """
     rank = tl.program_id(0).to(tl.int64) * GROUP + tl.arange(0, GROUP)  # [GROUP]
     inside = rank < count
@@ -112,7 +111,7 @@ def find_units(
 
 @triton.jit(do_not_specialize=["count", "capacity"])
 def summarise(unit_ends, count, pair_ends, capacity, flags, background, status):
-    """``status`` [3] int64: the number of units, of pairs (if the units fit), and whether a value is bad."""
+    """Fill ``status`` [3] int64: number of units; number of pairs (if the units fit); 1 if a value is bad."""
     units = tl.load(unit_ends + count - 1, mask=count > 0, other=0)
     pairs = tl.load(pair_ends + capacity - 1)
     channel = tl.arange(0, 4)
@@ -125,7 +124,7 @@ def summarise(unit_ends, count, pair_ends, capacity, flags, background, status):
 
 @triton.jit(do_not_specialize=["units"])
 def write_pairs(unit_owners, unit_blocks, unit_widths, pair_ends, units, keys, owners, GROUP: tl.constexpr):
-    """Write each slot's block (``keys``) and Gaussian (``owners``), both [pairs]; a lane a unit."""
+    """Write the block (``keys``) and the Gaussian (``owners``) of each slot, both [pairs]; one lane per unit."""
     unit = tl.program_id(0).to(tl.int64) * GROUP + tl.arange(0, GROUP)  # [GROUP]
     inside = unit < units
     width = tl.load(unit_widths + unit, mask=inside, other=0)
@@ -138,35 +137,35 @@ def write_pairs(unit_owners, unit_blocks, unit_widths, pair_ends, units, keys, o
 
 
 MAX_INT16, MAX_INT32 = 2**15 - 1, 2**31 - 1
-UNITS_AT_FIRST = 2  # rows of blocks that a Gaussian has room for, before they are counted
+UNITS_AT_FIRST = 2  # units per Gaussian that the first attempt has room for
 
 
 class Projected(NamedTuple):
-    """Numbers of each Gaussian in a view."""
+    """Results of projection for each of N Gaussians."""
 
-    records: Tensor  # [N + 1, 16] the last cannot be seen
+    records: Tensor  # [N + 1, 16] the last one is invisible
     color_slopes: Tensor  # [N, 9]
-    row_counts: Tensor  # [N] int32 units of each Gaussian
+    row_counts: Tensor  # [N] int32 number of units of each Gaussian
 
 
 class Units(NamedTuple):
-    """Rows of blocks that Gaussians cover, a unit each, those of one Gaussian side by side."""
+    """The units of all Gaussians; those of one Gaussian are adjacent."""
 
     number: int
-    pairs: int  # of a Gaussian and a block, in all units
-    first: Tensor  # [N] int64 of each Gaussian
-    widths: Tensor  # [units] int32 pairs of each
-    blocks: Tensor  # [units] int32 the first block of each
+    pairs: int  # number of pairs in all units
+    first: Tensor  # [N] int64 first unit of each Gaussian
+    widths: Tensor  # [units] int32 number of pairs of each unit
+    blocks: Tensor  # [units] int32 first block of each unit
     pair_ends: Tensor  # [units] int64 running sum of the widths
 
 
 class Lists(NamedTuple):
-    """Gaussians that each block blends."""
+    """The lists of Gaussians that blocks composite."""
 
-    order: Tensor  # [blocks] int64 the longest lists first
-    starts: Tensor  # [blocks + 1] int32
+    order: Tensor  # [blocks] int64 blocks, longest lists first
+    starts: Tensor  # [blocks + 1] int32 first entry of each block
     entries: Tensor  # [pairs] int32 Gaussians, by block, front to back
-    slots: Tensor  # [pairs] int64 of each entry
+    slots: Tensor  # [pairs] int64 slot of each entry
 
 
 def find_all_units(
@@ -179,9 +178,9 @@ def find_all_units(
     flags: Tensor,
     background: Tensor,
 ) -> tuple[Units, Tensor]:
-    """List the units of all Gaussians, front to back, and their Gaussians [units]; again where the room was too small.
+    """Find the units of all Gaussians, front to back, and the Gaussian of each unit, [units].
 
-    Here the host waits for the device.
+    Repeats with more memory if the first attempt has too little. Here the host waits for the device.
     """
     count = len(gaussians)
     depth_order = scratch.take("depth_order", count, torch.int64)
@@ -212,7 +211,7 @@ def find_all_units(
         )
         torch.cumsum(widths, 0, out=pair_ends)
         launch_grid(summarise, 1)(unit_ends, count, pair_ends, capacity, flags, background, status)
-        units, pairs, bad = Readback(status).values().tolist()  # the one wait for the device
+        units, pairs, bad = Readback(status).values().tolist()  # the only wait for the device
         if bad:
             raise_for_values(gaussians, background)
         if units <= capacity:

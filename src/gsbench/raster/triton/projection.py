@@ -1,6 +1,6 @@
-"""Projection of Gaussians to records, and its gradients, derived by hand; a lane a Gaussian.
+"""Projection of Gaussians to records, and its gradients, derived by hand; one lane per Gaussian.
 
-Sums are made in a fixed order and without atomics, so they have the same bits on every run.
+Sums have a fixed order and use no atomics, so their bits are the same on every run.
 """
 
 from __future__ import annotations
@@ -66,13 +66,13 @@ from gsbench.raster.triton.layout import (
 NEAR = tl.constexpr(CONSTANTS.near)
 SIGMA_EXTENT = tl.constexpr(CONSTANTS.sigma_extent)
 EIGENVALUE_FLOOR = tl.constexpr(CONSTANTS.eigenvalue_floor)
-MAX_RADIUS = tl.constexpr(2.0**24)  # px; keeps the radius of an absurdly large Gaussian inside int32
-MAX_CENTER = tl.constexpr(1e9)  # px; a centre so far outside the image cannot be told apart in float32
-MAX_VARIANCE = tl.constexpr(1e18)  # px^2; nor can a standard deviation; squares stay finite
+MAX_RADIUS = tl.constexpr(2.0**24)  # px; keeps the radius of a huge Gaussian within int32
+MAX_CENTER = tl.constexpr(1e9)  # px; so far outside the image, float32 cannot resolve a pixel
+MAX_VARIANCE = tl.constexpr(1e18)  # px^2; the same for standard deviations; also keeps squares finite
 MIN_SQUARED_NORM = tl.constexpr(MIN_QUATERNION_NORM**2)
-CONTOUR_MARGIN = tl.constexpr(0.01)  # px, and relative: rounding of the contour alpha = 1/255 must not lose a pixel
+CONTOUR_MARGIN = tl.constexpr(0.01)  # px, and relative: rounding must not lose a pixel of the contour alpha = 1/255
 LAST_KEY = tl.constexpr(2**31 - 1)  # sorts behind every depth
-UNSEEN = tl.constexpr(-1e9)  # log2(opacity)
+INVISIBLE = tl.constexpr(-1e9)  # log2(opacity) of the invisible record
 
 
 @triton.jit
@@ -103,11 +103,16 @@ def project(
     DEGREE: tl.constexpr,
     GROUP: tl.constexpr,
 ):
-    """Fill ``radii`` [N]; of every Gaussian that can be seen its record, elsewhere rubbish, and at N one that cannot be
-    seen; ``color_slopes`` [N, 9], likewise, the derivatives of colour by the direction, unless ``DEGREE`` is 0;
-    ``keys`` [N] by which depth is sorted; ``row_counts`` [N], the rows of blocks that its contour can touch.
-    ``flags`` [1] becomes 1 where a value is not finite or a quaternion has no length. ``record_ints`` is the memory of
-    ``records`` [N + 1, 16]."""
+    """Project all Gaussians. Fills:
+
+    - ``radii`` [N];
+    - ``records`` [N + 1, 16] of visible Gaussians (undefined for others), with an invisible record at N;
+      ``record_ints`` is the same memory;
+    - ``color_slopes`` [N, 9] of visible Gaussians, the derivatives of colour by the direction, unless ``DEGREE`` is 0;
+    - ``keys`` [N], by which depth is sorted;
+    - ``row_counts`` [N], the number of rows of blocks that the contour can touch;
+    - ``flags`` [1], set to 1 if a value is not finite or a quaternion has length 0.
+    """
     index = tl.program_id(0).to(tl.int64) * GROUP + tl.arange(0, GROUP)  # [GROUP]
     inside = index < count
     mean, log_scale = load_vector(means, index, inside), load_vector(log_scales, index, inside)
@@ -131,7 +136,7 @@ def project(
     visible &= (tl.abs(column) < MAX_CENTER) & (tl.abs(row) < MAX_CENTER) & (dot(m0, m0) + dot(m1, m1) < MAX_VARIANCE)
     xx, xy, yy, a = spread(m0, m1)
     half = (xx - yy) * 0.5
-    # middle^2 - det as a sum of squares
+    # The discriminant middle^2 - det, written as a sum of squares.
     largest = (xx + yy) * 0.5 + tl.sqrt(tl.maximum(half * half + xy * xy, EIGENVALUE_FLOOR))
     radius = tl.minimum(tl.ceil(tl.sqrt(largest) * SIGMA_EXTENT), MAX_RADIUS)
     first_x, past_x = _tile_range(column - radius, column + radius, v.tiles_x, TILE)
@@ -139,10 +144,10 @@ def project(
     visible &= (first_x < past_x) & (first_y < past_y)
     tl.store(radii + index, tl.where(visible, radius, 0.0).to(tl.int32), mask=inside)
 
-    # Of the blocks of the 3 sigma square's tiles, those that the contour alpha = 1/255 can touch.
+    # Of the blocks in the tiles of the 3 sigma square, keep those that the contour alpha = 1/255 can touch.
     growth = tl.exp(-logit) + 1.0
     log2_opacity = -tl.log2(growth)
-    reach = tl.maximum((log2_opacity - LOG2_ALPHA_MIN) * (2 / LOG2_E), 0.0)  # its squared Mahalanobis distance
+    reach = tl.maximum((log2_opacity - LOG2_ALPHA_MIN) * (2 / LOG2_E), 0.0)  # squared Mahalanobis distance
     half_x = tl.sqrt(reach * xx) * (1 + CONTOUR_MARGIN) + CONTOUR_MARGIN
     half_y = tl.sqrt(reach * yy) * (1 + CONTOUR_MARGIN) + CONTOUR_MARGIN
     inner_x, outer_x = _tile_range(tl.ceil(column - half_x), tl.floor(column + half_x) + 1, v.blocks_x, BLOCK_WIDTH)
@@ -151,7 +156,7 @@ def project(
     first_y, past_y = tl.maximum(first_y * BLOCK_ROWS, inner_y), tl.minimum(past_y * BLOCK_ROWS, outer_y)
     seen = visible & (growth * ALPHA_MIN < 1.0) & (first_x < past_x) & (first_y < past_y)
     tl.store(row_counts + index, tl.where(seen, past_y - first_y, 0), mask=inside)
-    # The bits of a positive float32 sort like its value.
+    # The bits of positive float32 numbers sort like the numbers.
     tl.store(keys + index, tl.where(seen, z.to(tl.int32, bitcast=True), LAST_KEY), mask=inside)
 
     distance = tl.sqrt(dot(offset, offset))
@@ -169,7 +174,7 @@ def project(
 
     place = index * RECORD
     seen |= index == count
-    log2_opacity = tl.where(inside, log2_opacity, UNSEEN)
+    log2_opacity = tl.where(inside, log2_opacity, INVISIBLE)
     tl.store(records + place + MEAN_X, column, mask=seen)
     tl.store(records + place + MEAN_Y, row, mask=seen)
     tl.store(records + place + SHEAR, -xy / yy, mask=seen)
@@ -188,10 +193,10 @@ def project(
 
 @triton.jit(do_not_specialize=["units"])
 def sum_units(pair_ends, unit_widths, unit_blocks, last_slots, units, rows, GROUP: tl.constexpr):
-    """Add the ``rows`` [pairs, 16] of each unit into the first of them. Its slots are neighbours.
+    """Sum the ``rows`` [pairs, 16] of each unit, which are adjacent, into its first row.
 
-    Only those that compositing came to have been written. They are the ones up to ``last_slots`` [blocks], since the
-    list of a block has its slots in rising order.
+    Only rows of entries that compositing reached have been written. These are the slots up to ``last_slots`` [blocks],
+    because the slots in the list of a block rise.
     """
     unit = tl.program_id(0).to(tl.int64) * GROUP + tl.arange(0, GROUP)  # [GROUP]
     inside = unit < units
@@ -244,10 +249,11 @@ def _store_vector(array, index, values, mask):
 
 @triton.jit
 def _store_splitting(place, d00, d01, d11, shear, rows, mask):
-    """Write F^T U^T (D G D - h D) U F for the derivative F = ``rows`` of the mean on the image, ``d`` what is between.
+    """Write the splitting matrices F^T U^T (D G D - h D) U F. F = ``rows`` is the derivative of the projected mean;
+    ``d00``, ``d01`` and ``d11`` are the entries of D G D - h D.
 
-    The second derivative of alpha by the mean on the image is alpha (u u^T - C), with u = C (dx, dy) and the conic
-    C = U^T D U; summed with weights h / alpha that is U^T (D G D - h D) U.
+    The second derivative of alpha by the projected mean is alpha (u u^T - C), with u = C (dx, dy) and the conic C = U^T
+    D U. Its sum with weights h / alpha is U^T (D G D - h D) U.
     """
     r0 = (rows[0][0] + shear * rows[1][0], rows[0][1] + shear * rows[1][1], rows[0][2] + shear * rows[1][2])
     r1 = rows[1]
@@ -294,7 +300,7 @@ def backproject(
     SPLITTING: tl.constexpr,
     GROUP: tl.constexpr,
 ):
-    """Write the gradients of the Gaussians that were seen; those of the others stay as they are."""
+    """Write the gradients of visible Gaussians; those of the others are not written."""
     index = tl.program_id(0).to(tl.int64) * GROUP + tl.arange(0, GROUP)  # [GROUP]
     row_count = tl.load(row_counts + index, mask=index < count, other=0)
     seen = row_count > 0
@@ -304,7 +310,7 @@ def backproject(
     mean, log_scale = load_vector(means, index, seen), load_vector(log_scales, index, seen)
     offset = from_camera(mean, v)
 
-    # Colour, and the position through the direction of the colour.
+    # Colour, and the gradient of the mean through the view direction of the colour.
     clamped = tl.load(record_ints + index * RECORD + CLAMPED, mask=seen, other=0)
     g_rgb = (
         tl.where(clamped & 1 != 0, 0.0, red),
@@ -327,7 +333,7 @@ def backproject(
     from_y = (pulled[1] - radial * to[1]) * inverse_distance
     from_z = (pulled[2] - radial * to[2]) * inverse_distance
 
-    # The forward geometry once more.
+    # Repeat the geometry of the forward pass.
     quaternion, inverse_norm, _ = load_quaternion(quaternions, index, seen)
     qw, qx, qy, qz = quaternion
     matrix = rotation_matrix(quaternion)
@@ -350,8 +356,9 @@ def backproject(
         tl.store(g_absolute + 2 * index, a * abs_t * half_width, mask=seen)
         tl.store(g_absolute + 2 * index + 1, abs_y * half_height, mask=seen)
 
-    # M = N S, N = A R: d loss / d M = U^T Q U M with Q = D G D, D = diag(a, e), U = [[1, shear], [0, 1]], G the second
-    # moments of h over (t, dy). The first row of U M is short for a needle: U N comes first.
+    # Covariance: M = N S and N = A R. d loss / d M = U^T Q U M with Q = D G D, D = diag(a, e), U = [[1, shear], [0, 1]]
+    # and G the second moments of h over (t, dy). For a needle the first row of U M is small, so U N is computed first,
+    # before large numbers can cancel.
     q00, q01, q11 = a * a * h_tt, a * e * h_ty, e * e * h_yy
     if SPLITTING:
         free = image_rows(x * inverse_z, y * inverse_z, inverse_z, v)
@@ -363,9 +370,9 @@ def backproject(
     along = (u0[0] * g0[0] + n1[0] * g1[0], u0[1] * g0[1] + n1[1] * g1[1], u0[2] * g0[2] + n1[2] * g1[2])
     _store_vector(g_log_scales, index, scaled(along, variances), seen)
 
-    # Turned by small angles w about its own axes, R S^2 R^T changes by a commutator: the gradient at w has differences
-    # of variances as factors. Taken first, they make that of a ball 0, where the rounding of terms that cancel would
-    # become full steps of Adam. The quaternion moves by q (0, w) / 2.
+    # Rotation by small angles w about the Gaussian's own axes changes R S^2 R^T by a commutator, so the gradient by w
+    # has differences of variances as factors. Computing these differences first makes the gradient of a sphere exactly
+    # 0; otherwise rounding errors remain, which Adam scales to full steps. The quaternion changes by q (0, w) / 2.
     w_x = (u0[1] * g0[2] + n1[1] * g1[2]) * (scales[1] - scales[2]) * (scales[1] + scales[2])
     w_y = (u0[2] * g0[0] + n1[2] * g1[0]) * (scales[2] - scales[0]) * (scales[2] + scales[0])
     w_z = (u0[0] * g0[1] + n1[0] * g1[1]) * (scales[0] - scales[1]) * (scales[0] + scales[1])
@@ -375,7 +382,7 @@ def backproject(
     tl.store(g_quaternions + 4 * index + 2, (qw * w_y + qz * w_x - qx * w_z) * twice, mask=seen)
     tl.store(g_quaternions + 4 * index + 3, (qw * w_z + qx * w_y - qy * w_x) * twice, mask=seen)
 
-    # A = J W: d loss / d A, then J's entries, then the position in the view.
+    # A = J W: d loss / d A, then by the entries of J, then by the position in view space.
     s0, s1 = scaled(g0, variances), scaled(g1, variances)
     s1 = (s1[0] + shear * s0[0], s1[1] + shear * s0[1], s1[2] + shear * s0[2])
     a0 = (dot(s0, matrix[0]), dot(s0, matrix[1]), dot(s0, matrix[2]))
@@ -384,7 +391,7 @@ def backproject(
     j11, j12 = a1[0] * v.r10 + a1[1] * v.r11 + a1[2] * v.r12, a1[0] * v.r20 + a1[1] * v.r21 + a1[2] * v.r22
     fx_z, fy_z = inverse_z * v.fx, inverse_z * v.fy
     free_x, free_y = x * inverse_z, y * inverse_z
-    # The clamp of the slope passes the gradient only within its limits.
+    # The clamp of a slope passes the gradient only within the limits.
     g_slope_x = tl.where((free_x >= v.slope_x_min) & (free_x <= v.slope_x_max), -fx_z * j02, 0.0)
     g_slope_y = tl.where((free_y >= v.slope_y_min) & (free_y <= v.slope_y_max), -fy_z * j12, 0.0)
     view_x = g_column * fx_z + g_slope_x * inverse_z
