@@ -27,7 +27,7 @@ from gsbench.analysis.results import Experiment, load_experiment
 from gsbench.analysis.table_formats import to_html_page, to_latex, to_markdown
 from gsbench.analysis.tables import build_table
 from gsbench.errors import InputError
-from gsbench.eval.facts import find
+from gsbench.eval.facts import find_metric
 from gsbench.system.install import conf_dir
 from gsbench.verbs import tables
 from tests.analysis.synthetic import Plan, write_runs
@@ -206,7 +206,7 @@ def test_every_paper_names_its_source_and_has_sane_numbers(name: str) -> None:
     assert paper.title
     assert "github.com/" in paper.source or "arxiv.org/" in paper.source
     assert paper.conventions
-    assert all(find(key) is not None for key in paper.quantities)
+    assert all(find_metric(key) is not None for key in paper.quantities)
     bounds = {"psnr": (10, 45), "ssim": (0.3, 1), "lpips_vgg_raw": (0, 1)}
     for (_, key), printed in paper.printed.items():
         low, high = bounds[key]

@@ -18,7 +18,7 @@ from gsbench.eval.facts import (
     METRICS,
     MetricFacts,
     facts_of,
-    find,
+    find_metric,
     from_record,
     further_keys,
     known_keys,
@@ -44,7 +44,7 @@ def test_every_metric_can_be_imported_and_is_described(facts: MetricFacts) -> No
     assert facts.worthwhile is not None
     assert facts.words
     assert facts.lowest is not None
-    assert find(facts.key) is facts
+    assert find_metric(facts.key) is facts
 
 
 def test_the_evaluator_knows_exactly_the_metrics_of_the_table() -> None:

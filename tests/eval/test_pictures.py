@@ -10,23 +10,23 @@ from PIL import Image
 
 from gsbench.errors import InputError
 from gsbench.eval.evaluator import Evaluator
-from gsbench.eval.pictures import Pair, measure
+from gsbench.eval.pictures import PicturePair, measure
 from gsbench.eval.protocol import PAPER
 
 
 @pytest.fixture
-def pairs(tmp_path: Path) -> list[Pair]:
+def pairs(tmp_path: Path) -> list[PicturePair]:
     rng = np.random.default_rng(0)
     made = []
     for view in ("b", "a"):
         photograph, picture = tmp_path / f"{view}.png", tmp_path / f"{view}_render.png"
         Image.fromarray(rng.integers(0, 256, (40, 50, 3), dtype=np.uint8)).save(photograph)
         Image.fromarray(rng.integers(0, 256, (40, 50, 3), dtype=np.uint8)).save(picture)
-        made.append(Pair(view, photograph, picture))
+        made.append(PicturePair(view, photograph, picture))
     return made
 
 
-def test_the_metrics_are_of_the_files_pixels(pairs: list[Pair]) -> None:
+def test_the_metrics_are_of_the_files_pixels(pairs: list[PicturePair]) -> None:
     per_view = measure(pairs, Evaluator(PAPER, lpips=(), flip=False))
     assert list(per_view) == ["b", "a"]
     for pair in pairs:
@@ -36,13 +36,13 @@ def test_the_metrics_are_of_the_files_pixels(pairs: list[Pair]) -> None:
         assert per_view[pair.view]["psnr"] == pytest.approx(expected, abs=1e-6)
 
 
-def test_sizes_are_never_changed(pairs: list[Pair]) -> None:
+def test_sizes_are_never_changed(pairs: list[PicturePair]) -> None:
     Image.open(pairs[1].picture).resize((25, 20)).save(pairs[1].picture)
     with pytest.raises(InputError, match=r"a_render\.png is 25x20 px, but its photograph .*a.png 50x40"):
         measure(pairs, Evaluator(PAPER, lpips=(), flip=False))
 
 
-def test_a_torn_picture_is_named(pairs: list[Pair]) -> None:
+def test_a_torn_picture_is_named(pairs: list[PicturePair]) -> None:
     pairs[0].picture.write_bytes(pairs[0].picture.read_bytes()[:500])
     with pytest.raises(InputError, match=r"b_render\.png: the image is damaged"):
         measure(pairs, Evaluator(PAPER, lpips=(), flip=False))

@@ -15,7 +15,7 @@ from gsbench.errors import InputError, TrainingError
 from gsbench.eval import evaluator as evaluator_module
 from gsbench.eval import facts
 from gsbench.eval.evaluator import Evaluator, quantize, summarize
-from gsbench.eval.facts import find
+from gsbench.eval.facts import find_metric
 from gsbench.eval.lpips import load_lpips
 from gsbench.eval.protocol import PAPER, STANDARD, get_protocol
 from gsbench.eval.ssim import ssim
@@ -75,7 +75,7 @@ def test_missing_weights_are_named_and_nothing_stands_in_for_them() -> None:
 
 @pytest.mark.shared
 def test_lpips_variants_see_the_range_that_their_name_says(shared: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    squeeze = find("lpips_squeeze")
+    squeeze = find_metric("lpips_squeeze")
     raw = replace(squeeze, key="lpips_squeeze_raw", options={"net": "squeeze", "raw": True})
     monkeypatch.setattr(facts, "METRICS", (squeeze, raw))
     monkeypatch.setattr(evaluator_module, "METRICS", (squeeze, raw))

@@ -7,11 +7,11 @@ from pathlib import Path
 import pytest
 
 from gsbench.errors import InputError
-from gsbench.renders.import_renders import Place, find_place
-from gsbench.renders.reference_images import Truth
+from gsbench.renders.import_renders import Destination, find_destination
+from gsbench.renders.reference_images import ReferenceImages
 
-COURTYARD = Truth({}, "the test views of a trial", "0" * 64, (96, 72), {}, "courtyard", "sfm")
-FOLDER = Truth({}, "the pictures in a folder", "0" * 64, (96, 72), {})
+COURTYARD = ReferenceImages({}, "the test views of a trial", "0" * 64, (96, 72), {}, "courtyard", "sfm")
+FOLDER = ReferenceImages({}, "the pictures in a folder", "0" * 64, (96, 72), {})
 
 
 @pytest.mark.parametrize(
@@ -28,14 +28,14 @@ FOLDER = Truth({}, "the pictures in a folder", "0" * 64, (96, 72), {})
     ],
 )
 def test_places_that_would_mix_or_damage_results_are_refused(
-    word: str, scene: str | None, seed: int, truth: Truth, said: str, tmp_path: Path
+    word: str, scene: str | None, seed: int, truth: ReferenceImages, said: str, tmp_path: Path
 ) -> None:
     with pytest.raises(InputError, match=said):
-        find_place(word, scene, seed, truth, tmp_path)
+        find_destination(word, scene, seed, truth, tmp_path)
 
 
 def test_the_scene_may_be_named_again(tmp_path: Path) -> None:
-    wanted = Place("table1", "courtyard", "sfm", "mine", 3)
-    assert find_place("table1:mine", "courtyard", 3, COURTYARD, tmp_path) == wanted
-    assert find_place("table1:mine", None, 3, COURTYARD, tmp_path) == wanted
-    assert find_place("table1:mine", "garden", 3, FOLDER, tmp_path).scene == "garden"
+    wanted = Destination("table1", "courtyard", "sfm", "mine", 3)
+    assert find_destination("table1:mine", "courtyard", 3, COURTYARD, tmp_path) == wanted
+    assert find_destination("table1:mine", None, 3, COURTYARD, tmp_path) == wanted
+    assert find_destination("table1:mine", "garden", 3, FOLDER, tmp_path).scene == "garden"

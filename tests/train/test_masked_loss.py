@@ -7,7 +7,7 @@ import pytest
 import torch
 from skimage.metrics import structural_similarity
 
-from gsbench.eval.images import where_counted
+from gsbench.eval.images import replace_ignored
 from gsbench.raster import create_rasterizer
 from gsbench.scene.camera import Camera
 from gsbench.scene.types import View
@@ -31,7 +31,7 @@ def picture() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
 def test_the_loss_with_a_mask_is_its_definition(picture) -> None:
     """L1 summed over what counts; SSIM by scikit-image, of pictures that are equal under the mask; over all pixels."""
     image, target, mask = picture
-    loss, l1, ssim = PhotometricLoss(0.2, threads=1)(where_counted(image, target, mask), target)
+    loss, l1, ssim = PhotometricLoss(0.2, threads=1)(replace_ignored(image, target, mask), target)
     truth, counts = target.numpy() / 255.0, mask.numpy()[..., 0]
     wanted_l1 = np.abs(image.numpy() - truth)[counts].sum() / image.numel()
     padded = [np.pad(np.where(mask.numpy(), x, truth), ((5, 5), (5, 5), (0, 0))) for x in (image.numpy(), truth)]
@@ -50,7 +50,7 @@ def test_no_gradient_and_no_value_comes_from_under_the_mask(picture, dtype: torc
     results = []
     for noise in (0.0, 5.0):
         drawn = (image + noise * ~mask).to(dtype).requires_grad_()
-        loss, *_ = PhotometricLoss(threads=1)(where_counted(drawn, target, mask), target)
+        loss, *_ = PhotometricLoss(threads=1)(replace_ignored(drawn, target, mask), target)
         loss.backward()
         assert drawn.grad is not None
         assert (drawn.grad[~mask.expand(-1, -1, 3)] == 0).all()
@@ -70,7 +70,7 @@ def test_far_from_the_mask_a_pixel_pulls_as_without_one(picture) -> None:
     gradients = []
     for chosen in (None, mask):
         drawn = image.clone().requires_grad_()
-        PhotometricLoss(threads=1)(where_counted(drawn, target, chosen), target)[0].backward()
+        PhotometricLoss(threads=1)(replace_ignored(drawn, target, chosen), target)[0].backward()
         gradients.append(drawn.grad)
     torch.testing.assert_close(gradients[0][:, :19], gradients[1][:, :19], rtol=0, atol=0)
     assert not torch.equal(gradients[0][:, 20:30], gradients[1][:, 20:30])

@@ -11,7 +11,7 @@ from statistics import fmean
 
 from gsbench.analysis.results import TrialResult, group_by
 from gsbench.errors import InputError
-from gsbench.eval.facts import LPIPS, find, from_record, known_keys
+from gsbench.eval.facts import LPIPS, find_metric, from_record, known_keys
 from gsbench.eval.protocol import PAPER, protocol_of
 from gsbench.words import signed
 
@@ -121,7 +121,9 @@ def quantity(name: str, trials: Iterable[TrialResult]) -> Quantity:
     metric, _, step = key.partition(AT)
     if metric == "lpips":
         metric = _protocol_lpips(trials[0]) if trials else f"{LPIPS}{PAPER.lpips}"
-    if find(metric) is not None or any(metric in trial.metrics for trial in trials):  # gsbench's metric or a user's
+    if find_metric(metric) is not None or any(
+        metric in trial.metrics for trial in trials
+    ):  # gsbench's metric or a user's
         return _metric(metric, step, trials)
     if key in FIXED_UNITS:
         cost, symbol, scale, decimals = FIXED_UNITS[key]
@@ -166,14 +168,14 @@ def value_of(asked: Quantity, trial: TrialResult) -> float:
 def metric_keys(trials: Iterable[TrialResult], wanted: Container[str] = ()) -> list[str]:
     """The metrics of any trial and those ``wanted``, in the order of tables; a user's own come last."""
     present = {key for trial in trials for key in trial.metrics}
-    own = sorted(key for key in present if find(key) is None)
+    own = sorted(key for key in present if find_metric(key) is None)
     return [key for key in known_keys() if key in present or key in wanted] + own
 
 
 def _metric(key: str, step: str, trials: Sequence[TrialResult]) -> Quantity:
     """A metric at the end, or at iteration ``step`` unless it is "". Trials record the facts of a user's metric."""
     records = [trial.record.metric_facts.get(key) for trial in trials if key in trial.metrics]
-    facts = find(key) or from_record(key, records[0] if records else None)
+    facts = find_metric(key) or from_record(key, records[0] if records else None)
     name, read = facts.name, partial(_final_value, key)
     if step:
         measured = sorted({int(at) for trial in trials for at in trial.record.metrics_at})

@@ -20,7 +20,7 @@ from gsbench.analysis.statistics import FIRST_LOOK, plan_looks
 from gsbench.analysis.verdicts import in_words
 from gsbench.config.compose import Trial
 from gsbench.errors import InputError
-from gsbench.eval.facts import MetricFacts, facts_of, find
+from gsbench.eval.facts import MetricFacts, facts_of, find_metric
 from gsbench.runs.declaration import Declaration, Question, declared_now
 from gsbench.runs.keys import flatten
 from gsbench.runs.layout import SEED
@@ -171,7 +171,7 @@ def _expected(trial: Trial) -> TrialResult:
 
 def facts_for(metric: str, values: Mapping[str, Any]) -> MetricFacts:
     """The facts of a metric of trials with the configuration ``values``; raises InputError for an unknown metric."""
-    shipped = find(metric)
+    shipped = find_metric(metric)
     if shipped is not None:
         return shipped
     from gsbench.pipeline.parts import build_metrics  # here, since only a user's own metric needs it

@@ -1,4 +1,4 @@
-"""The evaluator: applies the metrics of a protocol, and those of the user's own, to pairs of images."""
+"""The evaluator, which applies the metrics of a protocol and the user's own metrics to pairs of images."""
 
 import importlib
 import math
@@ -16,8 +16,8 @@ from torch import Tensor
 
 from gsbench.errors import InputError, TrainingError
 from gsbench.eval.facts import LPIPS, METRICS, MORE, MetricFacts, facts_of, further_keys, lpips_variants
-from gsbench.eval.images import as_unit_range, where_counted
-from gsbench.eval.measures import Conditions
+from gsbench.eval.images import as_unit_range, replace_ignored
+from gsbench.eval.measures import MetricContext
 from gsbench.eval.metric import MaskedMetric, Metric, UnavailableError
 from gsbench.eval.protocol import Protocol
 
@@ -25,12 +25,13 @@ from gsbench.eval.protocol import Protocol
 class Evaluator:
     """Computes the metrics of one protocol; loads every network once.
 
-    ``lpips`` names the variants to compute (see `gsbench.eval.facts.lpips_variants`); ``weights`` is a folder to look
-    in first; ``more`` names those of gsbench's metrics that are computed only if asked for (`further_keys`); ``extra``
-    are the user's own metrics by name. ``unavailable`` maps each metric that cannot be computed to
-    its reason in one line, and ``awaited`` holds those of them that could be once their weights or packages are there;
-    both can grow while views are evaluated, and such a metric is then left out of ``summarize`` for every view.
-    ``own`` are the facts of the user's metrics.
+    ``lpips`` names the variants to compute (see `gsbench.eval.facts.lpips_variants`), ``more`` names further metrics of
+    gsbench (`further_keys`), and ``extra`` are the user's own metrics by name. ``weights`` is the folder that is
+    searched first.
+
+    ``unavailable`` maps each metric that cannot be computed to the reason, in one line. ``awaited`` holds those that
+    can be computed once their weights or packages are installed. Both can grow while views are evaluated;
+    ``summarize`` then leaves the metric out for all views. ``own`` are the facts of the user's metrics.
     """
 
     def __init__(
@@ -59,15 +60,15 @@ class Evaluator:
         self.own = {name: facts_of(name, metric) for name, metric in extra.items()}
         wanted = {f"{LPIPS}{variant}" for variant in (variants if lpips is None else lpips)}
         wanted |= {facts.key for facts in METRICS if not facts.setting} | ({"flip"} if flip else set()) | set(more)
-        conditions = Conditions(protocol, self.device, weights, download)
+        context = MetricContext(protocol, self.device, weights, download)
         self._metrics: dict[str, Metric] = {}
         for facts in METRICS:
             if facts.setting == MORE and facts.key not in wanted:
-                continue  # left unsaid: such a metric may be younger than the results of others
+                continue  # not listed as unavailable, since older results do not know later metrics
             try:
                 if facts.key not in wanted:
                     raise UnavailableError(f"not asked for ({facts.setting})")
-                self._metrics[facts.key] = _load(facts, conditions)
+                self._metrics[facts.key] = _load(facts, context)
             except UnavailableError as error:
                 self._leave_out(facts.key, error)
         self._metrics |= extra
@@ -80,21 +81,21 @@ class Evaluator:
     ) -> dict[str, float]:
         """The metrics of one view; images are [H, W, 3], uint8 or floating point in [0, 1].
 
-        Where ``mask`` [H, W] is False the render is not looked at: it gets the photograph's pixels before anything is
-        measured, and the metrics that are means over pixels leave these out (see `MaskedMetric`).
+        Where ``mask`` [H, W] is False, the render is ignored: its pixels are replaced by the photograph's before
+        anything is measured, and metrics that average over pixels leave them out (see `MaskedMetric`).
 
-        A metric that cannot be computed is absent and stands in ``unavailable``. Raises ``TrainingError`` where the
-        render holds a non-finite value.
+        A metric that cannot be computed is absent and listed in ``unavailable``. Raises ``TrainingError`` if the render
+        holds a non-finite value.
         """
         image, target = self._prepare(render), self._prepare(ground_truth)  # [H, W, 3]
-        counts = None if mask is None else torch.as_tensor(mask, device=self.device)  # [H, W]
-        image = where_counted(image, target, None if counts is None else counts[..., None])
+        counted = None if mask is None else torch.as_tensor(mask, device=self.device)  # [H, W]
+        image = replace_ignored(image, target, None if counted is None else counted[..., None])
         values = {}
         for key, metric in self._metrics.items():
             if key in self.unavailable:
                 continue
             try:
-                value = self._measured(key, metric, image, target, counts)
+                value = self._measure(key, metric, image, target, counted)
                 if not math.isfinite(value):
                     raise UnavailableError(f"the value of a view is {value}")
                 values[key] = value
@@ -102,11 +103,11 @@ class Evaluator:
                 self._leave_out(key, error)
         return values
 
-    def _measured(self, key: str, metric: Metric, image: Tensor, target: Tensor, counts: Tensor | None) -> float:
+    def _measure(self, key: str, metric: Metric, image: Tensor, target: Tensor, mask: Tensor | None) -> float:
         try:
             value: Any
-            if counts is not None and isinstance(metric, MaskedMetric):
-                value = metric.measure_masked(image, target, counts)
+            if mask is not None and isinstance(metric, MaskedMetric):
+                value = metric.measure_masked(image, target, mask)
             else:
                 value = metric.measure(image, target)
         except UnavailableError:
@@ -116,10 +117,10 @@ class Evaluator:
         except Exception as error:
             if key not in self.own:
                 raise
-            place = traceback.extract_tb(error.__traceback__)[-1]
-            said = " ".join(f"{type(error).__name__} {str(error)[:200]}".split())
+            frame = traceback.extract_tb(error.__traceback__)[-1]
+            message = " ".join(f"{type(error).__name__} {str(error)[:200]}".split())
             raise InputError(
-                f"eval.extra.{key} raised {said} ({place.filename}, line {place.lineno}): correct it"
+                f"eval.extra.{key} raised {message} ({frame.filename}, line {frame.lineno}): correct it"
             ) from error
         if isinstance(value, Tensor | np.ndarray | np.generic) and math.prod(value.shape) == 1:
             value = value.item()
@@ -146,20 +147,20 @@ class Evaluator:
         return as_unit_range(tensor, torch.float32)
 
 
-def _load(facts: MetricFacts, conditions: Conditions) -> Metric:
-    """Make one of gsbench's own metrics; raises UnavailableError where it lacks something."""
+def _load(facts: MetricFacts, context: MetricContext) -> Metric:
+    """Make one of gsbench's own metrics; raises UnavailableError if its weights or packages are missing."""
     module, _, name = facts.target.rpartition(".")
-    metric: Metric = getattr(importlib.import_module(module), name)(conditions, **facts.options)
+    metric: Metric = getattr(importlib.import_module(module), name)(context, **facts.options)
     return metric
 
 
 def quantize(image: Tensor) -> Tensor:
-    """Round a floating point image in [0, 1] to uint8 as it goes into a PNG: ``floor(clamp(255 x + 0.5, 0, 255))``."""
+    """Round a floating point image in [0, 1] to uint8, as for a PNG: ``floor(clamp(255 x + 0.5, 0, 255))``."""
     return (image * 255 + 0.5).clamp(0, 255).to(torch.uint8)
 
 
 def summarize(per_view: Mapping[str, Mapping[str, float]], unavailable: Mapping[str, str]) -> dict[str, float]:
-    """Means over the views of every metric that all views have and that is not in ``unavailable``."""
+    """The mean over views of every metric that all views have and that is not in ``unavailable``."""
     if not per_view:
         return {}
     views = list(per_view.values())

@@ -1,4 +1,4 @@
-"""Facts of every metric that are known before it is computed, in one table. Loads no torch.
+"""One table of facts about gsbench's metrics, such as labels, units and directions. Loads no torch.
 
 A metric of your own needs no entry here: ``eval.extra.NAME._target_=mine.MyMetric`` (docs/metric.md).
 """
@@ -11,27 +11,27 @@ from typing import Any
 from gsbench.errors import InputError
 from gsbench.runs.trial_record import MetricRecord
 
-MORE = "eval.more"  # lists metrics that are computed only if named there
-LPIPS = "lpips_"  # how the keys of LPIPS start; what follows names the variant, as in ``eval.lpips``
-DECIMALS = 3  # of a metric that does not say
+MORE = "eval.more"  # the setting that lists metrics which are computed only on request
+LPIPS = "lpips_"  # prefix of the keys of LPIPS; the rest is the variant, as in ``eval.lpips``
+DECIMALS = 3  # default of a user's metric
 
 
 @dataclass(frozen=True)
 class MetricFacts:
-    """A metric as tables, verdicts and reports need it."""
+    """The facts about a metric that tables, verdicts and reports need."""
 
     key: str  # in results, per-view files and ``--metrics``
     label: str  # in tables
-    direction: int  # +1: more is better; -1: less is better; 0: not known, and it gets no verdict
+    direction: int  # +1: more is better; -1: less is better; 0: not known, so there is no verdict
     decimals: int  # in tables
     unit: str = ""
-    worthwhile: float | None = None  # the smallest difference worth resolving; about what papers claim as improvements
-    perceptual: bool = False  # meant to follow what people see
-    setting: str = ""  # the setting that asks for it; empty: it is always computed
-    target: str = field(default="", repr=False)  # import path of what computes it
+    worthwhile: float | None = None  # the smallest difference worth resolving, about what papers claim as improvements
+    perceptual: bool = False  # meant to agree with human vision
+    setting: str = ""  # the setting that requests it; empty: it is always computed
+    target: str = field(default="", repr=False)  # import path of the class that computes it
     options: Mapping[str, Any] = field(default_factory=dict, repr=False)  # of that class
-    lowest: float | None = None  # possible value; None: there is no bound, or it is not known
-    highest: float | None = None
+    lowest: float | None = None  # lower bound of its values; None: none or unknown
+    highest: float | None = None  # upper bound
     words: str = ""  # what it measures
 
     @property
@@ -40,11 +40,11 @@ class MetricFacts:
         return f"{self.label} ({self.unit})" if self.unit else self.label
 
 
-MEASURES = "gsbench.eval.measures"  # where what computes them stands
+MEASURES = "gsbench.eval.measures"  # the module of the classes
 
 
 def _lpips(variant: str, label: str, net: str, raw: bool = False) -> MetricFacts:
-    """LPIPS by the network ``net``, fed [-1, 1] as it is defined; ``raw``: fed [0, 1], as the evaluation of 3DGS is."""
+    """LPIPS by the network ``net``, fed [-1, 1] as it is defined, or [0, 1] (``raw``) as in 3DGS's evaluation."""
     return MetricFacts(
         f"{LPIPS}{variant}",
         label,
@@ -62,7 +62,7 @@ def _lpips(variant: str, label: str, net: str, raw: bool = False) -> MetricFacts
 
 
 def _structural(key: str, label: str, direction: int, class_name: str, highest: float, words: str) -> MetricFacts:
-    """A metric of structure without weights, computed where ``eval.more`` names it."""
+    """A metric of structure without weights, computed if ``eval.more`` names it."""
     return MetricFacts(
         key,
         label,
@@ -118,7 +118,7 @@ METRICS = (
     _structural("fsim", "FSIMc", 1, "Fsim", 1.0, "edges and lines: phase congruency, contrast and colour there"),
     _structural("gmsd", "GMSD", -1, "Gmsd", 0.5, "how unevenly the gradients agree"),
 )
-# Of the trained model, not of its pictures; an evaluation measures it by itself.
+# A fact about the trained model instead of its pictures, measured separately in the evaluation.
 FPS = MetricFacts(
     "fps", "speed", 1, 2, "frames/s", setting="eval.fps", lowest=0.0, words="renders of the test views at one size"
 )
@@ -131,22 +131,22 @@ def known_keys() -> tuple[str, ...]:
 
 
 def lpips_variants() -> tuple[str, ...]:
-    """The values that ``eval.lpips`` may list."""
+    """The values allowed in ``eval.lpips``."""
     return tuple(facts.key.removeprefix(LPIPS) for facts in METRICS if facts.key.startswith(LPIPS))
 
 
 def further_keys() -> tuple[str, ...]:
-    """The values that ``eval.more`` may list."""
+    """The values allowed in ``eval.more``."""
     return tuple(facts.key for facts in METRICS if facts.setting == MORE)
 
 
-def find(key: str) -> MetricFacts | None:
-    """The facts of gsbench's own metric ``key``, or None."""
+def find_metric(key: str) -> MetricFacts | None:
+    """The facts about gsbench's metric ``key``, or None."""
     return next((facts for facts in ALL if facts.key == key), None)
 
 
 def facts_of(key: str, metric: object) -> MetricFacts:
-    """The facts of a user's metric, from the attributes of its class; raises InputError for one that cannot be used."""
+    """The facts about a user's metric, from the attributes of its class; raises InputError for a wrong attribute."""
     label, unit = getattr(metric, "label", key), getattr(metric, "unit", "")
     direction, decimals = getattr(metric, "direction", 0), getattr(metric, "decimals", DECIMALS)
     worthwhile = getattr(metric, "worthwhile", None)
@@ -164,12 +164,12 @@ def facts_of(key: str, metric: object) -> MetricFacts:
 
 
 def to_record(facts: MetricFacts) -> MetricRecord:
-    """The facts that results keep of a user's metric, so that tables need not import its class."""
+    """The facts about a user's metric for its results, so that tables need not import its class."""
     return MetricRecord(**{entry.name: getattr(facts, entry.name) for entry in fields(MetricRecord)})
 
 
 def from_record(key: str, record: MetricRecord | None) -> MetricFacts:
-    """The facts of a user's metric from its results; without a record, its key is all that is known."""
+    """The facts about a user's metric from its results; without a record, only its key is known."""
     if record is None:
         return MetricFacts(key, key, 0, DECIMALS)
     return MetricFacts(key, record.label, record.direction, record.decimals, record.unit, record.worthwhile)

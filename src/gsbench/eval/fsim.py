@@ -1,4 +1,4 @@
-"""FSIM with colour (FSIMc): where two images have features, how far these and their contrast agree."""
+"""FSIM with colour (FSIMc), which compares phase congruency, gradients and colour of two images."""
 
 import math
 
@@ -14,24 +14,24 @@ QUADRATURE = (0.211, -0.523, 0.312)  # Q
 SCHARR = (3 / 16, 10 / 16, 3 / 16)
 T_PHASE, T_GRADIENT, T_CHROMA = 0.85, 160.0, 200.0  # T1; T2; T3 = T4, for values from 0 to 255
 CHROMA_POWER = 0.03  # lambda
-SIDE = 256  # px: larger images are shrunk by the whole number nearest to their shorter side over it
-MIN_SIZE = 16  # px; our choice: where not even three of the shortest waves fit, phases mean nothing
+SIDE = 256  # px: larger images are shrunk by the whole number nearest to shorter side / SIDE
+MIN_SIZE = 16  # px; our choice: phases mean nothing in an image of less than three of the shortest waves
 # Phase congruency, Kovesi 1999, "Image features from phase congruency", with the settings of section II of FSIM.
 SCALES, ORIENTATIONS = 4, 4
 SHORTEST_WAVE, WAVE_STEP = 6.0, 2.0  # px; factor between scales
 BANDWIDTH = 0.55  # sigma of a log-Gabor filter over its frequency
 ANGLE_SIGMA = math.pi / ORIENTATIONS / 1.2  # rad
-LOW_PASS, LOW_PASS_ORDER = 0.45, 15  # cycles a px; Butterworth, so that the corners of the spectrum count in no filter
-NOISE_SIGMAS = 2.0  # above the mean of the noise, below which a response counts as none
-NOISE_EXCESS = 1.7  # by which the estimate of the noise is too large for this measure
-TINY = 1e-4  # against 0 / 0, for values from 0 to 255
+LOW_PASS, LOW_PASS_ORDER = 0.45, 15  # cycles per px; a Butterworth filter that removes the corners of the spectrum
+NOISE_SIGMAS = 2.0  # a response below the noise's mean plus so many standard deviations counts as zero
+NOISE_EXCESS = 1.7  # factor by which the noise is overestimated for this measure
+TINY = 1e-4  # avoids 0 / 0; for values from 0 to 255
 
 
 def fsim(image: Tensor, target: Tensor) -> Tensor:
-    """Feature similarity with colour of two images: 1 for identical ones, at least 0.
+    """Feature similarity with colour of two images: 1 for identical images, at least 0.
 
-    Images are [H, W, 3] in [0, 1] or a batch [B, 3, H, W] with values [B]. Not a number where neither image has any
-    feature. Raises ValueError below 16 px a side.
+    Images are [H, W, 3] in [0, 1] or a batch [B, 3, H, W] with values [B]. The value is NaN if neither image has any
+    feature. Raises ValueError for a side below 16 px.
     """
     check_pair(image, target)
     x, y = as_batch(image) * 255, as_batch(target) * 255  # [B, 3, H, W] each
@@ -46,7 +46,7 @@ def fsim(image: Tensor, target: Tensor) -> Tensor:
         chroma = chroma * similarity(mix_channels(x, weights), mix_channels(y, weights), T_CHROMA)
     features = torch.maximum(phase_x, phase_y)
     agreement = similarity(phase_x, phase_y, T_PHASE) * contrast
-    # Opposite colours have a negative similarity, which has no real power: its size counts, as in piq and pyiqa.
+    # Opposite colours have a negative similarity, whose power is not real. As in piq and pyiqa, its size is used.
     local = agreement * chroma.abs() ** CHROMA_POWER
     values = (local * features).flatten(1).sum(dim=1) / features.flatten(1).sum(dim=1)  # [B]
     return values[0] if image.ndim == 3 else values
@@ -59,8 +59,8 @@ def phase_congruency(luminance: Tensor) -> Tensor:
     responses = torch.fft.ifft2(spectrum * filters)  # [B, O, S, H, W], real: even, imaginary: odd
     total = responses.sum(dim=2, keepdim=True)
     direction = total / (total.abs() + TINY)
-    turned = responses * direction.conj()
-    energy = (turned.real - turned.imag.abs()).sum(dim=2)  # [B, O, H, W]
+    aligned = responses * direction.conj()
+    energy = (aligned.real - aligned.imag.abs()).sum(dim=2)  # [B, O, H, W]
     energy = (energy - _noise(responses[:, :, 0], filters)).clamp_min(0).sum(dim=1)  # [B, H, W]
     amplitude = responses.abs().sum(dim=(1, 2))
     return (energy / (amplitude + TINY)).unsqueeze(1)
@@ -68,11 +68,11 @@ def phase_congruency(luminance: Tensor) -> Tensor:
 
 def _noise(finest: Tensor, filters: Tensor) -> Tensor:
     """The energy [B, O, 1, 1] that noise alone would reach, from the responses [B, O, H, W] of the finest scale."""
-    median = finest.abs().square().flatten(2).median(dim=2).values  # [B, O] of a chi-squared variable of 2 degrees
+    median = finest.abs().square().flatten(2).median(dim=2).values  # [B, O]; chi-squared with 2 degrees of freedom
     power = median / math.log(2) / filters[:, 0].square().sum(dim=(1, 2))
-    even = torch.fft.ifft2(filters.sum(dim=1)).real  # [O, H, W] in space
+    even = torch.fft.ifft2(filters.sum(dim=1)).real  # [O, H, W], the filters in space
     area = even.shape[1] * even.shape[2]
-    tau = (power * even.square().sum(dim=(1, 2)) * area).sqrt()  # of the Rayleigh distribution
+    tau = (power * even.square().sum(dim=(1, 2)) * area).sqrt()  # parameter of the Rayleigh distribution
     threshold = tau * (math.sqrt(math.pi / 2) + NOISE_SIGMAS * math.sqrt(2 - math.pi / 2))
     return (threshold / NOISE_EXCESS)[..., None, None]
 
@@ -83,7 +83,7 @@ def _log_gabor_filters(images: Tensor) -> Tensor:
     down, across = torch.meshgrid(along, indexing="ij")  # [H, W] each
     radius = torch.hypot(down, across)
     low_pass = 1 / (1 + (radius / LOW_PASS) ** (2 * LOW_PASS_ORDER))
-    radius[0, 0] = 1  # frequency 0, which no filter passes
+    radius[0, 0] = 1  # avoids log(0); the filters are set to 0 at this frequency below
     angle = torch.atan2(-down, across)
     radial = []
     for scale in range(SCALES):
@@ -93,13 +93,13 @@ def _log_gabor_filters(images: Tensor) -> Tensor:
         radial.append(passed)
     angular = []
     for orientation in range(ORIENTATIONS):
-        away = angle - orientation * math.pi / ORIENTATIONS
-        away = torch.atan2(away.sin(), away.cos())  # in [-pi, pi]
-        angular.append(torch.exp(-(away**2) / (2 * ANGLE_SIGMA**2)))
+        difference = angle - orientation * math.pi / ORIENTATIONS
+        difference = torch.atan2(difference.sin(), difference.cos())  # in [-pi, pi]
+        angular.append(torch.exp(-(difference**2) / (2 * ANGLE_SIGMA**2)))
     return torch.stack(angular).unsqueeze(1) * torch.stack(radial)
 
 
 def _frequencies(size: int, like: Tensor) -> Tensor:
-    """Cycles a px of the terms of a Fourier transform; over size - 1 where it is odd, so that both ends are 0.5."""
+    """Frequencies of a Fourier transform in cycles per px; an odd size is reduced by 1, so that both ends are 0.5."""
     steps = torch.arange(size, dtype=like.dtype, device=like.device) - size // 2  # [size]
     return torch.fft.ifftshift(steps / (size - size % 2))

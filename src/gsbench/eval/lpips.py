@@ -1,7 +1,7 @@
 """LPIPS v0.1 (Zhang et al. 2018, "The unreasonable effectiveness of deep features as a perceptual metric").
 
-The feature stacks of VGG16, AlexNet and SqueezeNet 1.1 are written here as plain layers in torchvision's order, so that
-its published ImageNet weights load into them; the learned linear heads are those of LPIPS v0.1.
+The layers of VGG16, AlexNet and SqueezeNet 1.1 are in torchvision's order, so that torchvision's ImageNet weights load
+into them without torchvision. The learned linear heads are those of LPIPS v0.1.
 """
 
 from collections.abc import Callable, Mapping
@@ -19,18 +19,18 @@ from gsbench.weights import MissingWeights, WeightsFile, find_weights, load_stat
 SHIFT = (-0.030, -0.088, -0.188)
 SCALE = (0.458, 0.448, 0.450)
 NORM_EPSILON = 1e-10  # added to the length of a feature vector before dividing by it
-ROWS_AT_A_TIME = 64  # feature rows compared at once: bounds the memory of the comparison
+ROWS_AT_A_TIME = 64  # feature rows compared at once, to limit the memory
 
 
 @dataclass(frozen=True)
 class Backbone:
-    """One feature stack: its layers, the indices after which it is tapped, and where its weights come from."""
+    """A network's convolutional layers, the layers whose output LPIPS compares, and the weights files."""
 
     build: Callable[[], nn.Sequential]
-    taps: tuple[int, ...]
+    taps: tuple[int, ...]  # indices of the layers whose output is compared
     channels: tuple[int, ...]  # of each tap
-    min_size: int  # px; a shorter side leaves some layer without output
-    features: tuple[WeightsFile, ...]  # any of them; the first is the one to download
+    min_size: int  # px; with a shorter side, some layer has no output
+    features: tuple[WeightsFile, ...]  # alternatives; the first is downloaded
     heads: WeightsFile
 
 
@@ -107,7 +107,7 @@ def _heads(net: str, sha256: str) -> WeightsFile:
     )
 
 
-# The convolutional part of torchvision's file alone, a copy that is small enough to keep beside a project.
+# A copy of the convolutional layers of torchvision's file, small enough to keep in a project.
 SQUEEZE_FEATURES_ONLY = WeightsFile(
     ("squeezenet1_1_features.pth",),
     None,
@@ -158,8 +158,8 @@ BACKBONES: dict[str, Backbone] = {
 class Lpips:
     """One LPIPS network, ready to compare images; it computes no gradients.
 
-    ``features`` holds the backbone's weights, keyed as torchvision's model or as its ``features`` part alone (keys of a
-    classifier are ignored); ``heads`` holds ``lin{k}.model.1.weight`` [1, C, 1, 1] for every tap k.
+    ``features`` holds the backbone's weights with the keys of torchvision's model, or of its ``features`` alone; keys
+    of a classifier are ignored. ``heads`` holds ``lin{k}.model.1.weight`` [1, C, 1, 1] for every tap k.
     """
 
     def __init__(
@@ -182,12 +182,12 @@ class Lpips:
 
     @torch.no_grad()
     def __call__(self, first: Tensor, second: Tensor, mask: Tensor | None = None) -> Tensor:
-        """Distances [B] of two batches [B, 3, H, W], which are fed to the network as they are.
+        """Distances [B] of two batches [B, 3, H, W], which are fed to the network unchanged.
 
         LPIPS is defined for inputs in [-1, 1]: pass ``2 * x - 1`` for images in [0, 1]. The evaluation of 3DGS passes
-        [0, 1] itself, which is what a metric named ``..._raw`` does here.
+        images in [0, 1] unchanged, as the metrics named ``..._raw`` do.
 
-        With a ``mask`` [H, W], each layer's mean over places is weighted by the share of a place's pixels that count.
+        With a ``mask`` [H, W], each position of a layer is weighted by the share of its pixels that count.
         """
         if first.shape != second.shape or first.ndim != 4 or first.shape[1] != 3:
             raise ValueError(f"lpips compares batches [B, 3, H, W], got {tuple(first.shape)} and {tuple(second.shape)}")
@@ -197,7 +197,8 @@ class Lpips:
         return torch.stack([self._pair(a[None], b[None], weights) for a, b in zip(first, second, strict=True)])  # [B]
 
     def _pair(self, first: Tensor, second: Tensor, weights: Tensor | None = None) -> Tensor:
-        """The distance [] of two images [1, 3, H, W], which pass the layers in step, so that no features are kept."""
+        """The distance [] of two images [1, 3, H, W]."""
+        # Both images pass a layer before the next one, so that features of earlier layers need not be kept.
         first, second = (
             (image.to(self.device, torch.float32) - self._shift) / self._scale for image in (first, second)
         )
@@ -207,23 +208,26 @@ class Lpips:
             first, second = layer(first), layer(second)  # [1, C, h, w] each
             if index in self.backbone.taps:
                 size = first.shape[2], first.shape[3]
-                here = None if weights is None else F.adaptive_avg_pool2d(weights, size)[0, 0]  # [h, w]
-                total = total + _feature_distance(first, second, next(heads), here)
+                layer_weights = None if weights is None else F.adaptive_avg_pool2d(weights, size)[0, 0]  # [h, w]
+                total = total + _feature_distance(first, second, next(heads), layer_weights)
         return total
 
 
 def load_lpips(
     net: str, folder: Path | None = None, download: bool = True, device: torch.device | str = "cpu"
 ) -> Lpips:
-    """An LPIPS network from weights in ``folder``, the usual places or a download; may raise ``MissingWeights``."""
+    """Load an LPIPS network; its weights are searched in ``folder`` and the usual places, else downloaded.
+
+    Raises ``MissingWeights`` if they are not found.
+    """
     backbone = BACKBONES[net]
-    features = find_any(backbone.features, folder, download)
+    features = find_first_weights(backbone.features, folder, download)
     heads = find_weights(backbone.heads, folder, download)
     return Lpips(net, load_state(features), load_state(heads), device)
 
 
-def find_any(specs: tuple[WeightsFile, ...], folder: Path | None, download: bool) -> Path:
-    """The first of ``specs`` that is at hand; else the first of all, downloaded where allowed."""
+def find_first_weights(specs: tuple[WeightsFile, ...], folder: Path | None, download: bool) -> Path:
+    """Find one of the alternatives ``specs`` on this machine; else download the first, if allowed."""
     for spec in specs[1:]:
         try:
             return find_weights(spec, folder, download=False)
@@ -235,12 +239,12 @@ def find_any(specs: tuple[WeightsFile, ...], folder: Path | None, download: bool
 def _feature_distance(first: Tensor, second: Tensor, head: Tensor, weights: Tensor | None = None) -> Tensor:
     """Spatial mean of the weighted squared difference of unit feature vectors; maps [1, C, h, w], head [C].
 
-    ``weights`` [h, w] are those of the places in the mean; None: all equal.
+    ``weights`` [h, w] weight the positions in the mean; None: all equal.
     """
     if weights is not None:
         first, second = (x / (x.square().sum(dim=1, keepdim=True).sqrt() + NORM_EPSILON) for x in (first, second))
-        places = ((first - second).square()[0] * head[:, None, None]).sum(dim=0)  # [h, w]
-        return (places * weights).sum().double() / weights.sum().double()
+        distances = ((first - second).square()[0] * head[:, None, None]).sum(dim=0)  # [h, w]
+        return (distances * weights).sum().double() / weights.sum().double()
     total = torch.zeros((), dtype=torch.float64 if first.device.type == "cpu" else torch.float32, device=first.device)
     for a, b in zip(first[0].split(ROWS_AT_A_TIME, dim=1), second[0].split(ROWS_AT_A_TIME, dim=1), strict=True):
         a = a / (a.square().sum(dim=0).sqrt() + NORM_EPSILON)  # [C, rows, w]
@@ -251,7 +255,7 @@ def _feature_distance(first: Tensor, second: Tensor, head: Tensor, weights: Tens
 
 
 def load_features(stack: nn.Sequential, state: Mapping[str, Tensor], who: str) -> None:
-    """Load a backbone's published weights into its layers; raises InputError naming ``who`` for those of another."""
+    """Load published weights into a backbone; raises InputError naming ``who`` if they are for another network."""
     expected = stack.state_dict().keys()
     renamed = {key.removeprefix("features."): value for key, value in state.items()}
     missing = [key for key in expected if key not in renamed]

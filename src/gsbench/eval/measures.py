@@ -1,4 +1,4 @@
-"""gsbench's own metrics as the evaluator calls them, each under the conventions of a protocol."""
+"""gsbench's own metrics as classes, which apply the conventions of a protocol."""
 
 import importlib.util
 import math
@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gsbench.eval import fsim, metrics, multiscale
-from gsbench.eval.images import exact
+from gsbench.eval.images import in_double_precision
 from gsbench.eval.lpips import Lpips, load_lpips
 from gsbench.eval.metric import UnavailableError
 from gsbench.eval.metrics import flip, flip_map, psnr
@@ -20,36 +20,36 @@ from gsbench.weights import MissingWeights
 
 
 @dataclass(frozen=True)
-class Conditions:
-    """Conditions that gsbench's metrics share; ``weights`` is a folder to look in first."""
+class MetricContext:
+    """Conditions that gsbench's metrics share; ``weights`` is the folder that is searched first."""
 
     protocol: Protocol
     device: torch.device
     weights: Path | None = None
     download: bool = True
-    networks: dict[str, Lpips | MissingWeights] = field(default_factory=dict, repr=False)  # of LPIPS, each loaded once
+    networks: dict[str, Lpips | MissingWeights] = field(default_factory=dict, repr=False)  # LPIPS, each loaded once
 
     def network(self, net: str) -> Lpips:
-        """The LPIPS network ``net``; raises UnavailableError where its weights are not to be had."""
+        """The LPIPS network ``net``; raises UnavailableError if its weights are missing."""
         if net not in self.networks:
             try:
                 self.networks[net] = load_lpips(net, self.weights, self.download, self.device)
             except MissingWeights as error:
                 self.networks[net] = error
-        found = self.networks[net]
-        if isinstance(found, MissingWeights):
-            raise UnavailableError(str(found), awaited=True)
-        return found
+        network = self.networks[net]
+        if isinstance(network, MissingWeights):
+            raise UnavailableError(str(network), awaited=True)
+        return network
 
 
 class Psnr:
-    """Peak signal-to-noise ratio, dB; at most the protocol's cap, which identical images get."""
+    """Peak signal-to-noise ratio in dB, at most the protocol's cap (identical images have an infinite PSNR)."""
 
-    def __init__(self, conditions: Conditions) -> None:
-        self._cap = conditions.protocol.psnr_cap
+    def __init__(self, context: MetricContext) -> None:
+        self._cap = context.protocol.psnr_cap
 
     def measure(self, image: Tensor, truth: Tensor) -> float:
-        return min(float(psnr(exact(image), exact(truth))), self._cap)
+        return min(float(psnr(in_double_precision(image), in_double_precision(truth))), self._cap)
 
     def measure_masked(self, image: Tensor, truth: Tensor, mask: Tensor) -> float:
         return self.measure(image[mask][None], truth[mask][None])
@@ -58,21 +58,21 @@ class Psnr:
 class Ssim:
     """Structural similarity with the protocol's padding."""
 
-    def __init__(self, conditions: Conditions) -> None:
-        self._padding = conditions.protocol.ssim_padding
+    def __init__(self, context: MetricContext) -> None:
+        self._padding = context.protocol.ssim_padding
 
     def measure(self, image: Tensor, truth: Tensor) -> float:
-        return float(ssim(exact(image), exact(truth), self._padding))
+        return float(ssim(in_double_precision(image), in_double_precision(truth), self._padding))
 
     def measure_masked(self, image: Tensor, truth: Tensor, mask: Tensor) -> float:
-        return float(masked_ssim(exact(image), exact(truth), mask, self._padding))
+        return float(masked_ssim(in_double_precision(image), in_double_precision(truth), mask, self._padding))
 
 
 class LpipsMetric:
-    """LPIPS by one network, fed [-1, 1] as it is defined or, ``raw``, [0, 1]."""
+    """LPIPS by one network, fed [-1, 1] as it is defined, or [0, 1] if ``raw``."""
 
-    def __init__(self, conditions: Conditions, net: str, raw: bool) -> None:
-        self._network, self._raw = conditions.network(net), raw
+    def __init__(self, context: MetricContext, net: str, raw: bool) -> None:
+        self._network, self._raw = context.network(net), raw
 
     def measure(self, image: Tensor, truth: Tensor) -> float:
         return self._distance(image, truth)
@@ -81,7 +81,7 @@ class LpipsMetric:
         return self._distance(image, truth, mask)
 
     def _distance(self, image: Tensor, truth: Tensor, mask: Tensor | None = None) -> float:
-        _need_size(image, self._network.backbone.min_size)
+        _require_size(image, self._network.backbone.min_size)
         first, second = (x.permute(2, 0, 1).unsqueeze(0) for x in (image, truth))  # [1, 3, H, W] each
         if not self._raw:
             first, second = 2 * first - 1, 2 * second - 1
@@ -91,11 +91,11 @@ class LpipsMetric:
 class Flip:
     """FLIP for the protocol's viewer."""
 
-    def __init__(self, conditions: Conditions) -> None:
+    def __init__(self, context: MetricContext) -> None:
         if importlib.util.find_spec("flip_evaluator") is None:
             reason = "the package flip-evaluator is not installed: pip install flip-evaluator"
             raise UnavailableError(reason, awaited=True)
-        self._ppd = conditions.protocol.flip_ppd
+        self._ppd = context.protocol.flip_ppd
 
     def measure(self, image: Tensor, truth: Tensor) -> float:
         return float(flip(image, truth, self._ppd))
@@ -104,41 +104,41 @@ class Flip:
         return float(flip_map(image, truth, self._ppd)[mask].mean())
 
 
-class Structural:
-    """A metric without weights that looks at structure; of each, its function of two images and its smallest side."""
+class StructuralMetric:
+    """Base of metrics of structure without weights, which no protocol changes: their authors' definitions hold."""
 
     function: Callable[[Tensor, Tensor], Tensor]
-    smallest: int  # px
+    min_side: int  # px
 
-    def __init__(self, conditions: Conditions) -> None:
-        pass  # no protocol says anything of these: their authors' definitions hold
+    def __init__(self, context: MetricContext) -> None:
+        pass
 
     def measure(self, image: Tensor, truth: Tensor) -> float:
-        _need_size(image, self.smallest)
-        value = float(type(self).function(exact(image), exact(truth)))
+        _require_size(image, self.min_side)
+        value = float(type(self).function(in_double_precision(image), in_double_precision(truth)))
         if not math.isfinite(value):
             raise UnavailableError("a view is flat: it has no structure to compare")
         return value
 
 
-class MsSsim(Structural):
-    function, smallest = staticmethod(multiscale.ms_ssim), multiscale.MIN_SIZE
+class MsSsim(StructuralMetric):
+    function, min_side = staticmethod(multiscale.ms_ssim), multiscale.MIN_SIZE
 
 
-class IwSsim(Structural):
-    function, smallest = staticmethod(multiscale.iw_ssim), multiscale.MIN_SIZE
+class IwSsim(StructuralMetric):
+    function, min_side = staticmethod(multiscale.iw_ssim), multiscale.MIN_SIZE
 
 
-class Fsim(Structural):
-    function, smallest = staticmethod(fsim.fsim), fsim.MIN_SIZE
+class Fsim(StructuralMetric):
+    function, min_side = staticmethod(fsim.fsim), fsim.MIN_SIZE
 
 
-class Gmsd(Structural):
-    function, smallest = staticmethod(metrics.gmsd), metrics.GMSD_MIN_SIZE
+class Gmsd(StructuralMetric):
+    function, min_side = staticmethod(metrics.gmsd), metrics.GMSD_MIN_SIZE
 
 
-def _need_size(image: Tensor, smallest: int) -> None:
-    """Raise UnavailableError for a view [H, W, 3] with a side below ``smallest`` px."""
+def _require_size(image: Tensor, min_side: int) -> None:
+    """Raise UnavailableError for a view [H, W, 3] with a side below ``min_side`` px."""
     height, width = image.shape[:2]
-    if min(height, width) < smallest:
-        raise UnavailableError(f"a view is {width}x{height} px, below {smallest} px a side")
+    if min(height, width) < min_side:
+        raise UnavailableError(f"a view is {width}x{height} px, below {min_side} px a side")

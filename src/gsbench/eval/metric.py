@@ -1,4 +1,4 @@
-"""Contract of a metric: a class that measures one image against another. docs/metric.md has an example."""
+"""Contract of a metric, a class that compares an image with its photograph. docs/metric.md has an example."""
 
 from typing import Protocol, runtime_checkable
 
@@ -8,11 +8,11 @@ from torch import Tensor
 class Metric(Protocol):
     """Measures a render against its photograph.
 
-    A class of the user's own says as class attributes how its values are to be read: ``direction`` (1, -1 or 0),
-    ``label``, ``unit``, ``decimals`` and ``worthwhile``, as `gsbench.eval.facts.MetricFacts` explains them.
+    Class attributes say how to read its values: ``direction`` (1, -1 or 0), ``label``, ``unit``, ``decimals`` and
+    ``worthwhile``. `gsbench.eval.facts.MetricFacts` explains them.
 
     Examples:
-        The largest error of any pixel, in 8-bit levels; less is better:
+        The largest error of any pixel, in 8-bit levels (less is better):
 
         >>> import torch
         >>> class LargestError:
@@ -29,8 +29,8 @@ class Metric(Protocol):
     def measure(self, image: Tensor, truth: Tensor) -> float:
         """The value of one view; both are [H, W, 3], float32 in [0, 1], on the evaluation's device.
 
-        They hold what the protocol compares: images rounded to 8 bits. May raise `UnavailableError`. Where a mask
-        ignores pixels, both images have the same there.
+        The render is rounded to 8 bits. Both images have equal pixels where a mask ignores them. May raise
+        `UnavailableError`.
         """
         ...
 
@@ -39,7 +39,7 @@ class Metric(Protocol):
 class MaskedMetric(Metric, Protocol):
     """Metric that can leave out the pixels that a mask ignores.
 
-    Any other is given equal pixels there, and counts them.
+    Other metrics include these pixels, which are equal in both images.
     """
 
     def measure_masked(self, image: Tensor, truth: Tensor, mask: Tensor) -> float:
@@ -48,9 +48,9 @@ class MaskedMetric(Metric, Protocol):
 
 
 class UnavailableError(Exception):
-    """A metric that cannot be computed; its text, one line, is the reason that results and tables give.
+    """Raised for a metric that cannot be computed; its message, one line, is the reason in results and tables.
 
-    ``awaited``, for gsbench's own metrics: what is missing may come, such as weights, and then the metric is computed.
+    ``awaited`` (gsbench's own metrics only) says that the metric can be computed after an installation or a download.
     """
 
     def __init__(self, reason: str, awaited: bool = False) -> None:

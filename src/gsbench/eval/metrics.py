@@ -1,7 +1,7 @@
-"""Image quality metrics by their exact definitions: PSNR, FLIP and GMSD, each as one value per image.
+"""PSNR, FLIP and GMSD by their exact definitions, each with one value per image.
 
 Images are torch tensors in [0, 1], either one image [H, W, 3] (the value is a 0-dimensional tensor) or a batch
-[B, 3, H, W] (the values are [B]). SSIM and LPIPS have modules of their own.
+[B, 3, H, W] (the values are [B]).
 """
 
 import torch
@@ -15,7 +15,7 @@ from gsbench.eval.protocol import FLIP_PPD
 def psnr(image: Tensor, target: Tensor) -> Tensor:
     """Peak signal-to-noise ratio in dB, from the mean squared error over all pixels and channels of an image.
 
-    Identical images give infinity; a protocol decides how that is reported.
+    Identical images give infinity, which a protocol replaces in reports.
     """
     check_pair(image, target)
     squared = (image - target).square()
@@ -26,8 +26,8 @@ def psnr(image: Tensor, target: Tensor) -> Tensor:
 def flip(image: Tensor, target: Tensor, ppd: float = FLIP_PPD) -> Tensor:
     """Mean FLIP error of sRGB images (0 identical, 1 worst) for a viewer who sees ``ppd`` pixels per degree.
 
-    Andersson et al. 2020, "FLIP: a difference evaluator for alternating images", computed by NVIDIA's own library,
-    ``flip-evaluator``; raises ModuleNotFoundError where that is not installed.
+    Andersson et al. 2020, "FLIP: a difference evaluator for alternating images", computed by NVIDIA's library
+    ``flip-evaluator``. Raises ModuleNotFoundError if it is not installed.
     """
     import flip_evaluator
 
@@ -53,17 +53,16 @@ def flip_map(image: Tensor, target: Tensor, ppd: float = FLIP_PPD) -> Tensor:
 
 
 PREWITT = (1 / 3, 1 / 3, 1 / 3)
-CONSTANT = 170 / 255**2  # their c = 170, for values from 0 to 255
-GMSD_MIN_SIZE = 2  # px: one mean of 2x2
+CONSTANT = 170 / 255**2  # the authors' c = 170 is for values from 0 to 255
+GMSD_MIN_SIZE = 2  # px: one block of 2x2
 
 
 def gmsd(image: Tensor, target: Tensor) -> Tensor:
     """Gradient magnitude similarity deviation of the luminance: 0 for identical images, less is better.
 
     Xue, Zhang, Mou and Bovik 2014, "Gradient magnitude similarity deviation: a highly efficient perceptual image
-    quality index", section II: means of 2x2 px (zeros beyond an odd side), gradients by Prewitt's filter, their
-    similarity at each pixel, and its standard deviation. Images are [H, W, 3] in [0, 1] or a
-    batch [B, 3, H, W] with values [B].
+    quality index", section II. Images are averaged over 2x2 px (odd sides padded with zeros), Prewitt's filter gives
+    the gradients, and the value is the standard deviation of their similarity over pixels.
     """
     check_pair(image, target)
     check_size(as_batch(image), GMSD_MIN_SIZE, "GMSD")

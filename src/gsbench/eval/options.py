@@ -1,4 +1,4 @@
-"""The settings of an evaluation: protocol, metrics, and the one that a verdict is declared to be about."""
+"""The settings of an evaluation: the protocol, the metrics, and the declared metric of the verdict."""
 
 import re
 from collections.abc import Mapping
@@ -9,18 +9,18 @@ from annotated_types import Interval, Len, Predicate, doc
 from pydantic import PositiveInt
 
 from gsbench.errors import InputError
-from gsbench.eval.facts import FPS, LPIPS, MORE, find, further_keys, known_keys, lpips_variants
+from gsbench.eval.facts import FPS, LPIPS, MORE, find_metric, further_keys, known_keys, lpips_variants
 from gsbench.eval.protocol import PROTOCOLS
 from gsbench.runs.declaration import AT, QUESTIONS, metric_and_question
 from gsbench.settings import MISSING, FolderName, PathName, check_settings
 from gsbench.words import closest
 
 METRIC_NAME = re.compile(r"[a-z][a-z0-9_]*")
-TAKEN_NAMES = (*known_keys(), "view", "lpips")  # of metrics, and what else a table of views or a list of metrics means
+RESERVED_NAMES = (*known_keys(), "view", "lpips")  # keys of metrics, the column of views, and the protocol's LPIPS
 
 
-def are_different(values: list[Any]) -> bool:
-    """Return whether no value stands twice in a list."""
+def all_different(values: list[Any]) -> bool:
+    """Return whether no value occurs twice in a list."""
     return len(set(values)) == len(values)
 
 
@@ -41,28 +41,28 @@ FurtherMetric = Annotated[str, Predicate(lambda name: name in further_keys())]
 class EvalConfig:
     name: str = MISSING
     protocol: ProtocolName = MISSING
-    lpips: Annotated[list[LpipsVariant], Predicate(are_different), doc(LPIPS_RULE)] = field(
+    lpips: Annotated[list[LpipsVariant], Predicate(all_different), doc(LPIPS_RULE)] = field(
         default_factory=lambda: list(lpips_variants())
     )
     flip: bool = True
-    more: Annotated[list[FurtherMetric], Predicate(are_different), doc(MORE_RULE)] = field(default_factory=list)
+    more: Annotated[list[FurtherMetric], Predicate(all_different), doc(MORE_RULE)] = field(default_factory=list)
     extra: dict[str, Any] = field(default_factory=dict)  # metrics of your own: {name: {_target_: mine.MyMetric}}
-    at: Annotated[list[PositiveInt], Predicate(are_different), doc(AT_RULE)] = field(default_factory=list)
-    # The metric of the verdict, declared before results are seen; psnr@extrapolation of one question; null: none was.
+    at: Annotated[list[PositiveInt], Predicate(all_different), doc(AT_RULE)] = field(default_factory=list)
+    # The metric of the verdict, declared before results are seen (psnr@extrapolation: for one question); null: none.
     primary: str | None = None
     controls: Annotated[dict[str, FolderName], doc(CONTROLS_RULE)] = field(default_factory=dict)  # {longaxis: absgrad}
-    maps: bool = False  # picture large Gaussians over a test view
-    fps: Annotated[list[Side], Len(2, 2), doc(FPS_RULE)] | None = None  # [1920, 1080]: speed at this size, px
+    maps: bool = False  # draw the large Gaussians over a test view
+    fps: Annotated[list[Side], Len(2, 2), doc(FPS_RULE)] | None = None  # [1920, 1080]: the speed at this size, px
     weights: PathName | None = None  # folder; null: $GSBENCH_WEIGHTS, then the torch hub cache
     download: bool = True  # fetch missing weights, checked by checksum
 
     def __post_init__(self) -> None:
         check_settings(self, "eval")
         for name, options in self.extra.items():
-            if not METRIC_NAME.fullmatch(name) or name in TAKEN_NAMES:
+            if not METRIC_NAME.fullmatch(name) or name in RESERVED_NAMES:
                 raise InputError(
                     f"eval.extra.{name}: name your metric in small letters, digits and underscores, and none of "
-                    f"{', '.join(TAKEN_NAMES)}"
+                    f"{', '.join(RESERVED_NAMES)}"
                 )
             if not isinstance(options, Mapping) or "_target_" not in options:
                 raise InputError(f"eval.extra.{name} must name a class, as eval.extra.{name}._target_=mine.MyMetric")
@@ -75,7 +75,7 @@ class EvalConfig:
 
     def _check_primary(self, key: str) -> None:
         """Raise InputError unless one of gsbench's own metrics, which these settings ask for, has this key."""
-        facts = find(key)
+        facts = find_metric(key)
         if facts is None:
             known = [*known_keys(), *self.extra]
             raise InputError(

@@ -1,4 +1,4 @@
-"""Pictures that some program rendered: matching them with photographs by name, without guesses, and measuring them."""
+"""Matching the pictures that a program rendered with photographs by name, without guesses, and measuring them."""
 
 import re
 from collections import defaultdict
@@ -20,8 +20,9 @@ BY_ORDER = "by order"
 
 @dataclass(frozen=True)
 class Matching:
-    """The picture of each photograph; ``rule`` says by what names were equal ("" where they are the same), and
-    ``left_out`` names the pictures that belong to none.
+    """The picture of each photograph. ``left_out`` are the pictures without a photograph.
+
+    ``rule`` says how the names were compared; it is "" if they are the same.
     """
 
     pairs: Mapping[str, str]
@@ -30,34 +31,36 @@ class Matching:
 
 
 def match_pictures(photographs: Sequence[str], pictures: Sequence[str], by_order: str = "--by-order") -> Matching:
-    """Match names (relative paths) by the first rule under which every photograph has exactly one picture.
+    """Match names (relative paths) by the first rule under which every photograph has a picture.
 
-    The rules, from strict to loose: the same name; apart from the extension; with folders written as part of the name;
-    apart from case; apart from a beginning and an end that all names of a folder share; apart from leading zeros; and
-    the last four without the folders. Raises `InputError` where a photograph has several pictures under the strictest
-    rule that finds any for all, or where no rule finds one for each; ``by_order`` is how one asks for `match_by_order`.
+    The rules, from strict to loose, compare names: as they are; without the extension; with folders written as part of
+    the name; without case; without a start and an end that all names share; without leading zeros; and by the last
+    three rules without folders. Raises `InputError` if that rule gives a photograph several pictures, or if no rule
+    gives each a picture. ``by_order`` is the option that error messages suggest for `match_by_order`.
     """
-    for rule, keys in _RULES.items():
-        of_photographs, of_pictures = keys(photographs), keys(pictures)
-        if len(set(of_photographs.values())) < len(photographs):
-            continue  # under this rule the photographs themselves cannot be told apart
+    for rule, make_keys in _RULES.items():
+        photograph_keys, picture_keys = make_keys(photographs), make_keys(pictures)
+        if len(set(photograph_keys.values())) < len(photographs):
+            continue  # this rule gives two photographs the same key
         by_key = defaultdict(list)
         for picture in pictures:
-            by_key[of_pictures[picture]].append(picture)
-        if not all(key in by_key for key in of_photographs.values()):
+            by_key[picture_keys[picture]].append(picture)
+        if not all(key in by_key for key in photograph_keys.values()):
             continue
-        found = {photograph: by_key[key] for photograph, key in of_photographs.items()}
-        for photograph, candidates in found.items():
+        matches = {photograph: by_key[key] for photograph, key in photograph_keys.items()}
+        for photograph, candidates in matches.items():
             if len(candidates) > 1:
                 raise InputError(f"{', '.join(sorted(candidates))} all fit the photograph {photograph}: leave one")
-        pairs = {photograph: candidates[0] for photograph, candidates in found.items()}
+        pairs = {photograph: candidates[0] for photograph, candidates in matches.items()}
         return Matching(pairs, rule, tuple(sorted(set(pictures) - set(pairs.values()))))
     raise InputError(_no_match(photographs, pictures, by_order))
 
 
 def match_by_order(photographs: Sequence[str], pictures: Sequence[str]) -> Matching:
-    """The k-th picture for the k-th photograph, both sorted with numbers by value; raises `InputError` unless equally
-    many."""
+    """Match the k-th picture with the k-th photograph, both sorted with numbers by value.
+
+    Raises `InputError` if their numbers differ.
+    """
     if len(photographs) != len(pictures):
         raise InputError(
             f"there are {counted(len(pictures), 'picture')} for {counted(len(photographs), 'photograph')}: by order, "
@@ -70,9 +73,9 @@ def match_by_order(photographs: Sequence[str], pictures: Sequence[str]) -> Match
 
 def _no_match(photographs: Sequence[str], pictures: Sequence[str], by_order: str) -> str:
     missing = list(photographs)
-    for keys in _RULES.values():  # the rule that came closest
-        found, wanted = set(keys(pictures).values()), keys(photographs)
-        missing = min(missing, [name for name in photographs if wanted[name] not in found], key=len)
+    for make_keys in _RULES.values():  # report the rule that left the fewest photographs without a picture
+        picture_keys, photograph_keys = set(make_keys(pictures).values()), make_keys(photographs)
+        missing = min(missing, [name for name in photographs if photograph_keys[name] not in picture_keys], key=len)
     called = some_of(sorted(pictures)) or "there are none"
     hint = f"; {by_order} takes them as they are sorted" if len(pictures) == len(photographs) else ""
     return (
@@ -94,7 +97,7 @@ def _base(name: str) -> str:
 
 
 def _stripped(words: Mapping[str, str]) -> dict[str, str]:
-    """The words without the beginning and the end that all of them share; digits are never part of these."""
+    """The words without the start and the end that all of them share, which never contain digits next to the rest."""
     if len(words) < 2:
         return dict(words)
     texts = list(words.values())
@@ -118,14 +121,14 @@ def _by_value(name: str) -> list[tuple[int, int, str]]:
     return [(1, int(part), part) if part.isdigit() else (0, 0, part) for part in parts]
 
 
-Keys = Callable[[Sequence[str]], dict[str, str]]
+KeyFunction = Callable[[Sequence[str]], dict[str, str]]  # names are equal under a rule if their keys are
 
 
-def _each(key: Callable[[str], str]) -> Keys:
+def _exactly(key: Callable[[str], str]) -> KeyFunction:
     return lambda names: {name: key(name) for name in names}
 
 
-def _loosely(key: Callable[[str], str], *steps: Callable[[Mapping[str, str]], dict[str, str]]) -> Keys:
+def _without_case(key: Callable[[str], str], *steps: Callable[[Mapping[str, str]], dict[str, str]]) -> KeyFunction:
     def keys(names: Sequence[str]) -> dict[str, str]:
         words = {name: key(name).casefold() for name in names}
         for step in steps:
@@ -135,22 +138,22 @@ def _loosely(key: Callable[[str], str], *steps: Callable[[Mapping[str, str]], di
     return keys
 
 
-_RULES: dict[str, Keys] = {
-    SAME_NAMES: _each(lambda name: name),
-    "apart from the extension": _each(_stem),
-    "with folders as part of the name": _each(_flat),
-    "apart from case": _loosely(_flat),
-    "apart from what all names begin or end with": _loosely(_flat, _stripped),
-    "apart from leading zeros": _loosely(_flat, _stripped, _unpadded),
-    "apart from folders": _loosely(_base),
-    "apart from folders and what all names begin or end with": _loosely(_base, _stripped),
-    "apart from folders and leading zeros": _loosely(_base, _stripped, _unpadded),
+_RULES: dict[str, KeyFunction] = {
+    SAME_NAMES: _exactly(lambda name: name),
+    "apart from the extension": _exactly(_stem),
+    "with folders as part of the name": _exactly(_flat),
+    "apart from case": _without_case(_flat),
+    "apart from what all names begin or end with": _without_case(_flat, _stripped),
+    "apart from leading zeros": _without_case(_flat, _stripped, _unpadded),
+    "apart from folders": _without_case(_base),
+    "apart from folders and what all names begin or end with": _without_case(_base, _stripped),
+    "apart from folders and leading zeros": _without_case(_base, _stripped, _unpadded),
 }
 
 
 @dataclass(frozen=True)
-class Pair:
-    """A view with the files of its photograph and of what was rendered for it, and of its mask, if it has one."""
+class PicturePair:
+    """A view with the files of its photograph, of the picture rendered for it, and of its mask, if it has one."""
 
     view: str
     photograph: Path
@@ -158,8 +161,8 @@ class Pair:
     mask: Path | None = None
 
 
-def check_sizes(pairs: Sequence[Pair]) -> None:
-    """Raise `InputError` for a picture of another size than its photograph: none is ever resized."""
+def check_picture_sizes(pairs: Sequence[PicturePair]) -> None:
+    """Raise `InputError` for a picture whose size differs from its photograph's: pictures are never resized."""
     for pair in pairs:
         (width, height), (wanted_width, wanted_height) = image_size(pair.picture), image_size(pair.photograph)
         if (width, height) != (wanted_width, wanted_height):
@@ -169,9 +172,11 @@ def check_sizes(pairs: Sequence[Pair]) -> None:
             )
 
 
-def measure(pairs: Sequence[Pair], evaluator: Evaluator, report: Progress = no_progress) -> dict[str, dict[str, float]]:
+def measure(
+    pairs: Sequence[PicturePair], evaluator: Evaluator, report: Progress = no_progress
+) -> dict[str, dict[str, float]]:
     """The metrics of every view, in the pairs' order. Raises `InputError` for damaged files and unequal sizes."""
-    check_sizes(pairs)
+    check_picture_sizes(pairs)
     per_view = {}
     for done, pair in enumerate(pairs, 1):
         mask = None if pair.mask is None else read_mask(pair.mask)

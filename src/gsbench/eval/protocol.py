@@ -1,7 +1,7 @@
 """Named, versioned sets of evaluation conventions. Loads no torch.
 
-Two protocols never share a table cell: an identifier such as ``paper-1`` goes into every result, and a change of any
-convention below needs a new version.
+Every result holds an identifier such as ``paper-1``, and results of two protocols never share a table cell. A change of
+any convention below needs a new version.
 """
 
 from dataclasses import dataclass
@@ -11,18 +11,19 @@ from gsbench.errors import InputError
 
 SsimPadding = Literal["zero", "valid"]
 
-# Pixels per degree of a 0.7 m wide, 3840 px display seen from 0.7 m: the default viewer of Andersson et al. 2020.
+# Pixels per degree of a 0.7 m wide display of 3840 px, seen from 0.7 m: the default viewer of Andersson et al. 2020.
 FLIP_PPD = 67.02
 
 
 @dataclass(frozen=True)
 class Protocol:
-    """The conventions under which metrics are computed; means over views are plain means of the per-view values.
+    """The conventions under which metrics are computed.
 
-    In all of them renders are rounded to 8 bits (``floor(clamp(255 x + 0.5))``) before they are compared, as a PNG
-    would store them. ``ssim_padding``: see ``gsbench.eval.ssim.ssim``. ``lpips``: the variant that tables show as
-    *the* LPIPS of this protocol. ``flip_ppd``: pixels per degree of FLIP's viewer. ``psnr_cap``: dB, reported for pairs
-    of higher PSNR; identical images, whose PSNR is infinite and has no number in JSON, get it.
+    All protocols round renders to 8 bits before the comparison, as a PNG stores them
+    (``floor(clamp(255 x + 0.5))``), and average per-view values with a plain mean. ``ssim_padding`` is explained in
+    ``gsbench.eval.ssim.ssim``. ``lpips`` is the variant that tables show as the LPIPS of this protocol. ``flip_ppd``
+    are the pixels per degree of FLIP's viewer. ``psnr_cap`` (dB) replaces higher values, such as the infinite PSNR of
+    identical images, which JSON cannot hold.
     """
 
     name: str
@@ -45,12 +46,12 @@ PROTOCOLS = {protocol.name: protocol for protocol in (PAPER, STANDARD)}
 
 
 def get_protocol(name: str) -> Protocol:
-    """The protocol of that name; raises ``InputError`` naming the known ones."""
+    """The protocol ``name``; raises ``InputError`` naming the known protocols."""
     if name not in PROTOCOLS:
         raise InputError(f"unknown evaluation protocol {name!r}; choose one of {', '.join(PROTOCOLS)}")
     return PROTOCOLS[name]
 
 
 def protocol_of(identifier: str) -> Protocol | None:
-    """The protocol with an identifier such as ``paper-1``, whatever its version; None for an unknown one."""
+    """The protocol of an identifier such as ``paper-1``, ignoring the version; None for an unknown name."""
     return PROTOCOLS.get(identifier.rpartition("-")[0])

@@ -1,7 +1,7 @@
-"""SSIM with its window and constants, for the metric, for those made of it, and for the loss of a training.
+"""SSIM, with the window and constants that the metrics based on it and the training loss share.
 
 Wang, Bovik, Sheikh and Simoncelli 2004, "Image quality assessment: from error visibility to structural similarity": an
-11x11 Gaussian window of sigma 1.5, constants for a data range of 1, variances of the window as a population.
+11x11 Gaussian window of sigma 1.5, constants for a data range of 1, and population variances.
 """
 
 from typing import get_args
@@ -27,16 +27,16 @@ def window() -> Tensor:
     return weights / weights.sum()
 
 
-_WEIGHTS = window().tolist()  # plain numbers: a tensor would have to be brought to each device
+_WEIGHTS = window().tolist()  # plain numbers, because a tensor would have to be copied to each device
 
 
 def ssim(image: Tensor, target: Tensor, padding: SsimPadding = "zero") -> Tensor:
-    """Structural similarity (their eq. 13), averaged over pixels and channels.
+    """Structural similarity (eq. 13), averaged over pixels and channels.
 
     Images are [H, W, 3] in [0, 1] (the value is a 0-dimensional tensor) or a batch [B, 3, H, W] (the values are [B]).
-    ``padding`` says what happens at the border: "zero" pads the images with zeros and averages the full map, as the
-    evaluation of 3DGS does; "valid" averages over the pixels whose window lies inside the image, as scikit-image does.
-    Raises ValueError for shapes and sizes that do not fit.
+    With ``padding`` "zero" the images are padded with zeros and the full map is averaged, as in the evaluation of 3DGS.
+    With "valid" only pixels whose window lies inside the image count, as in scikit-image. Raises ValueError for wrong
+    shapes and sizes.
     """
     check_pair(image, target)
     if padding not in get_args(SsimPadding):
@@ -50,9 +50,9 @@ def ssim(image: Tensor, target: Tensor, padding: SsimPadding = "zero") -> Tensor
 
 
 def masked_ssim(image: Tensor, target: Tensor, mask: Tensor, padding: SsimPadding = "zero") -> Tensor:
-    """`ssim` of two images [H, W, 3] over the pixels that count in ``mask`` [H, W]; not a number where there is none.
+    """`ssim` of two images [H, W, 3], averaged over windows whose centre counts in ``mask`` [H, W].
 
-    The mean is over the windows whose centre counts. With "valid" these lie inside the image, as always.
+    The value is NaN if no pixel counts.
     """
     check_pair(image, target)
     x, y = as_batch(image), as_batch(target)
@@ -64,15 +64,15 @@ def masked_ssim(image: Tensor, target: Tensor, mask: Tensor, padding: SsimPaddin
 
 
 def ssim_map(image: Tensor, target: Tensor) -> Tensor:
-    """SSIM at every pixel and channel, [3, H, W], of two images [H, W, 3] in [0, 1], zeros outside."""
+    """SSIM at every pixel and channel, [3, H, W], of two images [H, W, 3] in [0, 1], padded with zeros."""
     luminance, structure = ssim_parts(as_batch(image), as_batch(target), "zero")
     return (luminance * structure)[0]
 
 
 def ssim_parts(x: Tensor, y: Tensor, padding: SsimPadding, data_range: float = 1.0) -> tuple[Tensor, Tensor]:
-    """The two factors of SSIM for images [B, C, H, W] of values from 0 to ``data_range``, [B, C, H', W'] each.
+    """Two factors of SSIM for images [B, C, H, W] with values from 0 to ``data_range``, [B, C, H', W'] each.
 
-    Luminance compares means (their eq. 6), the other contrast and structure in one (eq. 9 times eq. 10, C3 = C2 / 2).
+    The first is luminance (eq. 6), the second contrast times structure (eq. 9 times eq. 10, with C3 = C2 / 2).
     """
     moments = _blur(torch.cat([x, y, x * x, y * y, x * y]), padding)  # [5B, C, H', W']
     mean_x, mean_y, mean_xx, mean_yy, mean_xy = moments.chunk(5)  # [B, C, H', W'] each
@@ -90,7 +90,7 @@ def _blur(images: Tensor, padding: SsimPadding) -> Tensor:
         images = F.pad(images, [WINDOW_RADIUS] * 4)
     for axis in (2, 3):
         size = images.shape[axis] - WINDOW_SIZE + 1
-        # Shifted sums: several times faster on a CPU than a depthwise convolution with one channel per group.
+        # Sums of shifted images are several times faster on a CPU than a depthwise convolution.
         blurred = images.narrow(axis, 0, size) * _WEIGHTS[0]
         for offset, weight in enumerate(_WEIGHTS[1:], start=1):
             blurred.add_(images.narrow(axis, offset, size), alpha=weight)

@@ -1,1 +1,1 @@
-"""Renders of other programs: measured as they are, or imported as trials."""
+"""Measuring renders of other programs, and importing them as trials."""

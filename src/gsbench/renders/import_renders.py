@@ -1,7 +1,7 @@
-"""Renders of another program as a trial of an experiment, beside trials that gsbench ran.
+"""Importing renders of another program as a trial of an experiment.
 
-Such a trial has metrics and pictures and nothing else: no model, no times, and nobody knows its iterations. Tables show
-what is unknown as missing, and say which arms were evaluated from renders.
+Such a trial has only metrics and pictures: no model, no times, and an unknown number of iterations. Tables show unknown
+values as missing, and say which arms were evaluated from renders.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,11 +15,11 @@ from PIL import Image
 from gsbench.analysis.results import TrialResult, read_experiment
 from gsbench.errors import InputError
 from gsbench.eval.evaluator import Evaluator
-from gsbench.eval.pictures import Pair
+from gsbench.eval.pictures import PicturePair
 from gsbench.files import atomic, file_sha256, write_text
 from gsbench.pipeline.results import versions
 from gsbench.pipeline.steps.evaluate import summary_of, write_per_view
-from gsbench.renders.reference_images import Truth
+from gsbench.renders.reference_images import ReferenceImages
 from gsbench.runs.code import ROOMS, states_of
 from gsbench.runs.keys import EVALUATE, sha256_of
 from gsbench.runs.layout import CONFIG, GROUND_TRUTH, IN_RUNS, MASKS, PER_VIEW, RENDERS, SEED
@@ -29,12 +29,12 @@ from gsbench.scene.images import read_image
 from gsbench.scene.names import png_name
 from gsbench.settings import is_folder_name
 
-KEPT_GROUPS = ("scene", "eval", "tracking", "launch")  # of the configuration: what is true of renders too
+KEPT_GROUPS = ("scene", "eval", "tracking", "launch")  # groups of the configuration that apply to renders too
 
 
 @dataclass(frozen=True)
-class Place:
-    """Place of renders among the results: an experiment, a scene, an arm (initialiser and densifier), a seed."""
+class Destination:
+    """The trial that renders become: experiment, scene, arm (initialiser and densifier) and seed."""
 
     experiment: str
     scene: str
@@ -43,14 +43,14 @@ class Place:
     seed: int
 
 
-def find_place(word: str, scene: str | None, seed: int, truth: Truth, runs: Path) -> Place:
-    """The place that ``EXPERIMENT:ARM`` names; ARM is a name, or INIT-NAME.
+def find_destination(word: str, scene: str | None, seed: int, truth: ReferenceImages, runs: Path) -> Destination:
+    """The destination that ``EXPERIMENT:ARM`` names; ARM is a name, or INIT-NAME.
 
-    Where ARM names no initialiser, it is the one of the experiment's own trials of the scene, or that of the trial
-    behind ``truth``. Raises `InputError` where that is not one.
+    If ARM names no initialiser, it is taken from the experiment's trials of the scene, else from the trial of
+    ``truth``. Raises `InputError` if several are possible.
     """
     experiment, _, arm = word.partition(":")
-    where = scene or truth.scene
+    scene_name = scene or truth.scene
     if not is_folder_name(experiment) or not is_folder_name(arm):
         raise InputError(f"--as {word} is not EXPERIMENT:ARM, such as table1:sfm-mine")
     if experiment.casefold() in IN_RUNS:
@@ -61,60 +61,56 @@ def find_place(word: str, scene: str | None, seed: int, truth: Truth, runs: Path
         raise InputError(f"--scene {scene}: must be a plain folder name")
     if scene is not None and truth.scene not in (None, scene):
         raise InputError(f"--scene {scene}: the photographs are {truth.what}, of the scene {truth.scene}: leave it out")
-    if where is None:
+    if scene_name is None:
         raise InputError("--as: a folder of photographs has no scene's name: give it with --scene")
     init, dash, name = arm.partition("-")
     if not dash:
         init, name = truth.init or "", arm
-        trials = _trials(runs / experiment, where)
-        known = sorted({trial.init for trial in trials if not trial.from_renders}) or sorted({t.init for t in trials})
-        if len(known) > 1:
+        trials = _trials(runs / experiment, scene_name)
+        inits = sorted({trial.init for trial in trials if not trial.from_renders}) or sorted({t.init for t in trials})
+        if len(inits) > 1:
             raise InputError(
-                f"{experiment} has {', '.join(known)} on {where}: say which, as in --as {experiment}:{known[0]}-{arm}"
+                f"{experiment} has {', '.join(inits)} on {scene_name}: say which, as in "
+                f"--as {experiment}:{inits[0]}-{arm}"
             )
-        init = known[0] if known else init or "renders"
-    return Place(experiment, where, init, name, seed)
+        init = inits[0] if inits else init or "renders"
+    return Destination(experiment, scene_name, init, name, seed)
 
 
-def check_place(place: Place, truth: Truth, runs: Path) -> None:
-    """Raise `InputError` where the experiment's other trials of the scene were tested on other photographs."""
-    for trial in _trials(runs / place.experiment, place.scene):
+def check_destination(destination: Destination, truth: ReferenceImages, runs: Path) -> None:
+    """Raise `InputError` if the experiment's trials of the scene were tested on other photographs."""
+    for trial in _trials(runs / destination.experiment, destination.scene):
         conditions = trial.conditions
         size = "x".join(map(str, truth.resolution))
         if conditions["data"] != truth.data or conditions["resolution"] != size:
             raise InputError(
-                f"{place.experiment} tests {place.scene} on other photographs (such as {trial.label}, "
+                f"{destination.experiment} tests {destination.scene} on other photographs (such as {trial.label}, "
                 f"{conditions['resolution']} px) than {truth.what} ({size} px), so nothing could be compared: give "
-                f"--truth {place.experiment}:{place.scene}:{trial.init}-{trial.densify}"
+                f"--truth {destination.experiment}:{destination.scene}:{trial.init}-{trial.densify}"
             )
 
 
-def is_entered(config: Mapping[str, Any]) -> bool:
-    """Return whether ``config`` is that of a trial made of imported renders."""
-    return config["densify"].get("evaluated_from") == FROM_RENDERS
-
-
-def enter(
-    place: Place,
-    truth: Truth,
-    pairs: Sequence[Pair],
+def import_trial(
+    destination: Destination,
+    truth: ReferenceImages,
+    pairs: Sequence[PicturePair],
     per_view: Mapping[str, Mapping[str, float]],
     evaluator: Evaluator,
     source: Mapping[str, str],
     runs: Path,
 ) -> Path:
-    """Write the trial's folder and return it; what is entered twice is written once.
+    """Write the trial's folder and return it. The same renders always go to the same folder.
 
-    ``source`` says where the renders came from. Raises `InputError` where the place is taken by other renders.
+    ``source`` says where the renders came from. Raises `InputError` if the destination already holds other renders.
     """
     renders = {pair.view: file_sha256(pair.picture) for pair in pairs}
     identity = sha256_of({"renders": renders, "data": truth.data, "protocol": evaluator.protocol.id})
-    arm = runs / place.experiment / place.scene / f"{place.init}-{place.densify}"
-    folder = arm / f"{identity[:8]}{SEED}{place.seed}"
-    if taken := [other for other in arm.glob(f"*{SEED}{place.seed}") if other != folder]:
+    arm = runs / destination.experiment / destination.scene / f"{destination.init}-{destination.densify}"
+    folder = arm / f"{identity[:8]}{SEED}{destination.seed}"
+    if taken := [other for other in arm.glob(f"*{SEED}{destination.seed}") if other != folder]:
         raise InputError(
-            f"seed {place.seed} of {place.init}-{place.densify} on {place.scene} is taken ({taken[0]}): give another "
-            "--seed, or remove that folder"
+            f"seed {destination.seed} of {destination.init}-{destination.densify} on {destination.scene} is taken "
+            f"({taken[0]}): give another --seed, or remove that folder"
         )
     for name, files in (
         (RENDERS, {png_name(pair.view): pair.picture for pair in pairs}),
@@ -126,16 +122,16 @@ def enter(
         for target, file in files.items():
             with atomic(folder / name / target, sync=False) as temporary:
                 Image.fromarray(read_image(file)).save(temporary, format="PNG")
-    config = _config(place, truth, runs)
+    config = _config(destination, truth, runs)
     write_text(folder / CONFIG, yaml.safe_dump(config, sort_keys=False))
     write_per_view(folder / PER_VIEW, per_view)
-    TrialFolder(folder).write_finished(config, _results(place, truth, identity, per_view, evaluator, source))
+    TrialFolder(folder).write_finished(config, _results(destination, truth, identity, per_view, evaluator, source))
     return folder
 
 
 def _results(
-    place: Place,
-    truth: Truth,
+    destination: Destination,
+    truth: ReferenceImages,
     identity: str,
     per_view: Mapping[str, Mapping[str, float]],
     evaluator: Evaluator,
@@ -145,11 +141,11 @@ def _results(
     unknown = dict.fromkeys(("gaussians", "train_time", "init_points", "total_time", "peak_memory_mb"), RENDERS_ALONE)
     return TrialRecord(
         status="complete",
-        experiment=place.experiment,
-        scene=place.scene,
-        init=place.init,
-        densify=place.densify,
-        seed=place.seed,
+        experiment=destination.experiment,
+        scene=destination.scene,
+        init=destination.init,
+        densify=destination.densify,
+        seed=destination.seed,
         evaluated_from=FROM_RENDERS,
         raster="unknown",
         protocol=evaluator.protocol.id,
@@ -171,14 +167,14 @@ def _results(
     )
 
 
-def _config(place: Place, truth: Truth, runs: Path) -> dict[str, Any]:
+def _config(destination: Destination, truth: ReferenceImages, runs: Path) -> dict[str, Any]:
     groups = {group: truth.config[group] for group in KEPT_GROUPS}
-    own = truth.config["init"] if truth.config["init"]["name"] == place.init else {"name": place.init}
-    names: dict[str, Any] = {"name": place.experiment, "seed": place.seed, "runs": str(runs)}
-    groups["scene"] = dict(groups["scene"]) | {"name": place.scene}
-    return names | groups | {"init": own, "densify": {"name": place.densify, "evaluated_from": FROM_RENDERS}}
+    own = truth.config["init"] if truth.config["init"]["name"] == destination.init else {"name": destination.init}
+    names: dict[str, Any] = {"name": destination.experiment, "seed": destination.seed, "runs": str(runs)}
+    groups["scene"] = dict(groups["scene"]) | {"name": destination.scene}
+    return names | groups | {"init": own, "densify": {"name": destination.densify, "evaluated_from": FROM_RENDERS}}
 
 
 def _trials(home: Path, scene: str) -> list[TrialResult]:
-    """The experiment's trials of a scene; none where there is no such experiment yet."""
+    """The experiment's trials of a scene; none if the experiment does not exist yet."""
     return [trial for trial in read_experiment(home).trials if trial.scene == scene] if home.is_dir() else []

@@ -1,4 +1,4 @@
-"""The work of ``gsbench evaluate``: renders of any program measured, and imported beside the arms of an experiment."""
+"""The work of ``gsbench evaluate``: measuring renders of any program, and importing them into an experiment."""
 
 import argparse
 import json
@@ -16,12 +16,12 @@ from gsbench.errors import InputError
 from gsbench.eval.evaluator import Evaluator, summarize
 from gsbench.eval.facts import METRICS
 from gsbench.eval.options import EvalConfig
-from gsbench.eval.pictures import Matching, Pair, match_by_order, match_pictures, measure
+from gsbench.eval.pictures import Matching, PicturePair, match_by_order, match_pictures, measure
 from gsbench.files import storage_errors
 from gsbench.logs import progress
 from gsbench.pipeline.parts import build_metrics, make_evaluator
-from gsbench.renders.import_renders import check_place, enter, find_place
-from gsbench.renders.reference_images import Truth, find_truth, truth_of_trial
+from gsbench.renders.import_renders import check_destination, find_destination, import_trial
+from gsbench.renders.reference_images import ReferenceImages, find_reference_images, reference_images_of
 from gsbench.scene.readers import list_images
 from gsbench.system.own_modules import allow_modules
 from gsbench.system.resources import available_threads
@@ -30,18 +30,18 @@ from gsbench.words import counted, some_of
 
 
 def measure_renders(options: argparse.Namespace, runs: Path) -> None:
-    """Measure what the ``options`` of the verb name, and print it."""
-    truth = _truth(options, runs)
-    place = None
+    """Measure the renders that the ``options`` of the verb name, and print the values."""
+    truth = _reference_images(options, runs)
+    destination = None
     if options.place is not None:
-        place = find_place(options.place, options.scene, options.seed, truth, runs)
-        check_place(place, truth, runs)
+        destination = find_destination(options.place, options.scene, options.seed, truth, runs)
+        check_destination(destination, truth, runs)
     renders = Path(options.renders).expanduser()
     if not renders.is_dir():
         raise InputError(f"{renders} is not a folder of renders")
     matching = _match(truth, list_images(renders), options.by_order)
     pairs = [
-        Pair(view, path, renders / matching.pairs[view], truth.masks.get(view))
+        PicturePair(view, path, renders / matching.pairs[view], truth.masks.get(view))
         for view, path in truth.photographs.items()
     ]
     torch.set_num_threads(available_threads())
@@ -49,37 +49,37 @@ def measure_renders(options: argparse.Namespace, runs: Path) -> None:
     with progress("evaluate") as report:
         per_view = measure(pairs, evaluator, report)
     folder = None
-    if place is not None:
+    if destination is not None:
         source = {"folder": str(renders.resolve()), "names matched": matching.rule or "as they are"}
         with storage_errors(runs):
-            folder = enter(place, truth, pairs, per_view, evaluator, source, runs)
+            folder = import_trial(destination, truth, pairs, per_view, evaluator, source, runs)
     if options.json:
         print(json.dumps(_as_dict(evaluator, matching, per_view, folder), indent=1))
     else:
         print("\n".join(_lines(truth, evaluator, matching, per_view, folder)))
 
 
-def _truth(options: argparse.Namespace, runs: Path) -> Truth:
-    """The photographs; a scene that the experiment of ``--as`` has trials of is taken as these saw it."""
+def _reference_images(options: argparse.Namespace, runs: Path) -> ReferenceImages:
+    """The photographs; those of a scene come from the trials of the experiment in ``--as``, if it has any."""
     others = [word for word in options.settings if not word.startswith(("eval", f"{PERMISSIONS}="))]
     experiment = runs / (options.place or "").partition(":")[0]
     if not others and options.place and not Path(options.truth).is_dir() and experiment.is_dir():
         trials = [trial for trial in read_experiment(experiment).trials if not trial.from_renders]
-        if known := next((trial for trial in trials if trial.scene == options.truth), None):
-            return truth_of_trial(known)
-    truth = find_truth(options.truth, options.settings, runs)
+        if same_scene := next((trial for trial in trials if trial.scene == options.truth), None):
+            return reference_images_of(same_scene)
+    truth = find_reference_images(options.truth, options.settings, runs)
     if truth.init is not None and others:
         raise InputError(f"{others[0]}: the settings of {truth.what} are as they are; only eval.… can be set here")
     return truth
 
 
-def _match(truth: Truth, renders: Sequence[str], by_order: bool) -> Matching:
+def _match(truth: ReferenceImages, renders: Sequence[str], by_order: bool) -> Matching:
     photographs = list(truth.photographs)
     return match_by_order(photographs, renders) if by_order else match_pictures(photographs, renders)
 
 
-def _evaluator(truth: Truth, protocol: str | None, settings: Sequence[str]) -> Evaluator:
-    """As the settings of the photographs' trial or scene say, unless the command says otherwise."""
+def _evaluator(truth: ReferenceImages, protocol: str | None, settings: Sequence[str]) -> Evaluator:
+    """The evaluator with the settings of the photographs' trial or scene, unless the command gives others."""
     allowed = typed_permissions([word for word in settings if word.startswith(f"{PERMISSIONS}=")])
     allow_modules(allowed)
     config: Mapping[str, Any] = truth.config
@@ -91,7 +91,7 @@ def _evaluator(truth: Truth, protocol: str | None, settings: Sequence[str]) -> E
 
 
 def _lines(
-    truth: Truth,
+    truth: ReferenceImages,
     evaluator: Evaluator,
     matching: Matching,
     per_view: Mapping[str, Mapping[str, float]],
@@ -99,7 +99,7 @@ def _lines(
 ) -> list[str]:
     metrics = summarize(per_view, evaluator.unavailable)
     width = max(len(view) for view in ("mean", *per_view))
-    facts = {known.key: known for known in METRICS} | evaluator.own
+    facts = {entry.key: entry for entry in METRICS} | evaluator.own
     names = {key: facts[key].name for key in metrics}
     lines = [f"{counted(len(per_view), 'view')}: {truth.what}; protocol {evaluator.protocol.id}"]
     if matching.rule:

@@ -1,4 +1,4 @@
-"""The photographs that renders are held against: those of a trial, of a scene as a trial would see it, or a folder."""
+"""The photographs that renders are compared with: of a trial, of a scene as a trial would see it, or of a folder."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -21,16 +21,16 @@ from gsbench.scene.readers import fingerprint, list_images
 from gsbench.view.trials import find_trial
 from gsbench.words import closest
 
-CAMERAS_ONLY = ("init=random", "init.count=100")  # the quickest initialiser; its points are not used
+CAMERAS_ONLY = ("init=random", "init.count=100")  # the fastest initialiser; its points are not used
 
 
 @dataclass(frozen=True)
-class Truth:
+class ReferenceImages:
     """Photographs by the names of their views, in the order of an evaluation.
 
-    ``data`` is the fingerprint of the capture that they come from, ``resolution`` (width, height) its size in px;
-    ``config`` is the configuration of a trial that is tested on them. ``scene`` is None for a mere folder of pictures,
-    ``init`` where no trial stands behind them.
+    ``what`` describes them in messages. ``data`` is the fingerprint of their capture, and ``resolution`` (width,
+    height) its size in px. ``config`` is the configuration of a trial that is tested on them. ``scene`` is None for a
+    plain folder of pictures, ``init`` is None if they come from no trial.
     """
 
     photographs: Mapping[str, Path]
@@ -40,20 +40,24 @@ class Truth:
     config: Mapping[str, Any]
     scene: str | None = None
     init: str | None = None
-    masks: Mapping[str, Path] = field(default_factory=dict)  # of the views that ignore some pixels
+    masks: Mapping[str, Path] = field(default_factory=dict)  # mask files of the views that ignore some pixels
 
 
-def find_truth(place: str, settings: Sequence[str], runs: Path) -> Truth:
-    """The photographs at ``place``: a folder, a trial (folder or EXPERIMENT:SCENE:DENSIFY), or the name of a scene.
+def find_reference_images(place: str, settings: Sequence[str], runs: Path) -> ReferenceImages:
+    """The photographs of ``place``: a folder, a trial (folder or EXPERIMENT:SCENE:DENSIFY), or the name of a scene.
 
-    ``settings`` are overrides of the configuration. Raises `InputError` for what is none of these.
+    ``settings`` are overrides of the configuration. Raises `InputError` if ``place`` is none of these.
     """
     folder = Path(place).expanduser()
     if folder.is_dir():
         home = folder.parent if folder.name in (GROUND_TRUTH, RENDERS) else folder
-        return truth_of_trial(find_trial(str(home), runs)) if (home / RESULTS).is_file() else _folder(folder, settings)
+        return (
+            reference_images_of(find_trial(str(home), runs))
+            if (home / RESULTS).is_file()
+            else _folder(folder, settings)
+        )
     if ":" in place:
-        return truth_of_trial(find_trial(place, runs))
+        return reference_images_of(find_trial(place, runs))
     scenes = options("scene")
     if place not in scenes:
         raise InputError(
@@ -63,13 +67,13 @@ def find_truth(place: str, settings: Sequence[str], runs: Path) -> Truth:
     return _scene(place, settings)
 
 
-def truth_of_trial(trial: TrialResult) -> Truth:
-    """The reference images of a finished trial, under the names and in the order of its own evaluation."""
+def reference_images_of(trial: TrialResult) -> ReferenceImages:
+    """The reference images of a finished trial, with the names and in the order of its own evaluation."""
     photographs = {view: trial.path / GROUND_TRUTH / png_name(view) for view in read_views(trial)}
     if trial.record.resolution is None or "data" not in trial.record.hashes:
         raise InputError(f"{trial.label} does not say what it was tested on: run this trial again")
     what = f"the test views of {trial.label}"
-    return Truth(
+    return ReferenceImages(
         photographs,
         what,
         trial.record.hashes["data"],
@@ -81,10 +85,10 @@ def truth_of_trial(trial: TrialResult) -> Truth:
     )
 
 
-def _scene(name: str, settings: Sequence[str]) -> Truth:
+def _scene(name: str, settings: Sequence[str]) -> ReferenceImages:
     """The test views of a scene as a trial with these settings sees them: undistorted, at its size.
 
-    Where cameras come with the scene, they are all that is asked of the initialiser, unless the settings choose one.
+    If the scene comes with cameras, the fastest initialiser is used, unless the settings choose one.
     """
     config = compose_one([f"scene={name}", *settings]).values
     if not any(word.startswith("init=") for word in settings) and config["scene"]["kind"] != "photos":
@@ -101,20 +105,20 @@ def _scene(name: str, settings: Sequence[str]) -> Truth:
     sizes = [(view.camera.width, view.camera.height) for view in [*scene.train, *scene.test]]
     masks = _masks(folder / MASKS, photographs)
     what = f"the test views of {name}"
-    return Truth(photographs, what, trial.capture.fingerprint, max(sizes), config, name, masks=masks)
+    return ReferenceImages(photographs, what, trial.capture.fingerprint, max(sizes), config, name, masks=masks)
 
 
 def _masks(folder: Path, views: Iterable[str]) -> dict[str, Path]:
-    """The masks that are in ``folder``, by view."""
+    """The existing masks in ``folder``, by view."""
     files = {view: folder / png_name(view) for view in views}
     return {view: file for view, file in files.items() if file.is_file()}
 
 
-def _folder(folder: Path, settings: Sequence[str]) -> Truth:
+def _folder(folder: Path, settings: Sequence[str]) -> ReferenceImages:
     names = list_images(folder)
     if not names:
         raise InputError(f"--truth {folder} holds no pictures")
     photographs = {name: folder / name for name in names}
     resolution = max(image_size(path) for path in photographs.values())
     config = compose_one(list(settings)).values
-    return Truth(photographs, f"the pictures in {folder}", fingerprint(folder, names), resolution, config)
+    return ReferenceImages(photographs, f"the pictures in {folder}", fingerprint(folder, names), resolution, config)

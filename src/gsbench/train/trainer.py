@@ -13,7 +13,7 @@ import torch
 
 from gsbench.densify import Densifier, DensifyContext, NoDensifier
 from gsbench.errors import TrainingError
-from gsbench.eval.images import where_counted
+from gsbench.eval.images import replace_ignored
 from gsbench.events import RefineEvent
 from gsbench.gaussians.model import MAX_SH_DEGREE, Gaussians
 from gsbench.gaussians.paper_values import LearningRates
@@ -164,7 +164,7 @@ class Trainer:
             render = self.render(index)
         except ValueError as error:  # the rasterizer rejects a parameter that is out of range
             raise TrainingError(f"iteration {step}: {error}; {_last_state(folder)}") from error
-        loss, l1, ssim = self.loss(where_counted(render.image, target, targets.mask(index)), target)
+        loss, l1, ssim = self.loss(replace_ignored(render.image, target, targets.mask(index)), target)
         regularizer = self.densifier.regularizer(self.gaussians.values)
         total = loss if regularizer is None else loss + regularizer
         self.losses.add(step, loss, l1, ssim, total)

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsbench.eval.images import as_unit_range, where_counted
+from gsbench.eval.images import as_unit_range, replace_ignored
 from gsbench.eval.ssim import ssim_map
 from gsbench.gaussians.model import Gaussians
 from gsbench.raster import Rasterizer, RenderOutput
@@ -114,7 +114,7 @@ class SceneViews:
         mask = self._targets.mask(index)
         if mask is None:
             return render
-        return replace(render, image=where_counted(render.image, self._targets.get(index), mask))
+        return replace(render, image=replace_ignored(render.image, self._targets.get(index), mask))
 
     def dissimilarity(self, index: int, image: Tensor) -> Tensor:
         target = as_unit_range(self._targets.get(index), image.dtype)

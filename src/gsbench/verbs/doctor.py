@@ -110,7 +110,7 @@ def check_triton() -> Iterator[Finding]:
 
 def check_weights() -> Iterator[Finding]:
     """Findings about the weights of networks that are here; nothing is downloaded."""
-    from gsbench.eval.lpips import BACKBONES, find_any
+    from gsbench.eval.lpips import BACKBONES, find_first_weights
     from gsbench.init.dim import EXTRACTOR_WEIGHTS, LIGHTGLUE_WEIGHTS
     from gsbench.weights import WEIGHTS_VARIABLE, MissingWeights, hub_cache
 
@@ -120,7 +120,7 @@ def check_weights() -> Iterator[Finding]:
     wanted |= {f"LightGlue for {name}": (spec,) for name, spec in LIGHTGLUE_WEIGHTS.items()}
     for purpose, specs in wanted.items():
         try:
-            yield Finding("ok", "weights", f"{purpose}: {find_any(specs, None, download=False)}")
+            yield Finding("ok", "weights", f"{purpose}: {find_first_weights(specs, None, download=False)}")
         except MissingWeights as error:
             origin = specs[0].url or specs[0].source
             missing = f"{specs[0].names[0]} is not here; gsbench downloads it when needed from {origin}"

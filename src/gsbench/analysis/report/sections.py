@@ -21,7 +21,7 @@ from gsbench.analysis.results import Arm, TrialResult, group_by
 from gsbench.analysis.table_formats import Column, Row, Table, TableEntry
 from gsbench.analysis.verdicts import PairVerdicts
 from gsbench.errors import InputError
-from gsbench.eval.facts import find
+from gsbench.eval.facts import find_metric
 from gsbench.events import RefineEvent
 from gsbench.parsing import DamagedError
 from gsbench.runs import layout
@@ -277,7 +277,7 @@ def search_summary(home: Path) -> tuple[str, str] | None:
     count += f"; {failed} failed" if failed else ""
     if not done:
         return f"{count}; none has a result yet.", ""
-    facts = find(record.metric)
+    facts = find_metric(record.metric)
     name, decimals = (facts.name, facts.decimals + 1) if facts else (record.metric, 4)
     number, best, best_value = max(done, key=lambda numbered: record.direction * numbered[2])
     settings = ", ".join(f"{key} = {value}" for key, value in best.settings.items())
