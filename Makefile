@@ -1,21 +1,21 @@
 PYTHON ?= python3
 VENV   ?= .venv
 BIN    := $(VENV)/bin
-# Two tests at a time, each worker in a process of its own; one that has nothing left takes tests of the other.
+# Two worker processes; one that runs out of tests takes some of the other's.
 PYTEST := $(BIN)/python -m pytest --numprocesses 2 --dist worksteal
 INSTALL := $(BIN)/python scripts/install.py
-# Packages are installed without byte code, which Python keeps of what is used. Images for containers often forbid that by
-# this variable; each start of the program would then compile all its modules again, 8 CPU-seconds.
+# Packages are installed without byte code; Python writes and keeps it for the modules that are used. Container images often
+# forbid that by this variable, and then each start of the program would compile all its modules again: 8 CPU-seconds.
 unexport PYTHONDONTWRITEBYTECODE
 
-# Each library that chooses its instructions by the processor, told to choose the plainest. Compiled kernels keep a cache
-# for each processor, so the ordinary ones stay.
+# Makes libraries that choose their instructions by the processor choose the plainest. Compiled kernels have a cache for each
+# processor, so the ordinary ones are kept.
 GENERIC := NUMBA_CPU_NAME=generic OPENBLAS_CORETYPE=Prescott ATEN_CPU_CAPABILITY=default MKL_ENABLE_INSTRUCTIONS=SSE4_2 \
 	DNNL_MAX_CPU_ISA=SSE41 NPY_DISABLE_CPU_FEATURES='X86_V3 X86_V4 AVX512_ICL'
-# What computes: the paths in tests/core.txt, which the workflows run on other systems too.
+# Tests of all code that computes: the paths in tests/core.txt, which the workflows also run on other systems.
 CORE_TESTS := @tests/core.txt
 
-# The next version of Hydra, as far as it is released, laid over .venv for the tests of what Hydra does.
+# The next version of Hydra, or its newest release candidate, installed beside .venv for the tests of configurations and sweeps.
 NEXT_HYDRA := 'hydra-core>=1.4.0rc1,<1.5' 'omegaconf>=2.4.1rc1,<2.5'
 NEXT_HYDRA_TESTS := tests/app tests/config tests/end_to_end/test_hydra.py
 
@@ -38,7 +38,7 @@ test: $(VENV)/.stamp-dev ## run the quick tests: every unit, every contract, the
 test-slow: $(VENV)/.stamp-dev
 	$(PYTEST) -m slow
 
-test-all: test test-slow ## run the quick tests and all others, which start processes, train or compile for long
+test-all: test test-slow ## run all tests; the slow ones start processes, train, or compile for long
 
 test-generic: $(VENV)/.stamp-dev ## run core tests as on the plainest processor of this architecture
 	$(GENERIC) $(PYTEST) -m 'not slow' $(CORE_TESTS)
@@ -54,7 +54,7 @@ lint: $(VENV)/.stamp-dev ## check style and types
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-docs: $(VENV)/.stamp-docs ## write the documentation as a site to site/; fails where a link leads nowhere
+docs: $(VENV)/.stamp-docs ## write the documentation as a site to site/; fails for a broken link
 	$(BIN)/python scripts/build_site.py
 	$(BIN)/zensical build --clean
 
@@ -68,7 +68,7 @@ lock: $(VENV)/.stamp-run ## bring uv.lock to the versions of constraints.txt
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check uv
 	$(BIN)/uv lock --no-config --default-index https://pypi.org/simple $$(sed 's/^/--upgrade-package /' constraints.txt)
 
-# What running needs, and no more; development tools come on top.
+# Only what running needs; the development tools are added by the next target.
 $(VENV)/.stamp-run: pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "gsbench needs Python 3.11 or newer: make PYTHON=python3.12 ...")'
 	@echo making the environment $(VENV)

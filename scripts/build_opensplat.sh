@@ -1,8 +1,8 @@
 #!/usr/bin/env bash
-# Builds OpenSplat 1.2.0 for the CPU, the other trainer that densify=external/opensplat runs.
-#   scripts/build_opensplat.sh FOLDER    # FOLDER/opensplat is the program; some ten minutes on two cores
-# OPENSPLAT_SOURCE may name a checkout or mirror to clone from. Torch is that of .venv; OpenCV, CMake and a compiler come
-# from Debian's or Ubuntu's packages.
+# Builds OpenSplat 1.2.0 for the CPU, the program that densify=external/opensplat runs.
+#   scripts/build_opensplat.sh FOLDER    # the program becomes FOLDER/opensplat; about ten minutes on two cores
+# OPENSPLAT_SOURCE may name a checkout or mirror to clone from. It uses the torch in .venv; OpenCV, CMake and a compiler
+# come from Debian's or Ubuntu's packages.
 set -euo pipefail
 COMMIT=bd0400db58aa14c597bf2f99c4b68cdef7b6134d # version 1.2.0, 2026-08-20
 SOURCE=${OPENSPLAT_SOURCE:-https://github.com/WebODM/OpenSplat}

@@ -1,9 +1,9 @@
-"""Put together the pages of the site in build/pages/, from which Zensical builds it (``make docs``).
+"""Write the pages of the site to build/pages/, from which Zensical builds it (``make docs``).
 
-The pages are those of docs/, the files of the root that readers look for, the findings, and what is made from the
-code (`reference.py`). In the repository a page may link to any file. On the site, a link to a file that is no page
-leads to the repository where its address is known (``$GSBENCH_REPOSITORY``), else only its name stays. A link to
-nothing is left as it is, and Zensical refuses it.
+The pages are docs/, the `PAGES` of the root, the findings, and pages generated from the code (`reference.py`). In the
+repository a page may link to any file. On the site, a link to a file that is no page leads to the repository if its
+address is known (``$GSBENCH_REPOSITORY``); otherwise only the file's name stays. A broken link is left as it is, so
+that Zensical refuses it.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ PAGES = {
 }  # file of the repository: page of the site
 LINK = re.compile(r"(?<!!)\[(?P<text>[^\]]*)\]\((?P<target>[^)#\s]+)(?P<anchor>#[^)]*)?\)")
 FENCE = re.compile(r"(^```.*?^```$)", re.DOTALL | re.MULTILINE)
-MADE = {"settings.md": "settings", "results.md": "results"}  # page: what `reference.py` adds at its end
+GENERATED = {"settings.md": "settings", "results.md": "results"}  # page: the part that `reference.py` adds to its end
 
 
-def led_on(markdown: str, folder: Path, repository: str | None) -> str:
-    """The text of a page that lies in ``folder``, with links that work on the site; blocks of code are left alone."""
+def with_site_links(markdown: str, folder: Path, repository: str | None) -> str:
+    """The text of a page in ``folder`` with links that work on the site. Blocks of code stay unchanged."""
 
     def replace(match: re.Match[str]) -> str:
         text, target, anchor = match["text"], match["target"], match["anchor"] or ""
@@ -39,8 +39,8 @@ def led_on(markdown: str, folder: Path, repository: str | None) -> str:
         name = path.relative_to(ROOT).as_posix()
         page = page_of(name)
         if page is not None:
-            here = page_of(folder.relative_to(ROOT).as_posix() + "/x.md") or ""
-            return f"[{text}]({os.path.relpath(page, Path(here).parent).replace(os.sep, '/')}{anchor})"
+            own_page = page_of(folder.relative_to(ROOT).as_posix() + "/x.md") or ""
+            return f"[{text}]({os.path.relpath(page, Path(own_page).parent).replace(os.sep, '/')}{anchor})"
         if repository:
             return f"[{text}]({repository.rstrip('/')}/{'tree' if path.is_dir() else 'blob'}/main/{name}{anchor})"
         return text if name in text else f"{text} (`{name}`)"
@@ -51,7 +51,7 @@ def led_on(markdown: str, folder: Path, repository: str | None) -> str:
 
 
 def page_of(name: str) -> str | None:
-    """The page of the site that a file of the repository becomes; None where it becomes none."""
+    """The page of the site that a file of the repository becomes; None for other files."""
     if name == "README.md":
         return "index.md"
     if name.startswith("docs/"):
@@ -59,7 +59,7 @@ def page_of(name: str) -> str | None:
     return name if name.startswith("findings/") and name.endswith(".md") else PAGES.get(name)
 
 
-def put_together(target: Path, repository: str | None) -> None:
+def write_pages(target: Path, repository: str | None) -> None:
     """Write every page, and the pictures beside them, to the folder ``target``."""
     import reference
 
@@ -78,12 +78,12 @@ def put_together(target: Path, repository: str | None) -> None:
         place = target / (PAGES.get(name) or str(page_of(name)))
         place.parent.mkdir(parents=True, exist_ok=True)
         text = path.read_text(encoding="utf-8")
-        if name.removeprefix("docs/") in MADE:
-            text += "\n" + reference.PAGES[MADE[name.removeprefix("docs/")]]()
-        place.write_text(led_on(text, path.parent, repository), encoding="utf-8")
+        if name.removeprefix("docs/") in GENERATED:
+            text += "\n" + reference.PAGES[GENERATED[name.removeprefix("docs/")]]()
+        place.write_text(with_site_links(text, path.parent, repository), encoding="utf-8")
     (target / "api.md").write_text(reference.api_page(), encoding="utf-8")
     (target / "results.schema.json").write_text(reference.schema_text(), encoding="utf-8")
 
 
 if __name__ == "__main__":
-    put_together(Path(sys.argv[1]) if sys.argv[1:] else ROOT / "build" / "pages", os.environ.get("GSBENCH_REPOSITORY"))
+    write_pages(Path(sys.argv[1]) if sys.argv[1:] else ROOT / "build" / "pages", os.environ.get("GSBENCH_REPOSITORY"))

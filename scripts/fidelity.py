@@ -1,12 +1,12 @@
-"""docs/fidelity.md: each arm, its source, what of it was compared with a restatement, and the largest difference found.
+"""docs/fidelity.md: each arm with its source, the parts compared with a restatement, and the largest difference.
 
-    python scripts/fidelity.py            say whether the page is what the tests measure
+    python scripts/fidelity.py            say whether the page agrees with what the tests measure
     python scripts/fidelity.py --write    write it
 
-The restatements are those of the tests below tests/densify: one Gaussian at a time in numpy, from the facts of the
-source, no code shared with gsbench or with the source. Differences are relative to the larger of 1 and the value, over
-all raw parameters and both Adam moments of every Gaussian after a round, in float64; the page states the next power of
-ten. Of the cases of a test the first and the last are measured; the test itself holds for all.
+A restatement is a second implementation of a source's rules in tests/densify: one Gaussian at a time in numpy, from the
+facts of the source, with no code shared with gsbench or the source. Differences are relative to the larger of 1 and the
+value, over all raw parameters and both Adam moments of every Gaussian after a refinement, in float64. The page states
+the next power of ten. Only the first and the last case of a test are measured; the test itself runs all.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ off its mean. Here small pictures have 8 bits.
 
 @dataclass(frozen=True)
 class Arm:
-    """A row: where the rule is from, the tests of ``module`` that compare it, and what is left out."""
+    """A row of the page: an arm's source, the compared parts, the tests that compare them, and deviations."""
 
     source: str
     compared: str
@@ -77,7 +77,7 @@ ARMS = {name: read_arm(name) for name in shipped_arms()}
 
 
 def calls_of(function: Any) -> Iterator[dict[str, Any]]:
-    """The arguments of a test, as pytest would give them."""
+    """The arguments of each case of a parametrised test, as pytest would give them."""
     tables = []
     for mark in getattr(function, "pytestmark", []):
         if mark.name == "parametrize":
@@ -89,7 +89,7 @@ def calls_of(function: Any) -> Iterator[dict[str, Any]]:
 
 
 def measured(arm: str) -> float:
-    """The largest difference that the tests of an arm find. Raises AssertionError where one fails."""
+    """The largest difference that the tests of an arm measure. Raises AssertionError if one fails."""
     sys.path.insert(0, str(ROOT))
     try:
         restatement = importlib.import_module("tests.densify.restatement")
@@ -110,18 +110,18 @@ def measured(arm: str) -> float:
 
 
 def bound(difference: float) -> str:
-    """The next power of ten, as text; 0 where there is none."""
+    """The next power of ten as text; 0 for no difference."""
     return "0" if difference == 0 else f"1e{math.ceil(math.log10(difference)):+03d}".replace("e-0", "e-")
 
 
 def page(bounds: dict[str, str]) -> str:
-    """The page, with the largest difference of each arm as text."""
+    """The text of the page; ``bounds`` is the largest difference of each arm as text."""
     rows = (f"| `{k}` | {a.source} | {a.compared} | {bounds[k]} | {a.otherwise} |" for k, a in ARMS.items())
     return HEAD + "\n".join(rows) + "\n" + TAIL
 
 
 def bounds_of(text: str) -> dict[str, str]:
-    """The largest differences that a page states."""
+    """The largest difference of each arm that a page states."""
     return dict(ROW.findall(text))
 
 

@@ -1,4 +1,4 @@
-"""The parts of gpu_day.sh that are Python: what the machine is, whether two renders have the same bits, the table."""
+"""The Python parts of gpu_day.sh: the machine's facts, whether renders are equal bit by bit, the table of results."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ MODEL = "bench-model"
 
 
 def machine() -> dict[str, str]:
-    """The GPU and the versions that figures depend on."""
+    """The GPU and the versions on which the measurements depend."""
     from importlib.metadata import version
 
     import torch
@@ -35,7 +35,10 @@ def machine() -> dict[str, str]:
 
 
 def bits(device: str, width: int, height: int, count: int) -> list[str]:
-    """Differences among three runs of render, loss and gradients: on new memory, on used memory, with new pools."""
+    """The names of outputs that differ among three runs of render, loss and gradients.
+
+    The runs are on new memory, on used memory, and by new objects with new memory pools.
+    """
     import torch
 
     from gsbench.bench.scenes import make_scene
@@ -51,10 +54,10 @@ def bits(device: str, width: int, height: int, count: int) -> list[str]:
         output = rasterizer.render(leaves, scene.train[0].camera, 3, background, absolute_gradient=True)
         value = loss(output.image, target)[0]
         value.backward()
-        found = {"image": output.image, "alpha": output.alpha, "radii": output.radii, "loss": value}
-        found |= {"screen": output.screen_points.grad, "absolute": output.screen_gradient_abs}
-        found |= {f"gradient of {name}": tensor.grad for name, tensor in leaves.tensors().items()}
-        return {name: tensor.detach().cpu() for name, tensor in found.items()}
+        outputs = {"image": output.image, "alpha": output.alpha, "radii": output.radii, "loss": value}
+        outputs |= {"screen": output.screen_points.grad, "absolute": output.screen_gradient_abs}
+        outputs |= {f"gradient of {name}": tensor.grad for name, tensor in leaves.tensors().items()}
+        return {name: tensor.detach().cpu() for name, tensor in outputs.items()}
 
     rasterizer, loss = TritonRasterizer(), TritonLoss(0.2)
     first = run(rasterizer, loss)
@@ -70,8 +73,8 @@ def table(results: Path) -> str:
 
 
 def _head(results: Path) -> str:
-    here = _read(results / "machine.out") or {}
-    lines = [f"Measured on: {', '.join(f'{name} {value}' for name, value in here.items()) or 'unknown'}.", ""]
+    facts = _read(results / "machine.out") or {}
+    lines = [f"Measured on: {', '.join(f'{name} {value}' for name, value in facts.items()) or 'unknown'}.", ""]
     ends = _ends(results)
     contract = _last_line(results / "contract.out")
     lines += [f"- contract: {_end(ends, 'contract')}{f' ({contract})' if contract else ''}"]
@@ -87,7 +90,7 @@ def _differing(results: Path) -> str:
 
 
 def _ends(results: Path) -> dict[str, str]:
-    """The exit code of each step, of its last try."""
+    """The exit code of each step's last run."""
     file = results / "steps.tsv"
     rows = [line.split("\t") for line in file.read_text().splitlines()] if file.is_file() else []
     return {row[0]: row[1] for row in rows}
@@ -124,14 +127,14 @@ def _speed(results: Path) -> str:
 def _training(results: Path) -> str:
     lines = []
     for file in sorted(results.glob("train-*.json")):
-        found = _read(file) or {}
-        metrics = found.get("metrics", {})
+        record = _read(file) or {}
+        metrics = record.get("metrics", {})
         cells = (
-            f"`{found.get('raster', NOTHING)}`",
-            _number(found.get("iterations"), 0),
-            f"{found.get('num_gaussians', 0):,}",
-            _number(found.get("seconds", {}).get("train")),
-            _number(found.get("peak_memory_mb"), 0),
+            f"`{record.get('raster', NOTHING)}`",
+            _number(record.get("iterations"), 0),
+            f"{record.get('num_gaussians', 0):,}",
+            _number(record.get("seconds", {}).get("train")),
+            _number(record.get("peak_memory_mb"), 0),
             _number(metrics.get("psnr"), 2),
             _number(metrics.get("ssim"), 4),
         )
@@ -145,7 +148,7 @@ def _number(value: float | None, digits: int = 2) -> str:
 
 
 def _read(file: Path) -> Any:
-    """The JSON in ``file``; None where there is none."""
+    """The JSON in ``file``; None if it is missing or damaged."""
     try:
         return json.loads(file.read_text())
     except (OSError, ValueError):

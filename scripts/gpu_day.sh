@@ -1,19 +1,19 @@
 #!/usr/bin/env bash
-# What raster=triton is asked once a GPU is at hand: 45 minutes on a machine without a network, no command above ten.
+# Checks and times raster=triton on a GPU: 45 minutes on a machine without a network, no command above ten minutes.
 #
-#   scripts/gpu_day.sh wheels   before, with a network: the packages which that machine lacks, for Python 3.12 on x86-64
-#   scripts/gpu_day.sh setup    there: install them; gsplat is compiled in the background            (1 minute)
-#   scripts/gpu_day.sh check    contract, the same bits twice, memory checker                          (8 minutes)
-#   scripts/gpu_day.sh speed    bench of triton and gsplat with the time of each kernel               (9 minutes)
-#   scripts/gpu_day.sh train    7,000 steps of bonsai with both, bench of the model that comes of it  (9 minutes)
-#   scripts/gpu_day.sh table    what docs/gpu.md is to say, from all results                          (1 second)
+#   scripts/gpu_day.sh wheels   before, with a network: download the packages for Python 3.12 on x86-64
+#   scripts/gpu_day.sh setup    on the machine: install them; gsplat compiles in the background      (1 minute)
+#   scripts/gpu_day.sh check    tests of the contract, equal bits in three runs, memory checker      (8 minutes)
+#   scripts/gpu_day.sh speed    bench of triton and gsplat with the time of each kernel              (9 minutes)
+#   scripts/gpu_day.sh train    7,000 steps of bonsai with both, then bench of the trained model     (9 minutes)
+#   scripts/gpu_day.sh table    all results as Markdown, for docs/gpu.md                             (1 second)
 #
-# Wheels lie in gpu_day/wheels1, wheels2, … (each below 50 MB: bring them one after the other where room is short; `setup`
-# installs what is there, and may be repeated), the scene in gpu_day/bonsai (a COLMAP folder). The machine needs Python,
-# torch for CUDA, numba and pytest; gsplat needs nvcc. Results lie in $GPU_DAY_STATE/results, and are packed into $OUT
-# after each command if that is set: unpack them there before `table` where machines change in between.
+# The wheels are in gpu_day/wheels1, wheels2, … of 50 MB at most each. If space is short, bring one folder after the other
+# and repeat `setup`. The scene is in gpu_day/bonsai (a COLMAP folder). The machine needs Python, torch for CUDA, numba
+# and pytest; gsplat needs nvcc. Results are in $GPU_DAY_STATE/results. If $OUT is set, they are also packed into it after
+# each command; if the machine changes between commands, unpack them before `table`.
 #
-# GPU_DAY_TINY=1 tries all of it without a GPU, in Triton's interpreter, at sizes of no worth.
+# GPU_DAY_TINY=1 tries everything without a GPU, in Triton's interpreter, at sizes whose times mean nothing.
 set -uo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.." || exit 1
 
@@ -23,7 +23,7 @@ STATE=${GPU_DAY_STATE:-/tmp/gpu_day}
 RESULTS=$STATE/results
 WHEELS=(hydra-core omegaconf pydantic pydantic_core annotated-types typing-inspection kornia kornia_rs flip-evaluator
   plyfile gsplat pycolmap)
-SOURCES=(antlr4-python3-runtime) # of which there are no wheels
+SOURCES=(antlr4-python3-runtime) # packages without wheels
 WHEELS_AT_ONCE=50000000          # bytes
 
 if [ "${GPU_DAY_TINY:-}" ]; then
@@ -40,8 +40,8 @@ fi
 export PYTHONPATH="$STATE/site:$PWD/src:$PWD${PYTHONPATH:+:$PYTHONPATH}" PYTHONUNBUFFERED=1
 export TORCH_EXTENSIONS_DIR=$STATE/extensions GSBENCH_RUNS=$STATE/runs
 
-# NAME LIMIT COMMAND…: standard output to NAME.out, the rest to NAME.log, exit code and seconds to steps.tsv. What fails
-# is shown, and the next step goes on. Nothing begins after nine minutes.
+# step NAME LIMIT COMMAND…: runs a command for LIMIT seconds at most. Its output goes to NAME.out, errors to NAME.log,
+# exit code and seconds to steps.tsv. A failure is shown, and the next step runs. No step begins after nine minutes.
 failed=0
 step() {
   local name=$1 limit=$2 begin=$SECONDS code=0
@@ -88,7 +88,7 @@ setup() {
       "${found[@]}" || return 1
   fi
   step machine 100 "$PYTHON" scripts/gpu_day.py machine && cat "$RESULTS/machine.out"
-  if [ ! -e "$STATE/gsplat.exit" ] && [ "$DEVICE" = cuda ]; then # it goes on when this command has ended
+  if [ ! -e "$STATE/gsplat.exit" ] && [ "$DEVICE" = cuda ]; then # continues after this command has ended
     TORCH_CUDA_ARCH_LIST=$("$PYTHON" -c 'import torch; print("%d.%d" % torch.cuda.get_device_capability())') MAX_JOBS=12 \
       setsid --fork bash -c '"$0" -c "from gsplat.cuda._backend import _C; assert _C" >"$1.log" 2>&1; echo $? >"$1.exit"' \
       "$PYTHON" "$STATE/gsplat" </dev/null >/dev/null 2>&1
@@ -100,7 +100,7 @@ check() {
     -k "$CONTRACT"
   step bits 100 "$PYTHON" scripts/gpu_day.py bits "$DEVICE" "$SIZE" "${COUNTS[0]}"
   local checker
-  if checker=$(PATH=$PATH:/usr/local/cuda/bin command -v compute-sanitizer); then # every tensor a piece of memory of its own
+  if checker=$(PATH=$PATH:/usr/local/cuda/bin command -v compute-sanitizer); then # without caching, each tensor is its own allocation, so that overruns are seen
     PYTORCH_NO_CUDA_MEMORY_CACHING=1 step memcheck 140 "$checker" --tool memcheck --error-exitcode 9 \
       "$PYTHON" scripts/gpu_day.py bits "$DEVICE" "$SMALL" "${COUNTS[0]:0:3}"
   else

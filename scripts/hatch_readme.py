@@ -1,4 +1,4 @@
-"""Build hook: the README on the package index has absolute links, made from the address in ``[project.urls]``.
+"""Build hook: gives the README on the package index absolute links, from the address in ``[project.urls]``.
 
 In the repository its links stay relative, so that they work in every clone and on every forge.
 """
@@ -16,7 +16,7 @@ FENCE = re.compile(r"(^```.*?^```$)", re.DOTALL | re.MULTILINE)
 
 
 def absolute_links(markdown: str, repository: str) -> str:
-    """Return the text with links that lead into the repository; links within the page and blocks of code stay."""
+    """The text with absolute links into the repository. Links within the page and blocks of code stay unchanged."""
 
     def replace(match: re.Match[str]) -> str:
         target = match["target"]

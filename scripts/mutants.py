@@ -1,22 +1,22 @@
-"""Do the quick tests notice faults? Plant small faults one at a time in a copy, and run the tests of the room.
+"""Mutation testing: plant small faults one at a time in a copy, and see whether the quick tests notice them.
 
     python scripts/mutants.py                               # 160 faults over all rooms below, two at a time
     python scripts/mutants.py --rooms densify eval --count 40 --seed 3
 
 A fault is one of these:
 
-- comparison: it becomes its opposite, ``<`` becomes ``>=`` and ``==`` becomes ``!=``;
-- border: a comparison with a whole number takes in its border or leaves it out, ``> 0`` becomes ``>= 0``. Other borders
-  stay as they are: between continuous values they change nothing that can be seen;
+- comparison: becomes its opposite, ``<`` becomes ``>=`` and ``==`` becomes ``!=``;
+- border: a comparison with a whole number includes its border or excludes it, ``> 0`` becomes ``>= 0``. Other
+  comparisons are not changed so: between continuous values that has no visible effect;
 - sign: ``+`` becomes ``-``, ``*`` becomes ``/``, ``and`` becomes ``or``, and the other way round;
-- off by one: a whole number is one larger;
-- dropped: a statement is left out;
+- off by one: a whole number becomes one larger;
+- dropped: a statement is removed;
 - swapped: the first two arguments of a call change places.
 
-Texts, messages and annotations get none. A fault is caught when a test of ``make test`` fails or hangs. The table and
-the faults that survived are printed as Markdown; a survivor either shows a gap in the tests or changes nothing. The
-tests of a fault are those of its room, then those elsewhere that import its module. Triton's kernels are left out:
-their tests belong to ``make test-all``.
+Texts, messages and annotations get no faults. A fault is caught if a test of ``make test`` fails or hangs. A table and
+the survivors are printed as Markdown. A survivor either shows a gap in the tests or changes nothing. The tests that run
+for a fault are those of its room, then others that import its module. Triton's kernels are left out: their tests belong
+to ``make test-all``.
 """
 
 from __future__ import annotations
@@ -42,10 +42,10 @@ ROOT = Path(__file__).parents[1]
 SOURCE = "src/gsbench"
 ROOMS = ["analysis", "claims", "densify", "eval", "gaussians", "init", "pipeline", "raster", "runs", "scene", "train"]
 FURTHER_TESTS = {"pipeline": ["tests/end_to_end/test_smoke.py"]}
-LEFT_OUT = "triton"  # in a path
+LEFT_OUT = "triton"  # files with this in their path
 SYMMETRIC = {"maximum", "minimum", "min", "max", "add"}  # swapped arguments change nothing
 SPEED_ONLY = {"prefetch"}  # calls that change no result
-SECONDS = 1800  # for the tests of one room; a fault that makes them hang is caught
+SECONDS = 1800  # time limit for the tests of one fault
 Replacements = dict[type[ast.AST], type[ast.AST]]
 OPPOSITE: Replacements = {
     **{ast.Lt: ast.GtE, ast.GtE: ast.Lt, ast.Gt: ast.LtE, ast.LtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq},
@@ -58,7 +58,7 @@ OTHER_SIGN: Replacements = {
 
 @dataclass(frozen=True)
 class Fault:
-    """One change of one file: the text between two offsets becomes another."""
+    """One change of one file: the text between two offsets (bytes) is replaced."""
 
     file: str
     line: int
@@ -74,7 +74,7 @@ class Fault:
 
 
 def describe(fault: Fault) -> str:
-    """One line of Markdown: where the fault is and what it changes."""
+    """One line of Markdown: the place of the fault and its change."""
     before, after = (" ".join(text.split()) for text in (fault.before, fault.after))
     return f"`{fault.file}:{fault.line}` {fault.kind}: `{before}` → `{after}`"
 
@@ -84,7 +84,7 @@ def is_whole_number(node: ast.AST) -> bool:
 
 
 def changed_nodes(node: ast.AST) -> Iterator[tuple[str, ast.AST]]:
-    """The faults that fit the node: the kind of each, and the node with it."""
+    """The faults that fit a node, as (kind, changed node)."""
     new = copy.deepcopy(node)
     if isinstance(new, ast.Compare):
         first = type(new.ops[0])
@@ -113,7 +113,7 @@ def changed_nodes(node: ast.AST) -> Iterator[tuple[str, ast.AST]]:
 
 
 def is_silent(node: ast.AST) -> bool:
-    """True for a message, a text or a hint to the processor: no test asks for what lies below such a node."""
+    """Return whether a node is a message, a text or a hint to the processor, below which no faults are planted."""
     if isinstance(node, ast.Raise | ast.JoinedStr | ast.Assert):
         return True
     called = node.func if isinstance(node, ast.Call) else None
@@ -123,7 +123,7 @@ def is_silent(node: ast.AST) -> bool:
 
 
 def visited(node: ast.AST) -> Iterator[ast.AST]:
-    """The nodes in which a fault may lie, parents first."""
+    """The nodes in which a fault may be planted, parents first."""
     if is_silent(node) or (isinstance(node, ast.Expr) and is_silent(node.value)):
         return
     yield node
@@ -136,14 +136,14 @@ def visited(node: ast.AST) -> Iterator[ast.AST]:
 
 
 def faults_of(path: Path) -> list[Fault]:
-    """All faults that may be planted in a file."""
+    """All faults that can be planted in a file."""
     text = path.read_text()
     lines = [0]
     for line in text.encode().splitlines(keepends=True):  # columns of the syntax tree count bytes
         lines.append(lines[-1] + len(line))
-    found = []
-    planted = ((node, *change) for node in visited(ast.parse(text)) for change in changed_nodes(node))
-    for node, kind, changed in planted:
+    faults = []
+    changes = ((node, *change) for node in visited(ast.parse(text)) for change in changed_nodes(node))
+    for node, kind, changed in changes:
         start, end = (
             lines[row - 1] + column
             for row, column in ((node.lineno, node.col_offset), (node.end_lineno, node.end_col_offset))
@@ -152,12 +152,12 @@ def faults_of(path: Path) -> list[Fault]:
         if isinstance(changed, ast.BinOp | ast.BoolOp | ast.Compare):
             after = f"({after})"
         file = path.relative_to(ROOT).as_posix()
-        found.append(Fault(file, node.lineno, kind, start, end, before, after))  # type: ignore[attr-defined]
-    return found
+        faults.append(Fault(file, node.lineno, kind, start, end, before, after))  # type: ignore[attr-defined]
+    return faults
 
 
-def chosen(rooms: list[str], count: int, seed: int) -> list[Fault]:
-    """``count`` faults, shared among the rooms by the root of their sizes; the kinds are equally likely."""
+def choose_faults(rooms: list[str], count: int, seed: int) -> list[Fault]:
+    """Choose about ``count`` faults, by the square root of the rooms' sizes; all kinds are equally likely."""
     rng = random.Random(seed)
     by_room = {
         room: [
@@ -179,7 +179,7 @@ def chosen(rooms: list[str], count: int, seed: int) -> list[Fault]:
 
 
 def copy_checkout(folder: Path) -> Path:
-    """The files of the checkout, tracked or new, in a folder with the development data beside it, if there are any."""
+    """Copy the checkout, tracked and new files, into ``folder``, and link development data beside it, if any."""
     listing = subprocess.run(
         ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"],
         cwd=ROOT,
@@ -198,7 +198,7 @@ def copy_checkout(folder: Path) -> Path:
 
 
 def tests_of(fault: Fault, place: Path) -> list[str]:
-    """The files of tests for a fault: those most likely to fail first, then the room's, then other rooms'."""
+    """The test files for a fault: the module's own, then those of its room, then others that import the module."""
     module = Path(fault.file).relative_to("src").with_suffix("").as_posix().replace("/", ".")
     parent, _, name = module.rpartition(".")
     imports = re.compile(rf"{re.escape(module)}\b|from {re.escape(parent)} import .*\b{name}\b")
@@ -213,7 +213,7 @@ def tests_of(fault: Fault, place: Path) -> list[str]:
 
 
 def is_caught(fault: Fault | None, place: Path, room: str) -> bool:
-    """Plant the fault in the copy, run its tests, and take the fault out again."""
+    """Plant the fault in the copy, run its tests, and remove it again. Without a fault, run the room's tests."""
     tests = [f"tests/{room}"]
     original = b""
     if fault is not None:
@@ -222,7 +222,7 @@ def is_caught(fault: Fault | None, place: Path, room: str) -> bool:
         (place / fault.file).write_bytes(original[: fault.start] + fault.after.encode() + original[fault.end :])
     tests += FURTHER_TESTS.get(room, [])
     words = [sys.executable, "-m", "pytest", "-q", "-x", "-m", "not slow", "-p", "no:cacheprovider", "-n", "0", *tests]
-    # Byte code is kept of the files as they are, not of faults: two of one second and size would be taken for the same.
+    # No byte code of faulty files is kept: Python takes files of one size and second for the same.
     environment = os.environ | {"PYTHONPATH": str(place / "src"), "PYTHONDONTWRITEBYTECODE": "1" if fault else ""}
     try:
         done = subprocess.run(words, cwd=place, env=environment, capture_output=True, timeout=SECONDS, check=False)
@@ -232,7 +232,7 @@ def is_caught(fault: Fault | None, place: Path, room: str) -> bool:
     finally:
         if fault is not None:
             (place / fault.file).write_bytes(original)
-            shutil.copystat(ROOT / fault.file, place / fault.file)  # its byte code is valid again
+            shutil.copystat(ROOT / fault.file, place / fault.file)  # makes its kept byte code valid again
 
 
 def main() -> int:
@@ -242,7 +242,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=int, default=2)
     arguments = parser.parse_args()
-    faults = chosen(arguments.rooms, arguments.count, arguments.seed)
+    faults = choose_faults(arguments.rooms, arguments.count, arguments.seed)
     random.Random(arguments.seed).shuffle(faults)
     with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(arguments.workers) as pool:
         places: Queue[Path] = Queue()

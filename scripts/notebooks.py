@@ -1,7 +1,7 @@
 """Run the notebooks and keep their outputs in the .ipynb files: ``make notebooks``.
 
-A notebook's source is its .py file. A forge shows the .ipynb as it is, so it carries what the cells print and draw,
-with small pictures and without what differs from machine to machine: paths, times of execution, numbers of cells' runs.
+A notebook's source is its .py file. A forge shows the .ipynb, so that file holds the outputs of the cells, with small
+pictures and without what differs between machines: paths, execution times and execution counts.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ import nbformat
 from PIL import Image
 
 NOTEBOOKS = Path(__file__).resolve().parents[1] / "notebooks"
-MOST_BYTES = 300_000  # of a notebook
+MAX_BYTES = 300_000  # of a notebook
 WIDTH = 640  # px, of a picture
-OURS = re.compile(r"(/[\w.-]+)*/gsbench-\w+(?=/|\b)")  # the temporary folder that each notebook makes
+SCRATCH = re.compile(r"(/[\w.-]+)*/gsbench-\w+(?=/|\b)")  # the temporary folder that each notebook makes
 
 
 def main(names: list[str]) -> int:
-    """Run the notebooks whose names begin with one of ``names``, or all; returns how many became too large."""
+    """Run the notebooks whose names begin with one of ``names``, or all; returns the number of too large ones."""
     too_large = 0
     for source in sorted(NOTEBOOKS.glob("*.py")):
         if names and not source.name.startswith(tuple(names)):
@@ -36,12 +36,12 @@ def main(names: list[str]) -> int:
         text = nbformat.writes(notebook)
         source.with_suffix(".ipynb").write_text(text + "\n", encoding="utf-8")
         print(f"{source.stem}: {len(text) // 1000} kB")
-        too_large += len(text) > MOST_BYTES
+        too_large += len(text) > MAX_BYTES
     return too_large
 
 
 def executed(notebook: Any) -> Any:
-    """The notebook after a run in an empty folder, with what it gave; pages of the program stand in its own folder."""
+    """The notebook with the outputs of a run in an empty folder."""
     with tempfile.TemporaryDirectory() as folder:
         os.environ["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
         resources = {"metadata": {"path": folder}}
@@ -58,7 +58,7 @@ def executed(notebook: Any) -> Any:
 
 
 def joined(outputs: list[Any]) -> list[Any]:
-    """The outputs with the pieces of one stream put together."""
+    """The outputs, with the pieces of each stream joined."""
     kept: list[Any] = []
     for output in outputs:
         streams = [old for old in kept if output.output_type == "stream" == old.output_type and old.name == output.name]
@@ -70,17 +70,17 @@ def joined(outputs: list[Any]) -> list[Any]:
 
 
 def tidied(output: Any) -> Any:
-    """An output without numbers of runs, folders of this machine, and pixels that nobody needs."""
+    """An output without execution counts and paths of this machine, and with small pictures."""
     if "execution_count" in output:
         output.execution_count = None
     if output.output_type == "stream":
-        output.text = OURS.sub("/tmp/gsbench", output.text)
+        output.text = SCRATCH.sub("/tmp/gsbench", output.text)
         return output
     for kind, content in list(output.get("data", {}).items()):
         if kind == "image/png":
             output.data[kind] = small(content)
         elif isinstance(content, str):
-            output.data[kind] = OURS.sub("/tmp/gsbench", content)
+            output.data[kind] = SCRATCH.sub("/tmp/gsbench", content)
     return output
 
 

@@ -36,7 +36,7 @@ def pixels(path: Path) -> NDArray[np.float64]:
 
 
 def initial_cloud(model: Path, view: str, size: tuple[int, int]) -> NDArray[np.float64]:
-    """The points of a COLMAP model as its camera of ``view`` sees them, the near ones in front: [H, W, 3]."""
+    """The points of a COLMAP model as the camera of ``view`` sees them, near points in front: [H, W, 3]."""
     reconstruction = pycolmap.Reconstruction(model)
     (image,) = (entry for entry in reconstruction.images.values() if Path(entry.name).stem == Path(view).stem)
     width, height = size
@@ -57,7 +57,7 @@ def initial_cloud(model: Path, view: str, size: tuple[int, int]) -> NDArray[np.f
 
 
 def verdict() -> str:
-    """The note on the verdict that ``gsbench tables demo`` prints."""
+    """The note with the verdict that ``gsbench tables demo`` prints; empty if there is none."""
     with contextlib.redirect_stdout(io.StringIO()) as printed:
         run(["tables", "demo"])
     notes = [line.removeprefix("- ") for line in printed.getvalue().splitlines() if line.startswith("- Verdict")]
@@ -94,13 +94,14 @@ def main(runs: Path) -> None:
         axis.axis("off")
     below = figure.add_subplot(grid[1, :])
     below.axis("off")
-    there = [name for name in COLUMNS if name in frame]
+    columns = [name for name in COLUMNS if name in frame]
     cells = []
     for arm in (BASELINE, IDEA):
         rows = frame[frame["densify"] == arm]
-        shown = [f"{FORMATS[n].format(rows[n].mean())} ± {FORMATS[n].format(rows[n].std())}" for n in there]
-        cells.append([arm, *shown])
-    table = below.table(cells, colLabels=["", *(COLUMNS[name] for name in there)], loc="upper center", cellLoc="center")
+        values = [f"{FORMATS[n].format(rows[n].mean())} ± {FORMATS[n].format(rows[n].std())}" for n in columns]
+        cells.append([arm, *values])
+    labels = ["", *(COLUMNS[name] for name in columns)]
+    table = below.table(cells, colLabels=labels, loc="upper center", cellLoc="center")
     table.auto_set_font_size(False)
     table.set_fontsize(11)
     table.scale(0.8, 1.25)

@@ -1,6 +1,6 @@
-"""Pages of the site that are made from the code: every setting, the keys of ``results.json``, the public names.
+"""Pages of the site that are generated from the code: all settings, the keys of ``results.json``, the public names.
 
-``python scripts/reference.py settings|results|api`` prints one of them as Markdown.
+``python scripts/reference.py settings|results|api`` prints one of them as Markdown, ``schema`` the JSON Schema.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ PYTHON_BLOCK = re.compile(r"^```python\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 YAML_COMMENT = re.compile(r"^(\w+):[^#\n]* # *(.+)$", re.MULTILINE)
 
 
-# --- what stands beside a field -------------------------------------------------------------------------------------
+# --- comments of fields ---------------------------------------------------------------------------------------------
 
 
 @cache
 def comments_of(cls: type) -> dict[str, str]:
-    """The comment at the end of each field's lines, of a class and of those that it is made from."""
-    found: dict[str, str] = {}
+    """The comments at the ends of lines, by field, of a class and its base classes."""
+    comments: dict[str, str] = {}
     for kind in reversed(cls.__mro__):
         if not kind.__module__.startswith("gsbench"):
             continue
@@ -52,22 +52,22 @@ def comments_of(cls: type) -> dict[str, str]:
             if isinstance(entry, ast.AnnAssign) and isinstance(entry.target, ast.Name):
                 lines = range(entry.lineno, (entry.end_lineno or entry.lineno) + 1)
                 words = " ".join(at_line[line] for line in lines if line in at_line and "noqa" not in at_line[line])
-                found[entry.target.id] = words.removeprefix("type: ignore[misc]").strip()
-    return found
+                comments[entry.target.id] = words.removeprefix("type: ignore[misc]").strip()
+    return comments
 
 
 @cache
 def yaml_comments_of(group: str) -> dict[str, str]:
-    """The first comment that the files of a group have at the end of a key's line."""
-    found: dict[str, str] = {}
+    """The comments at the ends of lines, by key, in a group's files; of several for one key the first."""
+    comments: dict[str, str] = {}
     for file in sorted((ROOT / "conf" / group).rglob("*.yaml")):
         for key, words in YAML_COMMENT.findall(file.read_text(encoding="utf-8")):
-            found.setdefault(key, words)
-    return found
+            comments.setdefault(key, words)
+    return comments
 
 
 def row(*cells: str) -> str:
-    """One row of a table; what would end a cell is escaped."""
+    """One row of a table, with pipes and line breaks escaped."""
     return "| " + " | ".join(cell.replace("|", "\\|").replace("\n", " ") for cell in cells) + " |"
 
 
@@ -75,8 +75,8 @@ def table(*heads: str) -> list[str]:
     return [row(*heads), row(*("---" for _ in heads))]
 
 
-def shown(value: Any) -> str:
-    """A default as YAML writes it."""
+def default_text(value: Any) -> str:
+    """A default, nearly as YAML writes it."""
     if value == MISSING or value is dataclasses.MISSING:
         return ""
     text = json.dumps(value, default=str)
@@ -97,39 +97,39 @@ def settings_of(cls: type, group: str, leave_out: frozenset[str] = frozenset()) 
         default = entry.default if entry.default_factory is dataclasses.MISSING else entry.default_factory()
         key = f"{group}.{entry.name}" if group else entry.name
         meaning = comments_of(cls).get(entry.name, "") or yaml_comments_of(group).get(entry.name, "")
-        yield row(f"`{key}`", describe(hints[entry.name]), shown(default), meaning)
+        yield row(f"`{key}`", describe(hints[entry.name]), default_text(default), meaning)
 
 
 def classes_of(group: str) -> dict[str, tuple[type, list[str]]]:
-    """The classes that the files of a group name, each with the choices that name it."""
-    found: dict[str, tuple[type, list[str]]] = {}
+    """The classes that a group's files name, each with the choices that name it."""
+    classes: dict[str, tuple[type, list[str]]] = {}
     for file in sorted((ROOT / "conf" / group).glob("*.yaml")):
         target = str((yaml.safe_load(file.read_text(encoding="utf-8")) or {}).get("_target_", ""))
         if target:
             module, _, name = target.rpartition(".")
             cls = getattr(importlib.import_module(module), name)
-            found.setdefault(target, (cls, []))[1].append(file.stem)
-    return found
+            classes.setdefault(target, (cls, []))[1].append(file.stem)
+    return classes
 
 
 def settings_page() -> str:
-    """All settings: of the root, of each group, and of each class that a group can name."""
+    """All settings: of the root, of each group, and of each class that a group's files name."""
     lines = [
         "Defaults are those of the class; a file below `conf/` may set another.",
         "",
     ]
-    whole = frozenset({*GROUP_SCHEMAS, "init", "densify"})
+    groups = frozenset({*GROUP_SCHEMAS, "init", "densify"})
     lines += [
         "### The root",
         "",
         *table(*HEADS),
-        *settings_of(Config, "", whole),
+        *settings_of(Config, "", groups),
         "",
     ]
     for group, cls in GROUP_SCHEMAS.items():
         lines += [f"### {group}", "", *table(*HEADS), *settings_of(cls, group), ""]
     for group in ("init", "densify"):
-        lines += [f"### {group}", "", "A class has the settings of the class that it is made from, too.", ""]
+        lines += [f"### {group}", "", "A class also has the settings of its base class.", ""]
         listed: set[type] = set()
         for cls, choices in classes_of(group).values():
             for kind in reversed(cls.__mro__):
@@ -141,10 +141,10 @@ def settings_page() -> str:
                 inherited = frozenset(f.name for f in dataclasses.fields(kind) if f.name not in own)
                 rows = list(settings_of(kind, group, inherited))
                 named = f" (`{group}={'`, `'.join(choices)}`)" if kind is cls else ""
-                based = f", made from `{bases[0].__name__}`" if bases else ""
+                based = f", base class `{bases[0].__name__}`" if bases else ""
                 if rows or named:
-                    said = plain((inspect.getdoc(kind) or "").partition("\n")[0])
-                    lines += [f"**`{kind.__name__}`**{named}{based}. {said}", ""]
+                    summary = as_markdown((inspect.getdoc(kind) or "").partition("\n")[0])
+                    lines += [f"**`{kind.__name__}`**{named}{based}. {summary}", ""]
                 lines += [*table(*HEADS), *rows, ""] if rows else []
     return "\n".join(lines) + "\n"
 
@@ -162,21 +162,21 @@ def schema_text() -> str:
     return json.dumps(schema(), indent=1) + "\n"
 
 
-def words_of(part: dict[str, Any]) -> str:
-    """The kind of a value, read from its JSON Schema."""
+def type_text(part: dict[str, Any]) -> str:
+    """The type of a value in words, from its JSON Schema."""
     if "$ref" in part:
         return f"[{part['$ref'].rpartition('/')[2]}](#{part['$ref'].rpartition('/')[2].lower()})"
     if "anyOf" in part:
-        return " or ".join(words_of(option) for option in part["anyOf"])
+        return " or ".join(type_text(option) for option in part["anyOf"])
     if "const" in part or "enum" in part:
         return " or ".join(f'`"{value}"`' for value in part.get("enum", [part.get("const")]))
     kind = part.get("type", "anything")
     if kind == "object":
         inner = part.get("additionalProperties")
-        return f"{{text: {words_of(inner)}}}" if isinstance(inner, dict) else "object"
+        return f"{{text: {type_text(inner)}}}" if isinstance(inner, dict) else "object"
     if kind == "array":
         inner = part.get("prefixItems") or [part.get("items") or {}]
-        return f"[{', '.join(words_of(item) for item in inner)}]"
+        return f"[{', '.join(type_text(item) for item in inner)}]"
     least = " ≥ 0" if part.get("minimum") == 0 else ""
     return {"string": "text", "integer": "whole number", "number": "number", "boolean": "true or false"}.get(
         kind, kind
@@ -184,23 +184,23 @@ def words_of(part: dict[str, Any]) -> str:
 
 
 def results_page() -> str:
-    """The keys of ``results.json``, those of its parts below."""
+    """The keys of ``results.json``, followed by the keys of its nested objects."""
     whole = schema()
     records = importlib.import_module(TrialRecord.__module__)
     lines: list[str] = []
     for name, part in {"TrialRecord": whole, **whole.get("$defs", {})}.items():
         cls = getattr(records, name)
-        lines += [f"### {'The file' if cls is TrialRecord else name}", "", plain(inspect.getdoc(cls) or ""), ""]
+        lines += [f"### {'The file' if cls is TrialRecord else name}", "", as_markdown(inspect.getdoc(cls) or ""), ""]
         lines += table("key", "value", "", "meaning")
         required = set(part.get("required", ()))
         for key, value in part["properties"].items():
-            there = "always" if key in required else "optional"
-            lines.append(row(f"`{key}`", words_of(value), there, comments_of(cls).get(key, "")))
+            presence = "always" if key in required else "optional"
+            lines.append(row(f"`{key}`", type_text(value), presence, comments_of(cls).get(key, "")))
         lines.append("")
     return "\n".join(lines) + "\n"
 
 
-def plain(text: str) -> str:
+def as_markdown(text: str) -> str:
     """A docstring as Markdown."""
     return text.replace("``", "`")
 
@@ -209,8 +209,8 @@ def plain(text: str) -> str:
 
 
 def public_names() -> dict[str, list[str]]:
-    """Module: the names that are public, which the documents import, or which stand in the ``__all__`` of a package."""
-    found: dict[str, set[str]] = {}
+    """The public names by module: those in the ``__all__`` of a package, and those that the documents import."""
+    public: dict[str, set[str]] = {}
     for file in sorted((ROOT / "src" / "gsbench").glob("*/__init__.py")):
         module = f"gsbench.{file.parent.name}"
         for node in ast.parse(file.read_text(encoding="utf-8")).body:
@@ -219,14 +219,14 @@ def public_names() -> dict[str, list[str]]:
                 and isinstance(node.targets[0], ast.Name)
                 and node.targets[0].id == "__all__"
             ):
-                found.setdefault(module, set()).update(ast.literal_eval(node.value))
+                public.setdefault(module, set()).update(ast.literal_eval(node.value))
     for page in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))):
         for block in PYTHON_BLOCK.findall(page.read_text(encoding="utf-8")):
             for node in ast.walk(ast.parse(block)):
                 if isinstance(node, ast.ImportFrom) and str(node.module).startswith("gsbench."):
-                    found.setdefault(str(node.module), set()).update(alias.name for alias in node.names)
+                    public.setdefault(str(node.module), set()).update(alias.name for alias in node.names)
     internal = ("gsbench.bench", "gsbench.tracking")  # packages with an `__all__` for the program's own use
-    return {module: sorted(names) for module, names in sorted(found.items()) if module not in internal}
+    return {module: sorted(names) for module, names in sorted(public.items()) if module not in internal}
 
 
 def api_page() -> str:

@@ -1,8 +1,8 @@
 #!/usr/bin/env bash
-# A real Slurm on this one machine, to try launch=slurm or to test it. Debian or Ubuntu, as root; no systemd needed.
+# Sets up a real Slurm on this one machine, to try or test launch=slurm. Debian or Ubuntu, as root; no systemd needed.
 #
 #   scripts/slurm_one_node.sh start     install what is missing, write /etc/slurm/slurm.conf, start the daemons
-#   scripts/slurm_one_node.sh stop      end the daemons that `start` began
+#   scripts/slurm_one_node.sh stop      end these daemons
 #
 # Not for a cluster: everything runs as root, and there is no accounting. It refuses to touch a Slurm that it did not set up.
 set -euo pipefail
@@ -30,7 +30,7 @@ start() {
   cores=$(nproc)
   mkdir -p /etc/slurm /var/lib/slurm/slurmctld /var/lib/slurm/slurmd /var/log/slurm /run/munge
   chown munge: /run/munge
-  # cred_expire: a requeued job waits for so many seconds before it may start again (Slurm's default is 120).
+  # cred_expire: the seconds that a requeued job waits before it may start again (Slurm's default is 120).
   cat >"$CONF" <<EOF
 $MARK
 ClusterName=gsbench

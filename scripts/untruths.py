@@ -1,10 +1,11 @@
-"""Simulated checks of claims whose truth is known: how often each word is untrue, for the table of docs/verdict.md.
+"""Simulated checks of claims whose truth is known: how often each verdict is wrong, for the table of docs/verdict.md.
 
     python scripts/untruths.py                 write the table into the page (about ten minutes)
     python scripts/untruths.py --checks 200    print it from fewer checks
 
-A check has four claims that share 5 %, looks at 2, 3 and 4 seeds, and trains no further once a claim is decided.
-Differences are in deviations of a pair of trainings; the least effect that matters is `LEAST` of them.
+A check has four claims that share an error rate of 5 %. It looks at 2, 3 and 4 seeds, and trains no further once a
+claim is decided. Differences are in standard deviations of a pair of trainings; `LEAST` is the least effect that
+matters.
 """
 
 from __future__ import annotations
@@ -32,34 +33,27 @@ LOOKS = (2, 3, 4)
 LEAST = 1.0
 
 Array = NDArray[np.float64]
-Draw = Callable[[np.random.Generator], tuple[list[Array], Array, Array]]  # noise of both arms [K] by scene; effects
+# Draws, for each scene: the noise of both arms [2, K], the scene's own effect, and the mean of its noise.
+Draw = Callable[[np.random.Generator], tuple[list[Array], Array, Array]]
 
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of sweep: ``draw`` gives for each scene both arms' noise, and the scenes' own effects beside the common
-    one.
-
-    ``median`` is that of the effects of scenes like these, ``looks`` are planned; none: all is judged once.
-    """
+    """A kind of sweep to simulate."""
 
     draw: Draw
-    looks: tuple[int, ...] = LOOKS
-    median: float = 0.0
+    looks: tuple[int, ...] = LOOKS  # numbers of seeds; none: all trials are judged once
+    median: float = 0.0  # of the own effects of scenes like these
     claims: int = CLAIMS
 
 
 @dataclass(frozen=True)
 class Rates:
-    """Shares of checks: ``told``, with which each word was said of a claim; ``untrue``, in which it was said untruly of
-    any.
+    """Rates at which verdicts occur and are wrong."""
 
-    ``like_these``: in which any of the words about scenes like these was untrue.
-    """
-
-    told: dict[str, float]
-    untrue: dict[str, float]
-    like_these: float
+    outcomes: dict[str, float]  # share of claims with each verdict
+    untrue: dict[str, float]  # share of checks that give a claim this verdict wrongly
+    like_these: float  # share of checks with a wrong verdict about scenes like these
 
 
 def _normal(
@@ -74,8 +68,7 @@ def normal(rng: np.random.Generator, scenes: int = 3) -> tuple[list[Array], Arra
 
 
 def standing_out(rng: np.random.Generator) -> tuple[list[Array], Array, Array]:
-    """Eight scenes, drawn from many of which one in eight gains .044 and the others lose .0063, in deviations of
-    .005."""
+    """Eight scenes of a population where one in eight gains .044 and the others lose .0063; deviations are .005."""
     rows, _, _ = normal(rng, 8)
     return rows, np.where(rng.random(8) < 1 / 8, 0.044, -0.0063) / 0.005, np.zeros(8)
 
@@ -85,8 +78,7 @@ def noisy(rng: np.random.Generator) -> tuple[list[Array], Array, Array]:
 
 
 def failing(rng: np.random.Generator, arms: tuple[int, ...]) -> tuple[list[Array], Array, Array]:
-    """One training in ten of each of these ``arms`` goes wrong by ten deviations, which counts as effect in the
-    mean."""
+    """One training in ten of each of these ``arms`` is worse by ten deviations, which changes the true mean."""
     rows, effects, _ = normal(rng)
     for row in rows:
         for arm in arms:
@@ -110,24 +102,24 @@ KINDS = {
 
 
 def rates(kind: Kind, effect: float, checks: int, seed: int = 0) -> Rates:
-    """The rates over ``checks`` simulated checks at a real ``effect`` of so many times the least that matters."""
+    """The rates over ``checks`` simulated checks. The real ``effect`` is in units of the least that matters."""
     rng = np.random.default_rng([seed, round(1000 * effect)])
     words = ("supported", "refuted", "too small to matter", "undecided")
-    told, untrue, beyond = dict.fromkeys(words, 0), dict.fromkeys(words[:3], 0), 0
+    counts, untrue, like_these = dict.fromkeys(words, 0), dict.fromkeys(words[:3], 0), 0
     for _ in range(checks):
-        found = [_claim(kind, effect * LEAST, rng) for _ in range(kind.claims)]
-        for verdict, _ in found:
-            told[verdict.outcome] += 1
+        claims = [_claim(kind, effect * LEAST, rng) for _ in range(kind.claims)]
+        for verdict, _ in claims:
+            counts[verdict.outcome] += 1
         for word in untrue:
-            untrue[word] += any(v.outcome == word and not _is_true(word, truth) for v, truth in found)
+            untrue[word] += any(v.outcome == word and not _is_true(word, truth) for v, truth in claims)
         median = effect * LEAST + kind.median
-        beyond += any(v.like_these and not _is_true(v.like_these.outcome, median) for v, _ in found)
-    shares = {word: count / checks / kind.claims for word, count in told.items()}
-    return Rates(shares, {word: count / checks for word, count in untrue.items()}, beyond / checks)
+        like_these += any(v.like_these and not _is_true(v.like_these.outcome, median) for v, _ in claims)
+    shares = {word: count / checks / kind.claims for word, count in counts.items()}
+    return Rates(shares, {word: count / checks for word, count in untrue.items()}, like_these / checks)
 
 
 def _is_true(word: str, truth: float) -> bool:
-    """Whether the word is true of a claim of more where ``truth`` is the difference."""
+    """Return whether the verdict ``word`` on the claim "more" is right if ``truth`` is the real difference."""
     return {"supported": truth > 0, "refuted": truth < 0, "too small to matter": abs(truth) < LEAST}.get(word, True)
 
 
@@ -161,21 +153,21 @@ EFFECTS = (0.0, 0.5, 1.0, 2.0)
 
 
 def table(checks: int) -> str:
-    """A kind of sweep and a real effect a row: what is said of a claim, and in how many checks a word is untrue."""
+    """The table: for each kind of sweep and real effect, how often each verdict occurs, and how often it is wrong."""
     lines = ["| differences | effect | supported | refuted | too small | undecided | untrue: supported | refuted | "]
     lines[0] += "too small | scenes like these |"
     lines.append("|" + "---|" * 10)
     for name, kind in KINDS.items():
         for effect in EFFECTS:
-            found = rates(kind, effect, checks)
-            shares = [*found.told.values(), *found.untrue.values(), found.like_these]
+            measured = rates(kind, effect, checks)
+            shares = [*measured.outcomes.values(), *measured.untrue.values(), measured.like_these]
             lines.append(f"| {name} | {effect:g} | " + " | ".join(f"{100 * share:.1f} %" for share in shares) + " |")
     return "\n".join(lines) + "\n"
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--checks", type=int, help="print the table of so many checks a row, and leave the page alone")
+    parser.add_argument("--checks", type=int, help="print the table from this many checks a row; the page stays")
     wanted = parser.parse_args().checks
     made = table(wanted or 3000)
     if wanted is None:

@@ -180,7 +180,7 @@ REPOSITORY = "https://example.org/owner/gsbench/"
     ],
 )
 def test_links_lead_on_from_the_site(link: str, folder: str, repository: str | None, wanted: str) -> None:
-    assert script("build_site").led_on(link, ROOT / folder, repository) == wanted
+    assert script("build_site").with_site_links(link, ROOT / folder, repository) == wanted
 
 
 @pytest.mark.parametrize(

@@ -204,7 +204,7 @@ def test_a_noisy_scene_with_few_seeds_does_not_make_verdicts() -> None:
 
 def test_an_effect_that_matters_is_found() -> None:
     found = rates(KINDS["normal"], 2.0, CHECKS)
-    assert found.told["supported"] > 0.8
+    assert found.outcomes["supported"] > 0.8
 
 
 def test_seeds_needed_give_the_promised_power() -> None:
