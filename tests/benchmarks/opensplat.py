@@ -22,7 +22,14 @@ import numpy as np
 import psutil
 import torch
 
-from gsbench.bench.measure import NEVER, NOWHERE, SH_DEGREE, WARM_UP_STEPS, make_rasterizer, standing_still
+from gsbench.bench.measure import (
+    NEVER,
+    SH_DEGREE,
+    UNUSED_FOLDER,
+    WARM_UP_STEPS,
+    constant_scene_options,
+    make_rasterizer,
+)
 from gsbench.bench.scenes import frontal_camera, trained_like_gaussians
 from gsbench.densify import ADC
 from gsbench.external.exchange import write_training_views
@@ -82,7 +89,7 @@ class Ours:
     def __init__(self, gaussians: Gaussians, views: tuple[View, ...]) -> None:
         densifier = ADC(start=NEVER - 1, stop=NEVER, opacity_reset_interval=NEVER, max_gaussians=None)
         rasterizer = make_rasterizer("cpu", torch.device("cpu"), 1)
-        self.trainer = Trainer(Scene("bench", views, ()), gaussians, densifier, rasterizer, standing_still(), 0)
+        self.trainer = Trainer(Scene("bench", views, ()), gaussians, densifier, rasterizer, constant_scene_options(), 0)
         self.trainer.step = SH_DEGREE
         self.milliseconds(WARM_UP_STEPS)
 
@@ -90,7 +97,7 @@ class Ours:
         """Processor time of an iteration."""
         begin = time.process_time()
         for _ in range(iterations):
-            self.trainer.iterate(NOWHERE)
+            self.trainer.iterate(UNUSED_FOLDER)
         return 1e3 * (time.process_time() - begin) / iterations
 
 

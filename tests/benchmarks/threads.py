@@ -21,7 +21,7 @@ from unittest import mock
 import numpy as np
 import torch
 
-from gsbench.bench.measure import NEVER, SH_DEGREE, standing_still
+from gsbench.bench.measure import NEVER, SH_DEGREE, constant_scene_options
 from gsbench.bench.scenes import make_scene
 from gsbench.densify import ADC
 from gsbench.gaussians.model import Gaussians
@@ -58,7 +58,7 @@ class Timed:
 
     def __init__(self, gaussians: Gaussians, scene: Scene) -> None:
         densifier = ADC(start=NEVER - 1, stop=NEVER, opacity_reset_interval=NEVER, max_gaussians=None)
-        self.trainer = Trainer(scene, gaussians, densifier, CpuRasterizer(threads=1), standing_still(), 0)
+        self.trainer = Trainer(scene, gaussians, densifier, CpuRasterizer(threads=1), constant_scene_options(), 0)
         self.trainer.step = SH_DEGREE
         self.stages: list[tuple[str, list[float]]] = []
 

@@ -22,7 +22,7 @@ from gsbench.init.base import PointCloud
 from gsbench.runs.keys import config_hash
 from gsbench.scene.camera import Camera
 from gsbench.scene.types import View
-from gsbench.system.isolate import telling_tail
+from gsbench.system.isolate import error_tail
 from tests.config.test_schema import composed
 from tests.processes import is_running
 
@@ -166,8 +166,8 @@ def test_the_last_words_of_gigabytes_of_output_cost_little(tmp_path: Path) -> No
         stream.write(b"\nstep 30000\nRuntimeError: CUDA out of memory\n")
     tracemalloc.start()
     try:
-        assert telling_tail(log) == "RuntimeError: CUDA out of memory"
+        assert error_tail(log) == "RuntimeError: CUDA out of memory"
         assert tracemalloc.get_traced_memory()[1] < 64 << 20
     finally:
         tracemalloc.stop()
-    assert telling_tail(log, log.stat().st_size) == "(no output)"
+    assert error_tail(log, log.stat().st_size) == "(no output)"

@@ -14,7 +14,7 @@ from pathlib import Path
 import torch
 
 import tests.raster.conftest  # noqa: F401 - makes the interpreter quicker
-from gsbench.bench.measure import NEVER, standing_still
+from gsbench.bench.measure import NEVER, constant_scene_options
 from gsbench.bench.scenes import make_scene
 from gsbench.densify import ADC, MCMC
 from gsbench.raster import create_rasterizer, staged
@@ -36,7 +36,7 @@ def main(raster: str) -> None:
     gaussians, scene = make_scene("trained", 20, 20, 12)
     for name, densifier in DENSIFIERS.items():
         rasterizer = create_rasterizer(raster, torch.device("cpu"))
-        trainer = Trainer(scene, gaussians, densifier, rasterizer, standing_still(), 0)
+        trainer = Trainer(scene, gaussians, densifier, rasterizer, constant_scene_options(), 0)
         trainer.loss = torch_photometric_loss  # type: ignore[assignment] # no kernel of the CPU
         for _ in range(2):  # one of every kind of memory is there
             trainer.iterate(Path())

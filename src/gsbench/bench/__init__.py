@@ -1,4 +1,4 @@
-"""Costs of a training step with each rasterizer: times and their split, peak memory."""
+"""Time of a training step and its parts, and peak memory, with each rasterizer."""
 
 from gsbench.bench.measure import run_bench
 

@@ -1,4 +1,4 @@
-"""Rasterizers side by side: single steps in parts, and whole steps and frames as trainings and viewers make them."""
+"""Comparison of rasterizers: training steps in parts, whole training steps, and frames as in a viewer."""
 
 import itertools
 import statistics
@@ -22,28 +22,28 @@ from gsbench.train.device import disable_tf32
 from gsbench.train.options import TrainConfig
 from gsbench.train.trainer import Trainer
 
-WARM_UP_STEPS = 2  # compile, and let memory pools grow
+WARM_UP_STEPS = 2  # they compile kernels and fill memory pools
 SH_DEGREE = 3
 NEVER = 10**9  # iterations
-STANDSTILL = 1e-30  # learning rates: the work of Adam on a scene that stays as it is
-STEPS_AT_ONCE = {"cpu": 1, "cuda": 10}  # whole steps between two looks at the clock; losses are read as often
-NOWHERE = Path("/nonexistent")  # a folder that is named and never used: no snapshot is asked for
+ZERO_RATE = 1e-30  # learning rate: Adam does its work, but the scene does not change
+STEPS_AT_ONCE = {"cpu": 1, "cuda": 10}  # whole steps between two readings of the clock and of the losses
+UNUSED_FOLDER = Path("/nonexistent")  # for snapshots, which are off
 
 
 @dataclass(frozen=True)
 class Setting:
-    """Conditions of a measurement."""
+    """The scene, image size and threads of a measurement."""
 
     scene: str  # of `bench.scenes.SCENES`
     width: int  # px
     height: int  # px
     count: int  # Gaussians
     ply: Path | None = None  # instead of ``scene`` and ``count``
-    threads: int | None = None  # None: as many as torch takes
+    threads: int | None = None  # None: torch's default
 
 
 class Stepper:
-    """A training of ``setting`` with the rasterizer called ``raster``: an executor, or an import path."""
+    """A training of ``setting`` with the rasterizer ``raster``, an executor's name or the import path of a class."""
 
     def __init__(self, raster: str, setting: Setting) -> None:
         self.threads = setting.threads or torch.get_num_threads()
@@ -58,13 +58,13 @@ class Stepper:
             gaussians.map(lambda tensor: tensor.detach().to(self.device)),
             ADC(start=NEVER - 1, stop=NEVER, opacity_reset_interval=NEVER, max_gaussians=None),
             make_rasterizer(raster, self.device, self.threads),
-            standing_still(),
+            constant_scene_options(),
             SEED,
         )
-        self.trainer.step = SH_DEGREE  # with a new degree at every iteration
+        self.trainer.step = SH_DEGREE  # sh_interval is 1, so the degree is full from here on
 
     def step(self) -> dict[str, float]:
-        """One step as its parts, waiting for the device after each; ms."""
+        """Time the parts of one step, ms; wait for the device after each part."""
         trainer = self.trainer
         target = trainer.targets.get(0)
         cpu = time.process_time()
@@ -88,16 +88,16 @@ class Stepper:
         }
 
     def steps_per_second(self) -> float:
-        """Whole training steps: the next view, render, loss, backward, statistics, Adam, losses read now and then."""
+        """The speed of whole training steps: view, render, loss, backward, statistics, Adam, losses read at times."""
         steps = STEPS_AT_ONCE[self.device.type]
         begin = self._now()
         for _ in range(steps):
-            self.trainer.iterate(NOWHERE)
+            self.trainer.iterate(UNUSED_FOLDER)
         self.trainer.losses.wait()
         return steps / (self._now() - begin)
 
     def frames_per_second(self) -> float:
-        """Renders of one view as a viewer makes them: no gradients, no other work between."""
+        """The speed of rendering one view as a viewer does: without gradients or other work."""
         frames = STEPS_AT_ONCE[self.device.type]
         begin = self._now()
         with torch.no_grad():
@@ -112,7 +112,7 @@ class Stepper:
 
 
 def device_of(raster: str) -> torch.device:
-    """The device on which ``raster`` is timed: a GPU if it needs one, or is a user's own class and there is one."""
+    """The device for timing ``raster``: a GPU if it needs one, or if it is a user's class and there is a GPU."""
     if "." in raster:
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     device = torch.device("cpu" if find_executor(raster).runs_on("cpu") else "cuda")
@@ -122,20 +122,20 @@ def device_of(raster: str) -> torch.device:
 
 
 def make_rasterizer(raster: str, device: torch.device, threads: int) -> Rasterizer:
-    """The executor of that name, or the class at that import path: whoever types it here trusts it."""
+    """Make the executor called ``raster``, or the class at that import path, which the user has typed and so trusts."""
     if "." in raster:
         return build_rasterizer({"_target_": raster}, [raster.partition(".")[0]], device, threads)
     return build_rasterizer({"name": raster}, [], device, threads)
 
 
-def standing_still() -> TrainConfig:
-    """Options of a training that neither ends nor changes the Gaussians."""
+def constant_scene_options() -> TrainConfig:
+    """Options of a training that does not end and does not change the Gaussians."""
     rates = ("position_initial", "position_final", "sh_dc", "sh_rest", "opacity", "scale", "rotation")
-    return TrainConfig(name="bench", iterations=NEVER, sh_interval=1, **dict.fromkeys(rates, STANDSTILL))  # type: ignore[arg-type]
+    return TrainConfig(name="bench", iterations=NEVER, sh_interval=1, **dict.fromkeys(rates, ZERO_RATE))  # type: ignore[arg-type]
 
 
 def peak_memory(raster: str, setting: Setting) -> float:
-    """Peak memory, MiB, of the warm-up steps and one more; for a process of its own."""
+    """Peak memory, MiB, of the warm-up steps and one more; call it in a fresh process."""
     stepper = Stepper(raster, setting)
     if stepper.device.type == "cuda":
         reset_peak_memory(stepper.device)
@@ -156,13 +156,17 @@ def run_bench(
 ) -> list[dict[str, Any]]:
     """Time the training step with each of ``rasters`` for each image size (width, height) and count of Gaussians.
 
-    The rasters take turns, step by step; all times are medians over ``repeats``, in ms. ``forward_ms`` is the render,
-    ``backward_ms`` the backward pass of loss and render, ``step_ms`` everything; ``loss_ms`` and ``adam_ms`` are the
-    rest, and ``cpu_ms`` is the processor time of the step on all threads. ``step_ratio`` is the median of the turns'
-    quotients with the first of ``rasters``. ``steps_per_second`` is that of whole training steps, which nothing is
-    waited for in between; ``fps`` is frames a second, rendered alone. ``peak_memory_mb`` is that of a fresh process
-    that makes the same steps (on a GPU: of torch's allocations there), None if ``memory`` is false. With ``ply`` that
-    model is timed, not ``counts``. Raises InputError for a raster that cannot run here.
+    The rasterizers take turns, step by step. Times are medians over ``repeats``, in ms. With ``ply``, that model is
+    timed instead of ``counts``. Raises InputError for a rasterizer that cannot run here. Columns:
+
+    - ``step_ms``: the whole step, which consists of ``forward_ms`` (render), ``loss_ms``, ``backward_ms`` (of loss and
+      render) and ``adam_ms``;
+    - ``cpu_ms``: processor time of the step on all threads;
+    - ``step_ratio``: median over the turns of ``step_ms`` divided by that of the first of ``rasters``;
+    - ``steps_per_second``: whole training steps, without waits in between;
+    - ``fps``: frames per second of rendering alone;
+    - ``peak_memory_mb``: of a fresh process that makes the same steps (on a GPU: torch's allocations there); None if
+      ``memory`` is False.
     """
     rows = []
     with progress("bench") as report:
@@ -208,7 +212,7 @@ def _compare(
             "device": stepper.device.type,
         }
         rows.append(row)
-    del steppers, stepper  # their memory: the processes below need it
+    del steppers, stepper  # frees memory for the processes below
     for row in rows:
         row["peak_memory_mb"] = None
         if memory:

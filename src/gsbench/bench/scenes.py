@@ -1,4 +1,4 @@
-"""Scenes to be timed: synthetic Gaussians, equal for one count on every machine, or a trained model; and its camera."""
+"""Scenes for timing: synthetic Gaussians, the same on every machine, or a trained model; and a camera for them."""
 
 import math
 from pathlib import Path
@@ -16,21 +16,22 @@ from gsbench.scene.types import Scene, View
 SEED = 0
 FOCAL = 0.9  # of the image width
 VIEWS = 2
-FIRST_DEPTH, DEPTH_RATIO = 2.0, 12.0  # of the trained-like scene
+FIRST_DEPTH, DEPTH_RATIO = 2.0, 12.0  # trained-like scene: least depth, and largest / least depth
 # Standard deviation of the median Gaussian of 100,000, in units of depth: 1.6 px in an image 500 px wide.
 MEDIAN_SIGMA = 1.6 / (FOCAL * 500)
-SIGMA_EXPONENT = 0.4  # more Gaussians are smaller ones: sigma falls as count^-0.4
-SIGMA_SPREAD = 0.7  # of log sigma
-# Of the skewed scene: a trained courtyard has 117 entries a block in the mean, and 1,054 at most.
-SPOTS, SPOT_SHARE, SPOT_RADIUS = 40, 0.5, 0.05  # radius: of x/z and y/z
-BOX_DEPTH, BOX_SIDE = 4.0, 4.0  # of the random scene: where its middle is, and how large
-NEIGHBOUR = 0.7  # distance to the nearest neighbours in units of count^-1/3, about
+SIGMA_EXPONENT = 0.4  # sigma is proportional to count^-0.4: many Gaussians are smaller
+SIGMA_SPREAD = 0.7  # standard deviation of log sigma
+# Skewed scene; for comparison, a trained courtyard has 117 entries per block on average, and at most 1,054.
+SPOTS, SPOT_SHARE, SPOT_RADIUS = 40, 0.5, 0.05  # number; share of Gaussians; standard deviation of x/z and y/z
+BOX_DEPTH, BOX_SIDE = 4.0, 4.0  # random scene: depth of its centre, and side
+NEIGHBOUR = 0.7  # distance to the nearest neighbours in units of count^-1/3, approximately
 INITIAL_OPACITY = 0.1  # 3DGS
 
 
 def trained_like_gaussians(count: int, seed: int = SEED) -> Gaussians:
-    """Make ``count`` Gaussians like those of a trained model: many small and flat, few large, opacities of all kinds.
-    They fill the view of `frontal_camera` and a margin, a few of them outside.
+    """Make ``count`` Gaussians like those of a trained model: many small and flat, few large, with varied opacities.
+
+    They fill the view of `frontal_camera` and a margin around it.
     """
     generator = _generator(count, seed)
     depth = FIRST_DEPTH * torch.exp(torch.rand(count, generator=generator) * math.log(DEPTH_RATIO))  # [N]
@@ -49,8 +50,8 @@ def trained_like_gaussians(count: int, seed: int = SEED) -> Gaussians:
 
 
 def random_gaussians(count: int, seed: int = SEED) -> Gaussians:
-    """Make the Gaussians of a training's begin: ``count`` faint balls of equal size, as large as they are apart, in a
-    box before `frontal_camera`.
+    """Make ``count`` Gaussians like those at the start of a training: faint spheres of equal size in a box in front of
+    `frontal_camera`. Their size is the distance to their neighbours.
     """
     generator = _generator(count, seed)
     means = BOX_SIDE * (torch.rand(count, 3, generator=generator) - 0.5)
@@ -66,8 +67,11 @@ def random_gaussians(count: int, seed: int = SEED) -> Gaussians:
 
 
 def skewed_gaussians(count: int, seed: int = SEED) -> Gaussians:
-    """`trained_like_gaussians` of which half lie around a few spots of the image, most at the first, as detail does in
-    photographs: the longest list of a tile is eight to nine times the mean, there 1.3 times."""
+    """Make `trained_like_gaussians`, but move half of them to a few spots of the image, most to the first ones, like
+    detail in photographs.
+
+    The longest list of a tile is eight to nine times the mean; without the spots it is 1.3 times the mean.
+    """
     gaussians = trained_like_gaussians(count, seed)
     generator = _generator(count, seed + 1)
     weights = 1 / torch.arange(1, SPOTS + 1)  # Zipf's
@@ -84,7 +88,7 @@ SCENES = {"trained": trained_like_gaussians, "random": random_gaussians, "skewed
 
 
 def make_scene(kind: str, width: int, height: int, count: int, ply: Path | None = None) -> tuple[Gaussians, Scene]:
-    """The Gaussians, of a model in ``ply`` or of the ``kind`` in `SCENES`, and views of noise from their camera."""
+    """Make Gaussians, from the model ``ply`` or of a ``kind`` in `SCENES`, and a scene of noise images for them."""
     if ply is not None:
         gaussians = read_ply(ply)
         camera = camera_before(gaussians, width, height)

@@ -10,7 +10,7 @@ from pathlib import Path
 import psutil
 
 from gsbench.errors import TrainingError
-from gsbench.system.isolate import CrashError, describe_exit, run_isolated, telling_tail
+from gsbench.system.isolate import CrashError, describe_exit, error_tail, run_isolated
 from gsbench.system.resources import MIB, peak_child_mb
 from gsbench.words import readable_time
 
@@ -50,7 +50,7 @@ def run_program(
         what = describe_exit(ended.code)
     else:
         what = f"still ran after {readable_time(limit or 0.0)} (densify.time_limit_minutes)"
-    raise TrainingError(f"{name} {what}; its last lines: {telling_tail(log)}; log: {log}")
+    raise TrainingError(f"{name} {what}; its last lines: {error_tail(log)}; log: {log}")
 
 
 def watch(command: Sequence[str], folder: Path, environment: Mapping[str, str], limit: float | None) -> Ended:

@@ -24,10 +24,10 @@ from gsbench.launch.states import forget_submission
 from gsbench.runs.keys import sha256_of
 from gsbench.runs.layout import JOBS
 from gsbench.runs.trial_folder import TrialFolder
-from gsbench.system.isolate import telling_tail
-from gsbench.system.own_modules import allowed_modules, take_over
+from gsbench.system.isolate import error_tail
+from gsbench.system.own_modules import adopt_modules, allowed_modules
 from gsbench.system.resources import assign_gpu, assign_threads, take_slot
-from gsbench.system.stopping import PASSED_ON, SIGNALS, Stopped, interrupts_ignored, stop_on_signals
+from gsbench.system.stopping import SIGNALS, SIGNALS_WITHOUT_INTERRUPT, Stopped, interrupts_ignored, stop_on_signals
 from gsbench.tracking import Mirror
 from gsbench.words import counted
 
@@ -52,14 +52,17 @@ class TrialJob:
 
     def __call__(self) -> Outcome:
         sys.path[:] = [*self.path, *(entry for entry in sys.path if entry not in self.path)]
-        take_over(self.own)
+        adopt_modules(self.own)
         from gsbench.logs import set_up_logging
 
         set_up_logging()
         launch = self.values["launch"]
         by_submitit = signal.getsignal(signal.SIGUSR2) if hasattr(signal, "SIGUSR2") else None
         try:
-            with stop_on_signals(PASSED_ON if launch["name"] == "local" else SIGNALS), ExitStack() as stack:
+            with (
+                stop_on_signals(SIGNALS_WITHOUT_INTERRUPT if launch["name"] == "local" else SIGNALS),
+                ExitStack() as stack,
+            ):
                 if launch["name"] == "local":
                     slot = stack.enter_context(take_slot(TrialFolder.of(self.values).runs, launch["parallel"]))
                     assign_gpu(slot, self.visible_gpus)
@@ -163,7 +166,7 @@ def collect(job: Job[Outcome], folder: Path, trials: Sequence[Trial]) -> Outcome
         return Outcome(folder, "failed", f"{failure.reason}; log: {log_file}", failure.bad_input)
     if record is not None:
         return Outcome(folder, "failed", f"its results no longer hold ({reason}): give the command again")
-    said = f"; its last lines: {telling_tail(log_file)}" if log_file.is_file() else ""
+    said = f"; its last lines: {error_tail(log_file)}" if log_file.is_file() else ""
     return Outcome(
         folder, "failed", f"the process ended without a result (killed, or out of memory){said}; log: {log_file}"
     )

@@ -8,7 +8,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-import pycolmap  # noqa: F401 - its import replaces signal handlers, which `take_signals_back` then restores
+import pycolmap  # noqa: F401 - its import replaces signal handlers, which `reinstall_handlers` then restores
 import torch
 
 from gsbench.config.compose import Trial
@@ -33,7 +33,7 @@ from gsbench.runs.trial_record import TrialRecord
 from gsbench.scene.colmap_files import model_files
 from gsbench.scene.types import Capture
 from gsbench.system.locks import hold
-from gsbench.system.stopping import take_signals_back
+from gsbench.system.stopping import reinstall_handlers
 
 log = logging.getLogger(__name__)
 
@@ -91,7 +91,7 @@ def run_trial(trial: Trial, wait: bool = True) -> TrialRecord:
     On failure, ``failed.json`` and ``log.txt`` in the trial's folder say why, and the error is raised again. If another
     process runs this trial, this waits for it, or raises BusyError if ``wait`` is False.
     """
-    take_signals_back()
+    reinstall_handlers()
     folder = trial.files
     with storage_errors(folder.runs):
         folder.require_own()

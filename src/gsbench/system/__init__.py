@@ -1,1 +1,1 @@
-"""The machine and its processes: locks, signals, memory, cores, installation."""
+"""The machine and its processes: locks, signals, memory, cores, compilation, installation."""

@@ -1,4 +1,4 @@
-"""Installation of gsbench: where it lies, the command that adds what is missing, and its code as git knows it."""
+"""The installation of gsbench: its folder, the command that installs extras, and its state in git."""
 
 import json
 import os
@@ -15,11 +15,11 @@ from urllib.request import url2pathname
 
 from gsbench.errors import InputError
 
-DISTRIBUTION = "gsbench-3dgs"  # on the package index, where plain "gsbench" is another project
+DISTRIBUTION = "gsbench-3dgs"  # the name on the package index, where "gsbench" is another project
 
 
 def install_command(extra: str = "") -> str:
-    """The shell command that installs gsbench with an extra such as ``view``, from where gsbench was installed."""
+    """The shell command that installs gsbench with an extra such as ``view``, from the place it was installed from."""
     wanted = f"[{extra}]" if extra else ""
     root = checkout()
     if root is None:
@@ -28,7 +28,7 @@ def install_command(extra: str = "") -> str:
 
 
 def installed_from() -> Path | None:
-    """The folder that pip installed gsbench from, by pip's own record (PEP 610); None for a package index."""
+    """The folder that pip installed gsbench from, by pip's record (PEP 610); None for a package index."""
     try:
         record = distribution(DISTRIBUTION).read_text("direct_url.json")
     except PackageNotFoundError:
@@ -39,15 +39,15 @@ def installed_from() -> Path | None:
 
 
 def checkout() -> Path | None:
-    """The folder of the source checkout from which gsbench runs; None where it was installed from a wheel."""
+    """The folder of the source checkout that gsbench runs from; None if it was installed as a wheel."""
     root = Path(__file__).resolve().parents[3]
     return root if (root / "pyproject.toml").is_file() and (root / "src" / "gsbench").is_dir() else None
 
 
 def conf_dir() -> Path:
-    """The folder ``conf``: inside an installed wheel, else beside ``src`` of a checkout."""
-    here = Path(__file__).resolve().parents[1]
-    for candidate in (here / "conf", here.parents[1] / "conf"):
+    """The folder ``conf``: inside the package of a wheel, beside ``src`` in a checkout."""
+    package = Path(__file__).resolve().parents[1]
+    for candidate in (package / "conf", package.parents[1] / "conf"):
         if (candidate / "config.yaml").is_file():
             return candidate
     raise FileNotFoundError("gsbench's conf folder was not found; reinstall gsbench")
@@ -55,22 +55,30 @@ def conf_dir() -> Path:
 
 SECONDS_FOR_GIT = 10
 SECONDS_FOR_A_TREE = 300
-# Variables by which a hook of another repository, in which gsbench may run, names that repository.
-OF_ANOTHER = ("GIT_DIR", "GIT_WORK_TREE", "GIT_INDEX_FILE", "GIT_PREFIX", "GIT_OBJECT_DIRECTORY", "GIT_COMMON_DIR")
-STARTS_NOTHING = ("core.fsmonitor=false", f"core.hooksPath={os.devnull}", "protocol.allow=never")
+# gsbench may run in a git hook, whose environment names the repository of the hook by these variables.
+REPOSITORY_VARIABLES = (
+    "GIT_DIR",
+    "GIT_WORK_TREE",
+    "GIT_INDEX_FILE",
+    "GIT_PREFIX",
+    "GIT_OBJECT_DIRECTORY",
+    "GIT_COMMON_DIR",
+)
+# Settings with which git runs no program that a repository names: it may come from a stranger.
+SAFE_SETTINGS = ("core.fsmonitor=false", f"core.hooksPath={os.devnull}", "protocol.allow=never")
 
 
 @dataclass(frozen=True)
 class Checkout:
-    """The commit of a checkout; ``edited``: whether files that git follows have changed since, None if unknown."""
+    """The commit of a checkout. ``edited``: whether tracked files have changed since; None if unknown."""
 
     commit: str
     edited: bool | None
 
 
-def checkout_of(folder: Path, holds: str | None = None) -> Checkout | None:
-    """The checkout that a folder is in; None where there is none, or where git does not follow the file ``holds``."""
-    if holds is not None and not _git(folder, "ls-files", "--", holds):
+def checkout_of(folder: Path, tracked: str | None = None) -> Checkout | None:
+    """The checkout that contains ``folder``; None if there is none, or if git does not track the file ``tracked``."""
+    if tracked is not None and not _git(folder, "ls-files", "--", tracked):
         return None
     commit = _git(folder, "rev-parse", "HEAD")
     if not commit:
@@ -83,15 +91,15 @@ def checkout_of(folder: Path, holds: str | None = None) -> Checkout | None:
 
 @cache
 def own_checkout() -> dict[str, Any]:
-    """The commit of gsbench's own checkout, and whether files that git follows had changed; empty without one."""
+    """The commit of gsbench's own checkout, and whether tracked files had changed; empty if it is no checkout."""
     found = checkout_of(Path(__file__).parent, Path(__file__).name)
     return {} if found is None else {"commit": found.commit, "edited": found.edited}
 
 
 def _has_filters(folder: Path) -> bool:
-    """Return whether the repository itself names programs that git would run to compare files, or this cannot be told.
+    """Return whether the repository names programs (filters) that git would run to compare files, or may do so.
 
-    A capture may come as a repository; what the user's own configuration names may run.
+    A capture from a stranger may be a repository. Filters of the user's own configuration do not count.
     """
     listed = _git(folder, "config", "--list", "--show-scope", "--name-only")
     if listed is None:
@@ -100,10 +108,10 @@ def _has_filters(folder: Path) -> bool:
 
 
 class WorkTrees:
-    """Work trees of commits of the repository that ``folder`` is in, made below the empty folder ``place``.
+    """Work trees of commits of the repository that contains ``folder``, made below the empty folder ``place``.
 
-    They belong to a repository of their own that only borrows the objects: the user's checkout and its list of work
-    trees stay as they are, and no hook, filter or other program runs that the repository's own configuration names.
+    They belong to a new repository that shares the objects. So the user's checkout and its list of work trees do not
+    change, and no hook, filter or other program of the repository's configuration runs.
     """
 
     def __init__(self, folder: Path, place: Path) -> None:
@@ -115,25 +123,25 @@ class WorkTrees:
         (place / "own" / ".git" / "objects" / "info" / "alternates").write_text(f"{objects}\n", encoding="utf-8")
 
     def commits(self, first: str, last: str) -> list[tuple[str, str, str]]:
-        """(hash, date, subject) of the commit ``first`` and those up to ``last``, merges from the outside only.
+        """List (hash, date, subject) of the commits from ``first`` to ``last``, without those inside merges.
 
-        Raises InputError where one is none, and where the first does not come before the last.
+        Raises InputError if one of them is not a commit, or if ``first`` does not come before ``last``.
         """
         names = [
             run_git(self._folder, "rev-parse", "--verify", "--end-of-options", f"{one}^{{commit}}")
             for one in (first, last)
         ]
         log = ("log", "--no-show-signature", "--no-color", "--format=%H%x09%cs%x09%s")
-        found = run_git(self._folder, *log, "-1", names[0])
+        good = run_git(self._folder, *log, "-1", names[0])
         between = f"{names[0]}..{names[1]}"
         later = run_git(self._folder, *log, "--first-parent", "--ancestry-path", "--reverse", between)
         if not later:
             raise InputError(f"{last} does not come after {first}: give the good commit first")
-        parts = [[*line.split("\t", 2), "", ""] for line in (found, *later.split("\n"))]
+        parts = [[*line.split("\t", 2), "", ""] for line in (good, *later.split("\n"))]
         return [(commit, date, subject) for commit, date, subject, *_ in parts]
 
     def tree(self, commit: str) -> Path:
-        """The work tree of a commit."""
+        """The work tree of a commit, made at the first call."""
         path = self._place / commit
         if not path.exists():
             run_git(self._place / "own", "worktree", "add", "--quiet", "--detach", str(path), commit)
@@ -141,9 +149,9 @@ class WorkTrees:
 
 
 def run_git(folder: Path, *words: str) -> str:
-    """The answer of git; raises InputError with its words where it has none. It starts no other program."""
+    """Run git safely (`SAFE_SETTINGS`) and return its output. Raises InputError with git's message if it fails."""
     try:
-        return _answer(folder, words, SECONDS_FOR_A_TREE).stdout.strip()
+        return _call_git(folder, words, SECONDS_FOR_A_TREE).stdout.strip()
     except OSError as error:
         raise InputError(f"git cannot be started ({error.strerror or error}): install it") from None
     except subprocess.TimeoutExpired:
@@ -153,22 +161,22 @@ def run_git(folder: Path, *words: str) -> str:
 
 
 def _git(folder: Path, *words: str) -> str | None:
-    """Answer of git; None where there is no git, no repository, or no answer."""
+    """Run git safely and return its output; None if there is no git or no repository, or if it fails."""
     try:
-        return _answer(folder, words, SECONDS_FOR_GIT).stdout.strip()
+        return _call_git(folder, words, SECONDS_FOR_GIT).stdout.strip()
     except (OSError, subprocess.SubprocessError):
         return None
 
 
-def _answer(folder: Path, words: Sequence[str], seconds: float) -> subprocess.CompletedProcess[str]:
-    """Run git in ``folder``; it starts no other program, and takes the repository from nowhere else."""
-    here = {key: value for key, value in os.environ.items() if key not in OF_ANOTHER}
+def _call_git(folder: Path, words: Sequence[str], seconds: float) -> subprocess.CompletedProcess[str]:
+    """Run git in ``folder``, with `SAFE_SETTINGS` and without `REPOSITORY_VARIABLES`."""
+    environment = {key: value for key, value in os.environ.items() if key not in REPOSITORY_VARIABLES}
     return subprocess.run(
-        ["git", *(word for setting in STARTS_NOTHING for word in ("-c", setting)), "-C", str(folder), *words],
-        env=here | {"GIT_OPTIONAL_LOCKS": "0", "GIT_NO_LAZY_FETCH": "1"},  # look, and touch nothing
+        ["git", *(word for setting in SAFE_SETTINGS for word in ("-c", setting)), "-C", str(folder), *words],
+        env=environment | {"GIT_OPTIONAL_LOCKS": "0", "GIT_NO_LAZY_FETCH": "1"},  # read only: no locks, no network
         capture_output=True,
         encoding="utf-8",
-        errors="replace",  # a subject may be in any encoding
+        errors="replace",  # subjects of commits may have any encoding
         timeout=seconds,
         check=True,
     )

@@ -1,14 +1,13 @@
-"""Run a function in a process of its own, so that a crash in native code becomes an error with a reason.
+"""Run a function in a separate process, so that a crash in native code becomes an error with a reason.
 
-The child is a fresh interpreter (never a fork, so no threads or locks are inherited) that imports only what the
-function needs: the parent's ``__main__`` is not imported again, so it works alike from a console script, a notebook,
-pytest and Hydra. The child, and every program that it started, ends when the parent does, even when the parent is
-killed; no such program outlives the function. On Linux that holds for daemons too; on other systems a program that
-begins a session of its own gets away.
+The child is a fresh interpreter, not a fork, so it inherits no threads or locks. It imports only what the function
+needs and never the parent's ``__main__``, so it works from console scripts, notebooks, pytest and Hydra. The child and
+all programs that it starts end with the parent, even if the parent is killed, and do not outlive the function. On
+Linux this includes daemons; on other systems a program that starts its own session escapes.
 
-The process stays behind its own child and ends whatever that leaves running. A daemon forks twice and begins a
-session of its own: then neither its parent nor its process group leads to it. Linux lets a process adopt all orphans
-among its descendants (PR_SET_CHILD_SUBREAPER), so that none can get away from it.
+For this, the child forks once: its own child runs the function, while it waits and then kills all descendants. A daemon
+forks twice and starts its own session, so neither its parent nor its process group identifies it. On Linux a process
+can adopt all orphans among its descendants (PR_SET_CHILD_SUBREAPER), so none can escape.
 """
 
 import ctypes
@@ -33,15 +32,16 @@ from gsbench.logs import Progress
 from gsbench.system.own_modules import allowed_modules
 
 PR_SET_PDEATHSIG, PR_SET_CHILD_SUBREAPER = 1, 36  # linux/prctl.h
-SECONDS_TO_END = 5.0  # patience with descendants that do not die of SIGKILL, such as those of another user
+SECONDS_TO_END = 5.0  # time limit for descendants that SIGKILL does not end, such as those of another user
 SECONDS_BETWEEN_LOOKS = 0.01
 
 
-def go_on_as_child() -> bool:
-    """Return in a child of this process, which itself never returns: it ends as the child does, and all with it.
+def continue_in_child() -> bool:
+    """Fork, and return True in the child. This process does not return: it waits for the child, kills all descendants,
+    and ends with the exit status of the child.
 
-    All ends too where the input of this process does, that is where its parent is gone. To be called while there is one
-    thread. Returns False, in this process, where the system has no fork.
+    All of them also end when the standard input of this process is closed, that is, when its parent is gone. Call it
+    while there is only one thread. Returns False, in this process, on systems without fork.
     """
     if not hasattr(os, "fork"):
         return False
@@ -50,20 +50,20 @@ def go_on_as_child() -> bool:
         _control(PR_SET_PDEATHSIG, signal.SIGKILL)
         return True
     _control(PR_SET_CHILD_SUBREAPER, 1)
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # the child may ask its whole process group to end, and wait for it
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # the child may end its whole process group and wait for it
     threading.Thread(target=_end_with_parent, daemon=True).start()
     status = 0
     ended = 0
     while ended != child:
-        ended, status = os.waitpid(-1, 0)  # adopted orphans are waited for as well
+        ended, status = os.waitpid(-1, 0)  # also reaps adopted orphans
     end_descendants()
     _exit_as(os.waitstatus_to_exitcode(status))
     return True
 
 
 def end_descendants() -> None:
-    """Kill every process that descends from this one; more than once, since they may start others meanwhile."""
-    import psutil  # here: its import takes longer than many a function that is supervised
+    """Kill all descendants of this process. It repeats this, since they may start others meanwhile."""
+    import psutil  # not at the top: the import takes longer than many of the functions that run here
 
     deadline = time.monotonic() + SECONDS_TO_END
     while time.monotonic() < deadline:
@@ -85,15 +85,15 @@ def _end_with_parent() -> None:
     while os.read(0, 1):
         pass
     end_descendants()
-    os.killpg(0, signal.SIGKILL)  # this process too, which leads the group
+    os.killpg(0, signal.SIGKILL)  # also this process, which leads the group
 
 
 def _exit_as(code: int) -> None:
-    """End as a child did whose exit code was ``code`` (negative: by a signal)."""
+    """End this process with the exit code of a child (negative: by that signal)."""
     if code < 0:
         import resource
 
-        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))  # the child has left its core, if any was wanted
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))  # no second core file beside that of the child
         with suppress(OSError):
             signal.signal(-code, signal.SIG_DFL)
         os.kill(os.getpid(), -code)
@@ -101,7 +101,7 @@ def _exit_as(code: int) -> None:
 
 
 def _control(option: int, value: int) -> None:
-    """Linux's prctl; nothing elsewhere."""
+    """Call Linux's prctl; do nothing on other systems."""
     if sys.platform == "linux":
         with suppress(OSError, AttributeError):
             ctypes.CDLL(None).prctl(option, value, 0, 0, 0)
@@ -113,17 +113,17 @@ T = TypeVar("T")
 
 _BOOTSTRAP = (
     "import json, sys; path, own = json.loads(sys.argv[1]); sys.path[:] = path; "
-    "from gsbench.system.own_modules import take_over; take_over(own); from {module} import {name}; {name}()"
+    "from gsbench.system.own_modules import adopt_modules; adopt_modules(own); from {module} import {name}; {name}()"
 )
-_SECONDS_TO_END = 10.0  # patience with a child that ends what it started, before it is killed
+_SECONDS_TO_END = 10.0  # time limit for a child to end the programs that it started, before it is killed
 _TAIL_LINES = 3
-_TAIL_BYTES = 1 << 20  # in which they are looked for: a program may print gigabytes
-_STACK_LINE = re.compile(r"^\s*(@|PC:|\*\*\* )|^\s*File |^\s*$")  # glog's crash dump, blank lines
+_TAIL_BYTES = 1 << 20  # the part of an output that is searched: a program may print gigabytes
+_STACK_LINE = re.compile(r"^\s*(@|PC:|\*\*\* )|^\s*File |^\s*$")  # crash dumps of glog, blank lines
 _REASON_LINE = re.compile(r"what\(\)|terminate called|Check failed|Error|error|free\(\)|malloc|corrupt")
 
 
 class CrashError(GsbenchError):
-    """Error of an isolated function without a result: its process crashed, was killed, or ran out of memory."""
+    """An isolated function has no result: its process crashed, was killed, or ran out of memory."""
 
 
 def run_isolated(
@@ -135,12 +135,12 @@ def run_isolated(
 ) -> R:
     """Return ``function(*args, **kwargs)``, computed in a fresh child process.
 
-    ``function`` must be importable by name (a top-level function of a module, not of ``__main__``); it, the arguments
-    and the result travel by pickle. ``what`` names the work in errors ("undistortion"). The child's whole output, that
-    of native libraries included, is appended to the file ``log`` if one is given, else dropped on success.
+    ``function`` must be a top-level function of a module other than ``__main__``. It, its arguments and its result are
+    pickled. ``what`` names the work in errors ("undistortion"). The output of the child, also of native libraries, is
+    appended to the file ``log``; without ``log`` it is dropped on success.
 
-    An exception that the function raises is raised here again, with the child's traceback as a note. A crash of the
-    process raises `CrashError`, one line that ends with the last telling lines of its output.
+    An exception of the function is raised again here, with the child's traceback as a note. A crash of the process
+    raises `CrashError`, whose message ends with the last error lines of the output.
     """
     what = what or function.__name__
     if function.__module__ == "__main__" or "<" in function.__qualname__:
@@ -153,7 +153,7 @@ def run_isolated(
             start = stream.seek(0, os.SEEK_END)
             code = _run_child(call, result, stream)
         if code != 0 or not result.is_file():
-            raise CrashError(f"{what} {describe_exit(code)}; its last lines: {telling_tail(output, start)}")
+            raise CrashError(f"{what} {describe_exit(code)}; its last lines: {error_tail(output, start)}")
         succeeded, value, trace = pickle.loads(result.read_bytes())
     if succeeded:
         return value
@@ -165,7 +165,7 @@ POLL_SECONDS = 0.25
 
 
 class ProgressFile:
-    """A `Progress` that writes to a file, for a process to tell its parent; small enough writes are atomic."""
+    """A `Progress` that appends to a file, from which the parent process reads. Its short writes are atomic."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -178,7 +178,7 @@ class ProgressFile:
 def run_with_progress(
     function: Callable[[Any, Progress], T], job: Any, progress: Progress, what: str, log: Path | None = None
 ) -> T:
-    """``function(job, progress)`` in a fresh process (see `run_isolated`); its progress is passed on as it comes."""
+    """Return ``function(job, progress)``, computed in a fresh process (`run_isolated`), and forward its progress."""
     with tempfile.TemporaryDirectory(prefix="gsbench-progress-") as folder:
         channel = ProgressFile(Path(folder, "progress.txt"))
         channel.path.touch()
@@ -200,27 +200,27 @@ def _listen(path: Path, progress: Progress, ended: threading.Event) -> None:
             *lines, rest = (rest + file.read()).split("\n")
             for line in lines:
                 phase, done, total, note = line.split("\t")
-                with suppress(BrokenPipeError):  # a closed terminal must not end the work
+                with suppress(BrokenPipeError):  # a closed terminal must not stop the work
                     progress(phase, int(done), int(total) if total else None, note)
             if last:
                 return
 
 
 def python_command(module: str, name: str, *arguments: str) -> list[str]:
-    """A fresh interpreter that finds the modules which this one finds, and calls the function ``name`` of ``module``.
+    """The command of a fresh interpreter, with the same module search path, that calls ``name`` of ``module``.
 
-    The function takes nothing; it finds ``arguments`` in ``sys.argv[2:]``.
+    The function has no parameters; ``arguments`` are in ``sys.argv[2:]``.
     """
-    found = json.dumps([sys.path, allowed_modules()])
-    # -P: the current folder, in which a capture may lie, is no place to look in, not for json either.
-    return [sys.executable, "-P", "-c", _BOOTSTRAP.format(module=module, name=name), found, *arguments]
+    search_path = json.dumps([sys.path, allowed_modules()])
+    # -P: a stranger's capture in the current folder may have a json.py, which must not be imported.
+    return [sys.executable, "-P", "-c", _BOOTSTRAP.format(module=module, name=name), search_path, *arguments]
 
 
 def _run_child(call: Path, result: Path, output: BinaryIO) -> int:
-    """Start the child, wait for it and return its exit code; end it on any exception here (Ctrl-C included)."""
+    """Start the child, wait for it and return its exit code. On any exception here, also Ctrl-C, end it."""
     command = python_command("gsbench.system.isolate", "_child", str(call), str(result))
-    # A session of its own: Ctrl-C reaches the parent only, which then ends the child: one traceback, not two.
-    # stdin is a pipe that is never written: its end tells the child that it is to end, or that the parent is gone.
+    # In its own session, the child does not receive Ctrl-C. The parent does and ends it: one traceback, not two.
+    # Nothing is written to the pipe at stdin. When it closes, the child ends, because the parent wants it or is gone.
     child = subprocess.Popen(
         command, stdin=subprocess.PIPE, stdout=output, stderr=subprocess.STDOUT, start_new_session=True
     )
@@ -238,27 +238,27 @@ def _run_child(call: Path, result: Path, output: BinaryIO) -> int:
 
 
 def _end_group(leader: int) -> None:
-    """End what the child started and left behind: its session is the process group ``leader``."""
+    """Kill programs that the child left running in its session, the process group ``leader``."""
     if hasattr(os, "killpg"):
-        with suppress(ProcessLookupError, PermissionError):  # nobody is left (macOS: only the dead are)
+        with suppress(ProcessLookupError, PermissionError):  # none is left (macOS: only zombies are)
             os.killpg(leader, signal.SIGKILL)
 
 
 def _child() -> None:
-    """The child's whole life: arguments are the paths of the pickled call and of the result to write."""
+    """The main function of the child. Its arguments are the paths of the pickled call and of the result to write."""
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    if not go_on_as_child():
+    if not continue_in_child():
         threading.Thread(target=_exit_with_parent, daemon=True).start()
     call, result = Path(sys.argv[2]), Path(sys.argv[3])
     function, args, kwargs = pickle.loads(call.read_bytes())
     try:
         outcome = (True, function(*args, **kwargs), "")
-    except Exception as error:  # noqa: BLE001  whatever it is, it is raised again in the parent
+    except Exception as error:  # noqa: BLE001  raised again in the parent
         outcome = (False, _portable(error), traceback.format_exc())
     result.write_bytes(pickle.dumps(outcome))
     sys.stdout.flush()
     sys.stderr.flush()
-    os._exit(0)  # native libraries may crash while they are unloaded; the result is already safe
+    os._exit(0)  # without unloading native libraries, which may crash then; the result is already written
 
 
 def _exit_with_parent() -> None:
@@ -268,10 +268,10 @@ def _exit_with_parent() -> None:
 
 
 def _portable(error: Exception) -> Exception:
-    """The error itself if it survives pickling, else a RuntimeError with its text."""
+    """The error itself if it can be pickled, else a RuntimeError with its text."""
     try:
         pickle.loads(pickle.dumps(error))
-    except Exception:  # noqa: BLE001  a class may fail in any way in its own reduce or init
+    except Exception:  # noqa: BLE001  the methods of its class may fail in any way
         return RuntimeError(f"{type(error).__name__}: {error}")
     return error
 
@@ -287,16 +287,16 @@ def describe_exit(code: int) -> str:
     return f"ended early (exit code {code})"
 
 
-def telling_tail(output: Path, start: int = 0) -> str:
-    """`telling_lines` of the end of a file of output, of which what is before ``start`` does not count."""
+def error_tail(output: Path, start: int = 0) -> str:
+    """`error_lines` of the end of an output file, from byte ``start`` on."""
     with output.open("rb") as stream:
         stream.seek(max(start, stream.seek(0, os.SEEK_END) - _TAIL_BYTES))
-        return telling_lines(stream.read(_TAIL_BYTES))
+        return error_lines(stream.read(_TAIL_BYTES))
 
 
-def telling_lines(output: bytes) -> str:
-    """The last lines of a process's output that look like a reason, on one line."""
+def error_lines(output: bytes) -> str:
+    """The last lines of a process's output that look like error messages, joined to one line."""
     lines = output.decode("utf-8", "replace").splitlines()
     lines = [line.strip() for line in lines if not _STACK_LINE.match(line)]
-    telling = [line for line in lines if _REASON_LINE.search(line)] or lines
-    return " | ".join(telling[-_TAIL_LINES:]) or "(no output)"
+    errors = [line for line in lines if _REASON_LINE.search(line)] or lines
+    return " | ".join(errors[-_TAIL_LINES:]) or "(no output)"

@@ -1,4 +1,4 @@
-"""Compilation of kernels by numba: options, the cache on disk, and the word to the user while something compiles."""
+"""Compilation of kernels by numba: options, the cache on disk, and the message to the user during compilation."""
 
 import functools
 import hashlib
@@ -11,12 +11,12 @@ from typing import Any
 
 from gsbench.system.machine import load_numba, numba_target
 
-numba = load_numba()  # before anything of it is imported by name
+numba = load_numba()  # first: it protects the import of numba
 
 from numba.core import event  # noqa: E402
 
 PACKAGE = Path(__file__).resolve().parents[1]
-# Files and folders of all that goes into kernels: functions and constants. A test compares them with the imports.
+# Files and folders with the functions and constants of kernels. A test compares them with the imports.
 SOURCES = (
     "raster/cpu",
     "raster/base.py",
@@ -28,7 +28,7 @@ SOURCES = (
     "system/jit.py",
 )
 DIGEST_CHARACTERS = 16
-TEMPORARY_PREFIX = "gsbench-numba-"  # of the folder where no other can be written
+TEMPORARY_PREFIX = "gsbench-numba-"  # of the temporary folder, if no other folder is writable
 
 njit: Any = numba.njit
 config: Any = numba.config
@@ -38,9 +38,9 @@ _logger = logging.getLogger(__name__)
 
 @functools.cache
 def cache_base() -> Path:
-    """The folder that holds compiled kernels: ``NUMBA_CACHE_DIR``, else one in the user's cache.
+    """The folder for caches of compiled kernels: ``NUMBA_CACHE_DIR``, else one in the user's cache.
 
-    Where neither can be written, a private temporary folder, and the next process compiles again.
+    If neither is writable, it is a private temporary folder, and the next process compiles again.
     """
     home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
     given = os.environ.get("NUMBA_CACHE_DIR")
@@ -56,11 +56,11 @@ def cache_base() -> Path:
 
 @functools.cache
 def cache_folder(package: Path = PACKAGE) -> Path:
-    """The folder of compiled kernels: another one for each state of what they are made of.
+    """The folder of compiled kernels, a different one for each state of their sources.
 
-    numba looks at the file of a kernel, not at what that file imports, so a changed helper would leave stale machine
-    code in use. The folder's name is a digest of all `SOURCES`, and of the processor: numba tells processors apart in
-    an index that two machines with one home folder may write at once.
+    numba checks the file of a kernel, but not the files that it imports, so after a change of a helper it would use
+    outdated machine code. The name of the folder is a digest of all `SOURCES` and of the processor. numba itself
+    separates processors only in an index file, which two machines with a common home folder could write at once.
     """
     digest = hashlib.sha256("\n".join((numba.__version__, *numba_target())).encode())
     for source in SOURCES:
@@ -73,8 +73,8 @@ def cache_folder(package: Path = PACKAGE) -> Path:
 def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile ``function`` at its first call: without the GIL, without Python's division checks, cached on disk.
 
-    Also without reference counts (``_nrt``), which numba would keep, atomically, at each inlined call: a kernel borrows
-    all its arrays and may not allocate.
+    Reference counts are off, too (``_nrt``): numba would update them atomically at each inlined call. So a kernel must
+    not allocate memory; the caller owns all arrays.
     """
     previous = config.CACHE_DIR  # read when the decorator runs; other users of numba in this process keep theirs
     config.CACHE_DIR = str(cache_folder())
@@ -90,19 +90,19 @@ def inlined(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 class _Announcement(event.Listener):
-    """Tells the user, once in a process, why the first call of a kernel takes a while: nothing if all were kept."""
+    """Tells the user once per process that kernels are compiled, unless all are in the cache."""
 
     def __init__(self) -> None:
-        self._said = False
+        self._announced = False
 
     def on_start(self, event: event.Event) -> None:
         ours = event.data["dispatcher"].py_func.__module__.startswith("gsbench.")
-        if ours and not self._said:
-            self._said = True
+        if ours and not self._announced:
+            self._announced = True
             _logger.warning("compiling for this processor, some 10 s, once")
 
     def on_end(self, event: event.Event) -> None:
         pass
 
 
-event.register("numba:compile", _Announcement())  # sent where the cache on disk has no machine code
+event.register("numba:compile", _Announcement())  # the event means that the cache had no machine code

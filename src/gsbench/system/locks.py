@@ -1,4 +1,4 @@
-"""Locks between processes: one works, the others wait and say for what."""
+"""Locks between processes: one process works, the others wait and report what for."""
 
 import json
 import logging
@@ -28,15 +28,15 @@ SECONDS_BETWEEN_TRIES = 0.25
 
 
 class BusyError(Exception):
-    """Error of a lock that another process holds."""
+    """Another process holds the lock."""
 
 
 @contextmanager
 def hold(path: Path, what: str, wait: bool = True) -> Iterator[None]:
     """Hold the lock ``path`` while the block runs; ``what`` is the work that it guards.
 
-    The system frees the lock when its process ends, however it ends; the file stays. Raises BusyError where another
-    process holds it and ``wait`` is False.
+    The system frees the lock when the process ends for any reason; the file stays. Raises BusyError if another process
+    holds the lock and ``wait`` is False.
     """
     lock = FileLock(path)
     try:
@@ -47,8 +47,8 @@ def hold(path: Path, what: str, wait: bool = True) -> Iterator[None]:
         log.info("waiting for %s: %s works on it", what, describe_holder(path))
         lock.acquire(poll_interval=SECONDS_BETWEEN_TRIES)
     holder = _holder_file(path)
-    with suppress(OSError):  # it only informs
-        holder.unlink(missing_ok=True)  # by another process it may be a link to anywhere
+    with suppress(OSError):  # this file is only information
+        holder.unlink(missing_ok=True)  # first: another process may have made it a link to any file
         with os.fdopen(open_plain(holder, os.O_WRONLY | os.O_CREAT | os.O_EXCL), "w") as stream:
             stream.write(json.dumps(this_process() | {"what": what}))
     try:
@@ -60,7 +60,7 @@ def hold(path: Path, what: str, wait: bool = True) -> Iterator[None]:
 
 
 def is_held(path: Path) -> bool:
-    """Return whether a process holds the lock ``path``; needs no right to write."""
+    """Return whether a process holds the lock ``path``. Needs no write permission."""
     if fcntl is None:
         lock = FileLock(path)
         try:
@@ -86,7 +86,7 @@ def is_held(path: Path) -> bool:
 
 @dataclass(frozen=True, kw_only=True)
 class LockHolder(Record):
-    """Record that a lock's holder writes of itself: host, process, Slurm job, time of start (Unix), its work."""
+    """What the holder of a lock writes about itself: host, process, Slurm job, start (Unix time) and work."""
 
     host: str
     pid: int
@@ -101,7 +101,7 @@ class LockHolder(Record):
 
 
 def read_holder(path: Path) -> LockHolder | None:
-    """Read what the holder of the lock ``path`` wrote about itself; None where nothing can be read."""
+    """Read what the holder of the lock ``path`` wrote about itself; None if that is not readable."""
     return read_if_sound(_holder_file(path), LockHolder)
 
 

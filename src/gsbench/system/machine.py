@@ -1,8 +1,7 @@
-"""Description of the machine, which may change a result though code, settings and seed are equal.
+"""Description of the machine, which can change results even if code, settings and seed are equal.
 
-Compiled kernels, torch and the linear algebra libraries choose their instructions by the processor; fused and wider
-ones round differently. So results are equal to the bit on one kind of machine, and close on two (see
-docs/reproducibility.md).
+Compiled kernels, torch and linear algebra libraries choose instructions by the processor, and fused or wider
+instructions round differently. So results are equal to the bit only on one kind of machine (docs/reproducibility.md).
 """
 
 from __future__ import annotations
@@ -24,22 +23,22 @@ if TYPE_CHECKING:
 
 CPU_INFO = Path("/proc/cpuinfo")
 CPU_NAME_KEYS = ("model name", "Processor", "cpu model", "Model", "cpu")  # x86, old ARM, MIPS, Raspberry Pi, POWER
-# Features that x86-64-v2 to -v4 ask for beyond the level below, as far as they tell processors apart (x86-64 psABI,
-# table 3.1); names are LLVM's.
+# Features that each level requires beyond the level before it, as far as they distinguish processors (x86-64 psABI,
+# table 3.1), by their LLVM names.
 X86_LEVELS = {
     "x86-64-v2": ("cx16", "sahf", "popcnt", "sse3", "sse4.1", "sse4.2", "ssse3"),
     "x86-64-v3": ("avx", "avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe"),
     "x86-64-v4": ("avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"),
 }
 SECONDS_FOR_SYSCTL = 10
-LEAST_OF_NUMBA = {"NUMBA_NUM_THREADS": 1, "NUMBA_DISABLE_JIT": 0}  # variables that it reads as whole numbers
+NUMBA_MINIMA = {"NUMBA_NUM_THREADS": 1, "NUMBA_DISABLE_JIT": 0}  # variables that numba reads as whole numbers
 
 
 def describe_machine(device: torch.device) -> dict[str, str]:
-    """Describe this machine as results name it: ``cpu``, ``architecture``, ``kernels``, ``torch``, ``device``.
+    """Describe this machine for results: ``cpu``, ``architecture``, ``kernels``, ``torch``, ``device``.
 
-    ``kernels`` is the processor type that the compiled kernels are made for, and its instruction set; ``torch`` the
-    instruction set that torch uses; ``device`` the GPU's name, or "cpu".
+    ``kernels`` is the processor type that kernels are compiled for, with its instruction set; ``torch`` is the
+    instruction set that torch uses; ``device`` is the name of the GPU, or "cpu".
     """
     import torch
 
@@ -53,14 +52,14 @@ def describe_machine(device: torch.device) -> dict[str, str]:
 
 
 def kind_of_machine(record: Mapping[str, Any]) -> str:
-    """One phrase for a record of `describe_machine`; results with equal phrases may be compared to the bit."""
+    """A record of `describe_machine` as one phrase. Results with equal phrases can be equal to the bit."""
     cpu = f"{record['cpu']} ({record['kernels']}, torch {record['torch']})"
     return cpu if record["device"] == "cpu" else f"{record['device']}, {cpu}"
 
 
 @functools.cache
 def cpu_name() -> str:
-    """The processor's name as its system gives it; its architecture where it gives none."""
+    """The name of the processor from the operating system, else its architecture."""
     name = {"linux": _linux_name, "darwin": _mac_name, "win32": _windows_name}.get(sys.platform, str)()
     return " ".join((name or platform.processor() or platform.machine() or "unknown").split())
 
@@ -77,12 +76,12 @@ def _linux_name() -> str:
     named = next((entries[key] for key in CPU_NAME_KEYS if entries.get(key)), "")
     if named or "CPU part" not in entries:
         return named
-    return f"ARM implementer {entries.get('CPU implementer', '?')} part {entries['CPU part']}"  # 64-bit ARM has no name
+    return f"ARM implementer {entries.get('CPU implementer', '?')} part {entries['CPU part']}"  # no name on 64-bit ARM
 
 
 def _mac_name() -> str:
     try:
-        asked = subprocess.run(
+        answer = subprocess.run(
             ["sysctl", "-n", "machdep.cpu.brand_string"],
             capture_output=True,
             text=True,
@@ -91,7 +90,7 @@ def _mac_name() -> str:
         )
     except (OSError, subprocess.SubprocessError):
         return ""
-    return asked.stdout
+    return answer.stdout
 
 
 def _windows_name() -> str:
@@ -99,25 +98,25 @@ def _windows_name() -> str:
 
 
 def load_numba() -> Any:
-    """The module numba. Raises InputError where a variable of its own keeps it from being loaded."""
-    for name, least in LEAST_OF_NUMBA.items():
+    """Import numba. Raises InputError if one of its environment variables would make the import fail."""
+    for name, least in NUMBA_MINIMA.items():
         value = os.environ.get(name, str(least))
         if not value.isascii() or not value.isdigit() or int(value) < least:
             raise InputError(f"{name}={value}: numba needs a whole number from {least} on: set another, or unset it")
-    # numba takes settings from `.numba_config.yaml` of the current folder, in which a stranger's capture may lie.
+    # numba reads `.numba_config.yaml` in the current folder, where a stranger's capture may be: import it elsewhere.
     with contextlib.chdir(Path(__file__).parent):
         import numba
         from numba.core import config
-    config._config_fname = ""  # which it reads again at compilations
+    config._config_fname = ""  # else numba reads the file again when it compiles
     return numba
 
 
 def numba_target() -> tuple[str, str]:
-    """The processor that numba compiles for and its features, as LLVM writes them ("+sse2,-avx512f,…")."""
+    """The processor that numba compiles for, and its features in LLVM's form ("+sse2,-avx512f,…")."""
     import llvmlite.binding
 
     numba = load_numba()
-    config: Any = numba.config  # its settings are made at run time
+    config: Any = numba.config  # Any: its attributes are made at run time
     features = config.CPU_FEATURES
     if features is None:
         features = llvmlite.binding.get_host_cpu_features().flatten()
@@ -125,7 +124,7 @@ def numba_target() -> tuple[str, str]:
 
 
 def kernel_target() -> str:
-    """The target of numba, LLVM's name and the x86-64 level: this processor, or ``NUMBA_CPU_NAME``."""
+    """The target of numba, this processor or ``NUMBA_CPU_NAME``: its LLVM name and, on x86-64, its level."""
     name, features = numba_target()
     if platform.machine().lower() not in ("x86_64", "amd64"):
         return name
@@ -133,7 +132,7 @@ def kernel_target() -> str:
 
 
 def x86_level(features: set[str]) -> str:
-    """The highest x86-64 micro-architecture level whose features (LLVM's names) are all there."""
+    """The highest x86-64 micro-architecture level whose features (LLVM names) are all in ``features``."""
     level = "x86-64-v1"
     for name, wanted in X86_LEVELS.items():
         if not features.issuperset(wanted):

@@ -1,6 +1,6 @@
-"""Import of a user's own modules: by the names that were allowed, in one folder, behind what is installed.
+"""Import of a user's own modules: only allowed names, from one folder, after installed packages.
 
-The current folder as such is no place of Python's here: a capture may hold a ``plyfile.py``.
+The current folder is not in Python's search path, because a stranger's capture may contain a ``plyfile.py``.
 """
 
 import os
@@ -10,12 +10,12 @@ from importlib.abc import MetaPathFinder
 from importlib.machinery import ModuleSpec, PathFinder
 from types import ModuleType
 
-# Python's switch against the current folder as a place of modules, with a value that tells ours from the user's.
+# The variable that removes the current folder from Python's search path, with a value that shows that gsbench set it.
 SAFE_PATH = ("PYTHONSAFEPATH", "gsbench")
 
 
 class AllowedModules(MetaPathFinder):
-    """Finds modules by their names in the folders of ``folders``, and nothing else there."""
+    """Finds the modules named in ``folders``, each in its folder, and no other modules there."""
 
     def __init__(self) -> None:
         self.folders: dict[str, str] = {}
@@ -28,21 +28,21 @@ class AllowedModules(MetaPathFinder):
         return PathFinder.find_spec(fullname, [self.folders[fullname]], target)
 
 
-_allowed = AllowedModules()  # one, since Python has one list of finders
+_allowed = AllowedModules()  # global, as is Python's list of finders
 
 
 def allow_modules(allowed: Sequence[str], folder: str | None = None) -> None:
     """Let Python find the modules of ``allow_targets`` in ``folder`` (default: the current one)."""
-    take_over(dict.fromkeys((name.split(".")[0] for name in allowed), folder or os.getcwd()))
+    adopt_modules(dict.fromkeys((name.split(".")[0] for name in allowed), folder or os.getcwd()))
 
 
 def allowed_modules() -> dict[str, str]:
-    """The modules that were allowed in this process, and the folder of each."""
+    """The modules allowed in this process, with their folders."""
     return _allowed.folders
 
 
-def take_over(folders: Mapping[str, str]) -> None:
-    """Allow what another process has allowed (`allowed_modules`)."""
+def adopt_modules(folders: Mapping[str, str]) -> None:
+    """Allow the modules that another process has allowed (its `allowed_modules`)."""
     _allowed.folders |= folders
     if _allowed not in sys.meta_path:
         sys.meta_path.append(_allowed)

@@ -1,6 +1,6 @@
-"""Cores, GPUs and slots for trials that run at once on a machine, and the memory that they take at most.
+"""Cores, GPUs and slots for trials that run at once on a machine, and their peak memory. Does not import torch.
 
-Peak memory is that of the GPU where the work is there, else of this process. Loads no torch.
+For work on a GPU, peak memory is that of the GPU, else that of this process.
 """
 
 from __future__ import annotations
@@ -33,18 +33,18 @@ if TYPE_CHECKING:
 MIB = 2**20
 STATUS = Path("/proc/self/status")
 CLEAR_REFS = Path("/proc/self/clear_refs")
-RESET_PEAK = "5"  # what Linux takes as "start VmHWM anew", see proc(5)
+RESET_PEAK = "5"  # makes Linux reset VmHWM, see proc(5)
 SECONDS_BETWEEN_TRIES = 0.5
-CORES_OF_TRIAL = 4  # beyond, more trials at once gain more than more threads of one
+CORES_OF_TRIAL = 4  # with more cores, more trials at once gain more than more threads per trial
 MEMORY_OF_TRIAL, MEMORY_OF_GAUSSIAN = 545 * 2**20, 1592  # bytes, of a training on the CPU
-USUAL_GAUSSIANS = 1_000_000  # where nothing limits them
+USUAL_GAUSSIANS = 1_000_000  # assumed count without a cap
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
 
 log = logging.getLogger(__name__)
 
 
 def available_threads(parallel: int = 1) -> int:
-    """The CPU threads for one of ``parallel`` trials: what Slurm gave, else this process's cores, shared evenly."""
+    """The number of CPU threads for one of ``parallel`` trials: that of Slurm, else an equal share of the cores."""
     slurm = os.environ.get("SLURM_CPUS_PER_TASK", "")
     if slurm.isdigit() and int(slurm) > 0:
         return int(slurm)
@@ -53,7 +53,7 @@ def available_threads(parallel: int = 1) -> int:
 
 @cache
 def trials_at_once(max_gaussians: int | None, device: str) -> int:
-    """The number of trials that use this machine well: by its GPUs where they train, else by its cores and memory."""
+    """A good number of trials at once: the number of GPUs, if they train, else by cores and memory."""
     if device != "cpu" and (gpus := installed_gpus()):
         return len(gpus)
     cores = available_cores()
@@ -64,7 +64,7 @@ def trials_at_once(max_gaussians: int | None, device: str) -> int:
 
 @contextmanager
 def take_slot(runs: Path, count: int) -> Iterator[int]:
-    """Hold the first free one of ``count`` slots of this machine: no more trials run at once, whoever started them."""
+    """Hold the first free one of ``count`` slots of this machine: a limit for trials of all commands together."""
     folder = runs / ".slots" / socket.gethostname()
     folder.mkdir(parents=True, exist_ok=True)
     while True:
@@ -80,16 +80,16 @@ def take_slot(runs: Path, count: int) -> Iterator[int]:
 
 
 def assign_gpu(slot: int, visible: str | None) -> None:
-    """Let this process see one GPU: the slot's turn among those that the parent saw. Before torch is loaded."""
+    """Let this process see one GPU, by its slot, of those that the parent saw. Call it before importing torch."""
     gpus = [gpu.strip() for gpu in visible.split(",") if gpu.strip()] if visible is not None else installed_gpus()
     if gpus:
         os.environ["CUDA_VISIBLE_DEVICES"] = gpus[slot % len(gpus)]
     elif visible is None:
-        os.environ.pop("CUDA_VISIBLE_DEVICES", None)  # submitit has emptied it
+        os.environ.pop("CUDA_VISIBLE_DEVICES", None)  # submitit has set it to an empty value
 
 
 def installed_gpus() -> list[str]:
-    """The indices of NVIDIA GPUs of this machine, as its driver lists them."""
+    """The indices of the NVIDIA GPUs of this machine, from its driver."""
     try:
         listing = subprocess.run(
             ["nvidia-smi", "--query-gpu=index", "--format=csv,noheader"],
@@ -104,22 +104,22 @@ def installed_gpus() -> list[str]:
 
 
 def assign_threads(threads: int | str, parallel: int) -> None:
-    """Limit the libraries' threads in this process to ``threads``, for "auto" to its share. Before torch is loaded."""
+    """Limit threads of libraries in this process to ``threads`` ("auto": its share). Call it before importing torch."""
     count = available_threads(parallel) if threads == "auto" else int(threads)
     for variable in THREAD_VARIABLES:
         os.environ[variable] = str(count)
 
 
 def available_cores() -> int:
-    """The cores that this process may use, at least 1."""
+    """The number of cores that this process may use, at least 1."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-# ---- memory
+# Memory
 
 
 def reset_peak_memory(device: torch.device) -> None:
-    """Start a new measurement of peak memory, where the platform can (Linux, CUDA)."""
+    """Start a new measurement of peak memory, if the platform supports it (Linux, CUDA)."""
     if device.type == "cuda":
         import torch
 
@@ -132,7 +132,7 @@ def reset_peak_memory(device: torch.device) -> None:
 
 
 def peak_memory_mb(device: torch.device) -> float:
-    """Peak since `reset_peak_memory`: of torch's allocations on a GPU, else of this process's resident memory; MiB."""
+    """Peak memory since `reset_peak_memory`, MiB: torch's allocations on a GPU, else this process's resident memory."""
     if device.type == "cuda":
         import torch
 
@@ -141,10 +141,9 @@ def peak_memory_mb(device: torch.device) -> float:
 
 
 def peak_resident_mb() -> float:
-    """The most memory that this process had resident; MiB.
+    """The peak resident memory of this process, MiB.
 
-    Linux's own count comes first: ``ru_maxrss`` begins at what the parent had when it started this process, and cannot
-    be reset.
+    On Linux it is VmHWM: ``ru_maxrss`` cannot be reset, and starts at the memory of the parent.
     """
     if STATUS.exists():
         found = re.search(r"VmHWM:\s+(\d+) kB", STATUS.read_text())
@@ -156,7 +155,7 @@ def peak_resident_mb() -> float:
 
 
 def peak_child_mb() -> float:
-    """The most that any one ended child of this process had resident; MiB, 0 where the platform does not say."""
+    """The largest peak resident memory of an ended child of this process, MiB; 0 if the platform does not report it."""
     return 0.0 if resource is None else _max_resident_mb(resource.RUSAGE_CHILDREN)
 
 

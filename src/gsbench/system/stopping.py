@@ -1,7 +1,7 @@
-"""Stopping on a signal: at once, or in a training at the end of its iteration, with a checkpoint.
+"""Stopping on a signal: at once, or, in a training, after the current iteration, with a checkpoint.
 
-Signals belong to the process, and so does the state in this module. SIGINT is Ctrl-C; SIGTERM comes from shells and
-from Slurm when a job is preempted or cancelled; SIGUSR2 comes from submitit shortly before a job's time is up.
+The state in this module is global, because signals belong to the process. SIGINT is Ctrl-C. SIGTERM comes from shells,
+and from Slurm when a job is preempted or cancelled. SIGUSR2 comes from submitit shortly before a job's time is up.
 """
 
 import signal
@@ -11,12 +11,12 @@ from contextlib import contextmanager
 from types import FrameType
 
 SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGUSR2") if hasattr(signal, name))
-# Of a process that ignores Ctrl-C, since the one that started it passes it on.
-PASSED_ON = tuple(signum for signum in SIGNALS if signum != signal.SIGINT)
+# For a process that ignores Ctrl-C because its parent handles it and ends the process.
+SIGNALS_WITHOUT_INTERRUPT = tuple(signum for signum in SIGNALS if signum != signal.SIGINT)
 
 
 class Stopped(KeyboardInterrupt):
-    """Signal to the program to end; what was done so far is kept."""
+    """Raised when a signal stops the program. Results so far are kept."""
 
     def __init__(self, signum: int) -> None:
         super().__init__(signal.Signals(signum).name)
@@ -29,28 +29,28 @@ class Stopped(KeyboardInterrupt):
 
 
 class _State:
-    signals: Sequence[int] = ()  # that stop, within stop_on_signals
-    deferring = 0  # depth of blocks that stop where it suits them
-    requested: int | None = None
+    signals: Sequence[int] = ()  # signals handled by the present stop_on_signals
+    deferring = 0  # number of nested ``deferred`` blocks
+    requested: int | None = None  # a signal that a ``deferred`` block has received
 
 
 def requested() -> bool:
-    """Return whether a signal came that the present ``deferred`` block has still to act on."""
+    """Return whether the present ``deferred`` block has received a signal and should end."""
     return _State.requested is not None
 
 
 @contextmanager
 def stop_on_signals(signals: Sequence[int] = SIGNALS) -> Iterator[None]:
-    """Raise `Stopped` in the main thread when a signal comes; the earlier handlers are back afterwards."""
+    """Within the block, a signal raises `Stopped` in the main thread. Then the earlier handlers are restored."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
     earlier = {signum: signal.signal(signum, _on_signal) for signum in signals}
-    before, _State.signals = _State.signals, signals
+    earlier_signals, _State.signals = _State.signals, signals
     try:
         yield
     finally:
-        _State.signals = before
+        _State.signals = earlier_signals
         for signum, handler in earlier.items():
             signal.signal(signum, handler)
         _State.requested = None
@@ -58,7 +58,7 @@ def stop_on_signals(signals: Sequence[int] = SIGNALS) -> Iterator[None]:
 
 @contextmanager
 def interrupts_ignored() -> Iterator[None]:
-    """Ignore Ctrl-C for a moment, so that processes started within the block ignore it for good."""
+    """Ignore Ctrl-C within the block. Processes started in it inherit this and always ignore Ctrl-C."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -69,8 +69,8 @@ def interrupts_ignored() -> Iterator[None]:
         signal.signal(signal.SIGINT, handler)
 
 
-def take_signals_back() -> None:
-    """Install the handlers again, within `stop_on_signals`: importing pycolmap replaces that of SIGTERM."""
+def reinstall_handlers() -> None:
+    """Install the handlers of `stop_on_signals` again: importing pycolmap replaces the handler of SIGTERM."""
     if threading.current_thread() is threading.main_thread():
         for signum in _State.signals:
             signal.signal(signum, _on_signal)
@@ -78,8 +78,8 @@ def take_signals_back() -> None:
 
 @contextmanager
 def deferred() -> Iterator[None]:
-    """Defer signals within the block: a first sets `requested`, a second stops at once; raises `Stopped` at its end."""
-    take_signals_back()
+    """Within the block, a first signal sets `requested` and raises `Stopped` at the end; a second stops at once."""
+    reinstall_handlers()
     _State.deferring += 1
     try:
         yield

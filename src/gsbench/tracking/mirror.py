@@ -17,7 +17,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from gsbench.system.isolate import describe_exit, python_command, telling_lines
+from gsbench.system.isolate import describe_exit, error_lines, python_command
 from gsbench.tracking.trial import name_of
 
 log = logging.getLogger(__name__)
@@ -100,7 +100,7 @@ class Mirror:
             log.debug("tracking failed:\n%s", text)
             self._warn(text.splitlines()[-1])
         elif process.returncode != 0:
-            self._warn(f"the mirror {describe_exit(process.returncode)}; its last lines: {telling_lines(stderr)}")
+            self._warn(f"the mirror {describe_exit(process.returncode)}; its last lines: {error_lines(stderr)}")
 
     def _warn(self, error: object) -> None:
         log.warning("tracking: %s; the files are complete, `gsbench sync` mirrors them later", error)

@@ -1,8 +1,8 @@
 """The photometric loss compiled for the CPU: one fused forward pass over rows, and a hand-written gradient.
 
-Images stay interleaved [H, W, 3]: a row is 3 W numbers and a horizontal neighbour is 3 numbers away, so one vector
-covers 16 numbers of any channel. Rows are filtered horizontally once into a ring of 11 and combined vertically from
-there. The statistics of the target are computed again at each step, so that no memory is needed for each view.
+Images stay interleaved [H, W, 3]: a row is 3 W numbers, and horizontal neighbours are 3 numbers apart. So one vector
+holds 16 adjacent numbers of all channels. Each row is filtered horizontally once, into a ring buffer of 11 rows, which
+are then filtered vertically. Statistics of the target are computed again in each step, to need no memory per view.
 """
 
 from typing import Any
@@ -19,12 +19,12 @@ from gsbench.raster.staged import Lifetime
 from gsbench.system.jit import inlined, kernel
 from gsbench.system.resources import available_cores
 
-SHARDS = 8  # of rows; a thread filters ten rows beside its own
+SHARDS = 8  # of rows; each shard filters ten rows of its neighbours, too
 CHANNELS = 3
-PAD = LANES  # zeros on both sides of a row: at least CHANNELS * WINDOW_RADIUS
+PAD = LANES  # zeros on both sides of a row; at least CHANNELS * WINDOW_RADIUS
 TAPS = 2 * WINDOW_RADIUS + 1
 WEIGHTS = window().numpy().astype(np.float32)[WINDOW_RADIUS:].copy()  # from the centre outwards
-MAPS = 4  # image, target, sum of their squares, product
+MAPS = 4  # filtered maps: image, target, sum of their squares, product
 LANE = np.arange(LANES, dtype=np.float32)
 ZERO, ONE, TWO = np.float32(0), np.float32(1), np.float32(2)
 F_C1, F_C2 = np.float32(C1), np.float32(C2)
@@ -45,7 +45,7 @@ def _blur_row(source: Any, start: int, target: Any, place: int, numbers: int) ->
 
 @inlined
 def _blur_column(ring: Any, first: int, i: int, row: int, stride: int) -> Any:
-    """Filter vertically around ``row`` at number ``i``: rows of the ring starting at ``first``, ``stride`` apart."""
+    """Filter vertically around ``row`` at number ``i``. Rows of the ring start at ``first``, ``stride`` apart."""
     total = load(ring, first + row % TAPS * stride + i) * WEIGHTS[0]
     for k in range(1, WINDOW_RADIUS + 1):
         pair = load(ring, first + (row - k + TAPS) % TAPS * stride + i) + load(
@@ -64,20 +64,20 @@ def _sum(vector: Any, scratch: Any) -> float:
 
 @inlined
 def _read_row(image: Any, row: int, numbers: int, divisor: Any, out: Any) -> None:
-    """A row of an image, float32 or uint8, in units of ``divisor``, behind PAD zeros that ``out`` has already."""
+    """Read a row of a float32 or uint8 image, divided by ``divisor``, into ``out`` behind its PAD zeros."""
     start = row * numbers
     if numbers < LANES:
         for i in range(numbers):
             out[PAD + i] = image[start + i] / divisor
     else:
         for i in range(0, numbers, LANES):
-            place = min(i, numbers - LANES)  # the last vector repeats some numbers, so as to end with the row
+            place = min(i, numbers - LANES)  # the last vector overlaps the previous one, to end with the row
             store(out, PAD + place, load_numbers(image, start + place) / divisor)
 
 
 @inlined
 def _write_row(line: Any, row: int, numbers: int, image: Any) -> None:
-    """The inverse of ``_read_row``, from ``line`` without padding."""
+    """The inverse of ``_read_row``; ``line`` has no padding."""
     start = row * numbers
     if numbers < LANES:
         for i in range(numbers):
@@ -101,11 +101,10 @@ def similarity_rows(
     derivatives: Any,
     sums: Any,
 ) -> None:
-    """Rows ``begin`` to ``end``, with scratch ``memory``: ``sums`` [H, 2] get each row's sum of SSIM and of |image -
-    target|.
+    """For the rows ``begin`` to ``end``, write the sums of SSIM and of |image - target| to ``sums`` [H, 2].
 
-    ``derivatives`` [3, H, PAD + 3 W rounded up + PAD], if not empty, gets the derivative of SSIM's sum with respect to
-    the blurred image, its blurred square and its blurred product with the target, between zeros.
+    ``derivatives`` [3, H, PAD + 3 W rounded up + PAD], if not empty, gets the derivatives of the sum of SSIM by the
+    blurred image, its blurred square and its blurred product with the target, padded with zeros. ``memory`` is scratch.
     """
     numbers = width * CHANNELS
     length = (numbers + LANES - 1) // LANES * LANES
@@ -125,7 +124,7 @@ def similarity_rows(
             l1 = splat(ZERO)
             for i in range(PAD, PAD + length, LANES):
                 a, b = load(x, i), load(y, i)
-                store(squares, i, fma(a, a, b * b))  # SSIM asks for the sum of both variances alone
+                store(squares, i, fma(a, a, b * b))  # SSIM needs only the sum of both variances
                 store(products, i, a * b)
                 l1 += absolute(a - b)
             if begin <= row < end:
@@ -184,7 +183,7 @@ def gradient_rows(
     ssim_factor: Any,
     gradient: Any,
 ) -> None:
-    """Rows ``begin`` to ``end`` of ``gradient`` [H * W * 3]; the blur is symmetric, so it pulls derivatives back."""
+    """Compute the rows ``begin`` to ``end`` of ``gradient`` [H * W * 3]. The symmetric blur is its own adjoint."""
     numbers = width * CHANNELS
     length = (numbers + LANES - 1) // LANES * LANES
     padded = length + 2 * PAD
@@ -217,7 +216,7 @@ def gradient_rows(
 
 
 class CompiledLoss:
-    """The kernels with their threads and memory; see ``loss.PhotometricLoss``."""
+    """Calls the kernels with threads and pooled memory; see ``loss.PhotometricLoss``."""
 
     def __init__(self, ssim_weight: float, threads: int | None) -> None:
         self.ssim_weight = ssim_weight
@@ -226,10 +225,10 @@ class CompiledLoss:
         self._tensors = TensorPool()
 
     def __call__(self, image: Tensor, target: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        return _Loss.apply(self, image, target)
+        return _CompiledLossFunction.apply(self, image, target)
 
     def compute(self, image: Tensor, target: Tensor, differentiate: bool) -> tuple[float, float, Tensor | None]:
-        """Mean SSIM, mean L1, and the gradient of the loss at ``image`` if ``differentiate``."""
+        """Return mean SSIM, mean L1 and, if ``differentiate``, the gradient of the loss by ``image``."""
         height, width, _ = image.shape
         numbers = image.numel()
         pixels = image.detach().contiguous().numpy().reshape(-1)
@@ -265,8 +264,8 @@ class CompiledLoss:
         return total_similarity, total_l1, gradient
 
 
-class _Loss(torch.autograd.Function):
-    """The gradient is computed with the value, from rows that are in the cache, and scaled in ``backward``."""
+class _CompiledLossFunction(torch.autograd.Function):
+    """Computes the gradient together with the value; ``backward`` only scales it."""
 
     @staticmethod
     def forward(ctx: Any, compiled: CompiledLoss, image: Tensor, target: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -1,8 +1,8 @@
-"""The photometric loss in Triton kernels: nothing is read back from the device, neither values nor gradient.
+"""The photometric loss in Triton kernels. The host never waits for values from the device.
 
-Images stay interleaved [H, W, 3]: a row is 3 W numbers, and a horizontal neighbour is 3 numbers away. A program goes
-down a strip of rows, a lane a number of a row. It filters each row horizontally as it comes, and adds it to eleven
-running sums, of which one is complete at each row.
+Images stay interleaved [H, W, 3]: a row is 3 W numbers, and horizontal neighbours are 3 numbers apart. A program
+processes a strip of columns from top to bottom, one lane per number of a row. It filters each row horizontally and adds
+it to eleven running vertical sums, of which one is complete at each row.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from gsbench.raster.executors import load_driver
 from gsbench.raster.staged import Lifetime
 from gsbench.raster.triton.launch import WorkspacePool, launch_grid
 
-STRIP = 128  # numbers of a row that a program takes
-LEAST_ROWS = 8  # that it takes
-# Of an H100 or H200, for which the programs are counted. Each multiprocessor holds four: 65,536 registers, at most 128
-# in each of 128 lanes.
+STRIP = 128  # numbers of a row per program
+MIN_ROWS = 8  # rows per program
+# The numbers of programs are chosen for an H100 or H200. A multiprocessor holds four programs at once: it has 65,536
+# registers, and each of the 128 lanes of a program uses at most 128.
 MULTIPROCESSORS, PROGRAMS_HELD = 132, 4
 RADIUS = tl.constexpr(WINDOW_RADIUS)
 CHANNELS = tl.constexpr(3)
@@ -32,17 +32,17 @@ F_C1, F_C2 = tl.constexpr(C1), tl.constexpr(C2)
 
 
 def rows_of_program(height: int, numbers: int) -> int:
-    """Rows that a program takes of an image of ``height`` rows of ``numbers``.
+    """The number of rows per program, for an image of ``height`` rows of ``numbers``.
 
-    It filters ``2 * RADIUS`` rows more than it takes, so fewer programs do less work, but multiprocessors without one
-    do none. All programs run at once; of their possible numbers on a multiprocessor that is best by which the fullest
-    filters fewest rows. One program alone counts as two there: it leaves the time open that it waits for its memory.
-    The image's size alone decides, so that sums have the same bits on every GPU.
+    A program filters ``2 * RADIUS`` rows besides its own. So few programs do less work in all, but leave
+    multiprocessors idle. This chooses the number of programs per multiprocessor, all running at once, for which the
+    busiest multiprocessor filters the fewest rows. A single program counts as two, because nothing else runs while it
+    waits for memory. The result depends only on the size of the image, so sums have the same bits on every GPU.
     """
     strips = triton.cdiv(numbers, STRIP)
 
     def rows(held: int) -> int:
-        return max(LEAST_ROWS, triton.cdiv(height, max(1, held * MULTIPROCESSORS // strips)))
+        return max(MIN_ROWS, triton.cdiv(height, max(1, held * MULTIPROCESSORS // strips)))
 
     def filtered(held: int) -> int:
         programs = strips * triton.cdiv(height, rows(held))
@@ -59,14 +59,14 @@ def _weight(k: tl.constexpr):
 
 @triton.jit
 def _zeros(like):
-    """Eleven running sums of nothing."""
+    """Eleven running sums, all zero."""
     zero = tl.zeros_like(like)
     return (zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero)
 
 
 @triton.jit
 def _push(sums, value):
-    """The running sums one row further, where the row's blurred ``value`` comes in; the first is complete."""
+    """Advance the running sums by one row, whose blurred ``value`` is added. The first sum is then complete."""
     return (
         tl.fma(value, W5, sums[1]),
         tl.fma(value, W4, sums[2]),
@@ -84,14 +84,14 @@ def _push(sums, value):
 
 @triton.jit
 def _load(array, row, number, height, numbers, scale):
-    """Numbers of one row as float32, times ``scale``; 0 outside the image."""
+    """Load numbers of one row as float32, times ``scale``; 0 outside the image."""
     inside = (row >= 0) & (row < height) & (number >= 0) & (number < numbers)
     return tl.load(array + row * numbers + number, mask=inside, other=0).to(tl.float32) * scale
 
 
 @triton.jit
 def _add(sums, x, y, weight):
-    """Five weighted sums: of x, y, x^2, y^2 and x y."""
+    """Add to five weighted sums: of x, y, x^2, y^2 and x y."""
     wx, wy = x * weight, y * weight
     return (sums[0] + wx, sums[1] + wy, tl.fma(wx, x, sums[2]), tl.fma(wy, y, sums[3]), tl.fma(wx, y, sums[4]))
 
@@ -109,11 +109,10 @@ def measure_similarity(
     DIFFERENTIATE: tl.constexpr,
     STRIP: tl.constexpr,
 ):
-    """``sums`` [programs, 2] gets the sums of SSIM and of |image - target| over the ``rows`` of this program, where the
-    target is ``target * scale``.
+    """Write the sums of SSIM and of |image - target scale| over the ``rows`` of this program to ``sums`` [programs, 2].
 
-    ``derivatives`` [3, H, 3 W], if ``DIFFERENTIATE``, gets the derivative of SSIM's sum with respect to the blurred
-    image, its blurred square and its blurred product with the target.
+    If ``DIFFERENTIATE``, ``derivatives`` [3, H, 3 W] gets the derivatives of the sum of SSIM by the blurred image, its
+    blurred square and its blurred product with the target.
     """
     number = tl.program_id(0) * STRIP + tl.arange(0, STRIP)  # [STRIP] of a row
     first = tl.program_id(1) * rows
@@ -160,7 +159,7 @@ def measure_similarity(
 
 @triton.jit(do_not_specialize=["programs"])
 def add_up(sums, programs, size, ssim_weight, values, GROUP: tl.constexpr):
-    """``values`` [3]: loss, mean L1 and mean SSIM, from the ``sums`` [programs, 2] of images of ``size`` numbers."""
+    """Write loss, mean L1 and mean SSIM to ``values`` [3], from ``sums`` [programs, 2] over ``size`` numbers."""
     similarity, l1 = tl.zeros([GROUP], tl.float32), tl.zeros([GROUP], tl.float32)
     for start in range(0, programs, GROUP):
         program = start + tl.arange(0, GROUP)
@@ -186,7 +185,7 @@ def differentiate(
     rows,
     STRIP: tl.constexpr,
 ):
-    """The ``gradient`` [H, 3 W] at the image; the blur is symmetric, so it pulls derivatives back."""
+    """Compute the ``gradient`` [H, 3 W] by the image. The symmetric blur is its own adjoint."""
     number = tl.program_id(0) * STRIP + tl.arange(0, STRIP)  # [STRIP] of a row
     first = tl.program_id(1) * rows
     zero = tl.zeros([STRIP], tl.float32)
@@ -216,7 +215,7 @@ def differentiate(
 
 
 class TritonLoss:
-    """The kernels with their memory; see ``loss.PhotometricLoss``. The same bits on every run of one GPU."""
+    """Calls the kernels with pooled memory; see ``loss.PhotometricLoss``. Same bits on every run on one GPU."""
 
     def __init__(self, ssim_weight: float) -> None:
         self.ssim_weight = ssim_weight
@@ -227,12 +226,12 @@ class TritonLoss:
             load_driver()
         if target.dtype != torch.uint8:
             target = target.to(torch.float32)
-        loss, l1, similarity = _Loss.apply(self, image, target.contiguous())
+        loss, l1, similarity = _TritonLossFunction.apply(self, image, target.contiguous())
         return loss, l1, similarity
 
 
-class _Loss(torch.autograd.Function):
-    """The bridge between the kernels and autograd."""
+class _TritonLossFunction(torch.autograd.Function):
+    """Connects the kernels with autograd."""
 
     @staticmethod
     def forward(ctx: Any, loss: TritonLoss, image: Tensor, target: Tensor) -> tuple[Tensor, Tensor, Tensor]:
