@@ -26,7 +26,7 @@ from gsbench.gaussians.ply import write_ply
 from gsbench.raster.cpu import CpuRasterizer
 from gsbench.raster.cpu import executor as cpu_executor
 from gsbench.raster.reference import project
-from gsbench.verbs.bench import main, parser
+from gsbench.verbs.bench import _parser, main
 from tests.benchmarks.counters import timed_kernels
 
 pytestmark = pytest.mark.slow
@@ -125,7 +125,7 @@ def test_the_skewed_scene_has_the_skew_of_a_trained_model() -> None:
 
 
 def test_every_scene_can_be_chosen() -> None:
-    (choice,) = (action for action in parser()._actions if action.dest == "scene")
+    (choice,) = (action for action in _parser()._actions if action.dest == "scene")
     assert tuple(choice.choices) == tuple(SCENES)
 
 
