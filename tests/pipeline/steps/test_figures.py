@@ -6,10 +6,11 @@ import math
 
 import numpy as np
 import torch
+from PIL import Image
 
 from gsbench.events import Cause
 from gsbench.gaussians.model import Gaussians
-from gsbench.pipeline.steps.pictures import draw_ellipsoids
+from gsbench.pipeline.steps.pictures import _with_legend, draw_ellipsoids
 from tests.train.conftest import orbit_camera
 
 
@@ -40,3 +41,9 @@ def test_only_the_voluminous_is_outlined() -> None:
     assert abs(distances.mean() - radius) < 0.3
     assert abs(columns.mean() - (camera.cx - 0.5)) < 0.3
     assert abs(rows.mean() - (camera.cy - 0.5)) < 0.3
+
+
+def test_a_word_wider_than_the_picture_leaves_no_line_empty() -> None:
+    wide, narrow = (_with_legend(Image.new("RGB", (width, 10)), "illegible", []).height for width in (500, 5))
+    assert narrow == wide
+    assert _with_legend(Image.new("RGB", (5, 10)), "illegible too", []).height - wide == wide - 10  # a line each

@@ -1,0 +1,46 @@
+"""A camera: what it refuses, where it stands, and that another size changes no direction."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gsbench.scene.camera import Camera
+from tests.scene.cameras import looking
+
+SOUND: dict[str, Any] = {
+    **{"width": 1, "height": 1, "fx": 1e-3, "fy": 1e-3, "cx": -5.0, "cy": 0.0},
+    **{"rotation": np.eye(3), "translation": np.zeros(3)},
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        *[("width", 0), ("height", 0), ("fx", 0.0), ("fy", 0.0), ("fx", -1.0), ("fy", np.inf), ("fx", np.nan)],
+        *[("cx", np.inf), ("cy", np.nan)],
+        *[("rotation", 1.01 * np.eye(3)), ("rotation", np.eye(4)), ("rotation", np.full((3, 3), np.nan))],
+        *[("translation", np.zeros(2)), ("translation", np.array([0.0, np.nan, 0.0]))],
+    ],
+)
+def test_only_what_is_no_camera_is_refused(name: str, value: object) -> None:
+    Camera(**SOUND)  # one pixel is a picture
+    with pytest.raises(ValueError, match="camera: "):
+        Camera(**(SOUND | {name: value}))
+
+
+def test_its_centre_is_where_it_stands() -> None:
+    eye = np.array([3.0, -2.0, 1.5])
+    np.testing.assert_allclose(looking(eye, np.array([0.5, 0.0, 0.2])).center, eye, atol=1e-12)
+
+
+def test_a_point_stays_at_its_share_of_a_resized_picture() -> None:
+    camera = looking(np.array([3.0, -2.0, 1.5]), np.zeros(3), size=(64, 48))
+    x, y, z = camera.rotation @ [0.1, 0.2, 0.3] + camera.translation
+    places = [
+        ((one.fx * x / z + one.cx) / one.width, (one.fy * y / z + one.cy) / one.height)
+        for one in (camera, camera.resized(17, 60))
+    ]
+    assert places[0] == pytest.approx(places[1])
