@@ -232,3 +232,22 @@ def test_the_picture_is_a_map_seen_from_the_cameras_side(tmp_path: Path) -> None
     assert (pixels == [10, 20, 30]).all(axis=-1).sum() == 2 * 9
     bar = np.flatnonzero((pixels[960 - 24] == 0).all(axis=-1))
     np.testing.assert_allclose([bar.min(), bar.max()], [60, 60 + scale], atol=1.0)  # one unit
+
+
+def test_points_are_drawn_smaller_the_more_there_are(tmp_path: Path) -> None:
+    """Most of them stand in one place; the other is drawn alone."""
+    inked = []
+    for others in (1, 6_000, 60_000):
+        model = pycolmap.Reconstruction()
+        model.add_camera_with_trivial_rig(pycolmap.Camera.create_from_model_name(1, "PINHOLE", 100.0, 100, 80))
+        for index, (x, y) in enumerate(((0.0, 0.0), (8.0, 5.0)), start=1):
+            pose = pycolmap.Rigid3d(np.column_stack([np.eye(3), [-x, -y, 0]]))
+            image = pycolmap.Image(name=f"{index}", keypoints=np.zeros((1, 2)), camera_id=1, image_id=index)
+            model.add_image_with_trivial_frame(image, pose)
+        for _ in range(others):
+            model.add_point3D(np.array([1.0, 1.0, 5.0]), pycolmap.Track(), np.array([10, 20, 30], dtype=np.uint8))
+        model.add_point3D(np.array([6.0, 4.0, 5.0]), pycolmap.Track(), np.array([30, 90, 30], dtype=np.uint8))
+        draw_cloud(model, tmp_path / "cloud.png", "hand-made")
+        pixels = np.asarray(Image.open(tmp_path / "cloud.png").convert("RGB"))
+        inked.append(int((pixels == [30, 90, 30]).all(axis=-1).sum()))
+    assert inked[0] > inked[1] > inked[2] > 0
