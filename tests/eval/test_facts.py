@@ -108,15 +108,26 @@ def test_missing_weights_are_awaited_and_what_was_not_asked_for_is_not(
         ("direction", 2),
         ("direction", "up"),
         ("decimals", -1),
+        ("decimals", 13),
+        ("decimals", True),
         ("label", " "),
         ("unit", 3),
         ("worthwhile", float("nan")),
+        ("worthwhile", 0),
+        ("worthwhile", True),
     ],
 )
 def test_what_a_metric_says_of_itself_is_checked(name: str, value: object) -> None:
     metric = type("Mine", (Brightness,), {name: value})()
     with pytest.raises(InputError, match=rf"Mine\.{name} must be "):
         facts_of("mine", metric)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("direction", 0), ("decimals", 0), ("decimals", 12), ("unit", ""), ("worthwhile", 1e-9)]
+)
+def test_a_metric_may_say_what_the_rules_allow(name: str, value: object) -> None:
+    assert getattr(facts_of("mine", type("Mine", (Brightness,), {name: value})()), name) == value
 
 
 def test_a_metric_that_says_nothing_has_no_direction() -> None:

@@ -84,6 +84,16 @@ def test_colours_are_those_of_the_nearest_photograph(courtyard: Capture):
     assert 5 < (found[:, 0] >= 0).sum() < 60
 
 
+def test_black_is_a_colour_and_what_no_camera_sees_is_grey(
+    courtyard: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    save(tmp_path / "scan.xyz", XYZ[:3])
+    seen = np.array([[0, 0, 0], [-1, -1, -1], [0, 9, 255]], dtype=np.int16)
+    monkeypatch.setattr("gsbench.init.points.seen_colors", lambda *_: seen)
+    cloud = Points(path=tmp_path / "scan.xyz").cloud(courtyard, pycolmap.Reconstruction())
+    np.testing.assert_array_equal(cloud.colors, [[0, 0, 0], [GREY] * 3, [0, 9, 255]])
+
+
 def test_a_cloud_is_thinned_and_placed(courtyard: Capture, tmp_path: Path):
     save(tmp_path / "scan.xyz", XYZ)
     options = Points(path=tmp_path / "scan.xyz", max_points=30, seed=1)

@@ -72,7 +72,11 @@ def test_gauge_of_the_papers_threshold():
 
 def test_figures_of_a_model(capture: Capture):
     model = model_of(CENTERS, shift_px=0.75)
-    report = make_report("x", "shared", capture, model, 1.0, settings={}, seconds={}, packages=("pycolmap",))
+    counts = {"features": 7}
+    report = make_report(
+        "x", "shared", capture, model, 1.0, settings={}, seconds={}, packages=("pycolmap",), counts=counts
+    )
+    assert report.counts == counts
     assert (report.num_images, report.num_registered, report.num_points) == (4, 4, 2)
     assert report.mean_reprojection_error == pytest.approx(0.75)
     assert report.mean_track_length == 2.0

@@ -49,8 +49,11 @@ def test_three_cameras_give_a_similarity_and_two_do_not() -> None:
         align_poses(*poses(2))
 
 
-def test_wrong_cameras_do_not_move_the_alignment():
+@pytest.mark.parametrize("away", [0.0, 1000.0])
+def test_wrong_cameras_do_not_move_the_alignment(away: float):
+    """Wherever the origin lies: captures by satellite positions stand far from it."""
     centers, rotations, moved, moved_rotations = poses(30)
+    centers, moved = centers + away, moved + away * TRUE_SCALE * TRUE_ROTATION.sum(axis=1)
     wrong = moved.copy()
     wrong[:10] += np.random.default_rng(1).normal(size=(10, 3)) * 20
     similarity = align_poses(centers, rotations, wrong, moved_rotations)
