@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import statistics
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -111,6 +112,21 @@ def test_trials_that_were_measured_before_the_question_cost_it_its_place(
     assert one.answer is not None
     assert late.answer is not None
     assert late.answer.level == pytest.approx(one.answer.level / 4)  # psnr, ssim, flip and one LPIPS
+
+
+@pytest.mark.parametrize("seeds", [1, 2, 3])
+def test_a_scene_has_the_mean_and_the_deviation_of_its_differences(
+    make_experiment: Callable[..., Experiment], seeds: int
+) -> None:
+    trials = make_experiment(seeds=range(seeds)).trials
+    (verdict,) = judge(trials, Declaration(time=EARLY, questions=(PSNR,)))
+    assert [scene.scene for scene in verdict.scenes] == ["courtyard", "garden"]
+    values = {(trial.scene, trial.densify, trial.seed): trial.metrics["psnr"] for trial in trials}
+    for found in verdict.scenes:
+        own = [values[found.scene, "volumetric", seed] - values[found.scene, "adc", seed] for seed in range(seeds)]
+        assert found.seeds == seeds
+        assert found.mean == pytest.approx(statistics.mean(own))
+        assert found.deviation == (pytest.approx(statistics.stdev(own)) if seeds > 1 else None)
 
 
 def test_arms_that_never_differ_cannot_be_tested(make_experiment: Callable[..., Experiment]) -> None:
