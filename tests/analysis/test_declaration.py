@@ -18,7 +18,7 @@ from gsbench.analysis.report.build import build_report
 from gsbench.analysis.results import Experiment, load_experiment
 from gsbench.analysis.statistics import answer_family
 from gsbench.analysis.tables import build_table
-from gsbench.analysis.verdicts import PairVerdicts, families, judge_pairs
+from gsbench.analysis.verdicts import PairVerdicts, families, in_words, judge_pairs
 from gsbench.runs.declaration import STAMP, Arm, Declaration, Question, open_question, read_declarations, record_text
 from tests.analysis.synthetic import Plan, write_runs
 
@@ -113,6 +113,7 @@ def test_where_nothing_was_declared_that_is_said_and_all_metrics_are_one_family(
     assert "4 tests adjusted by Holm" in page
     (one,) = judged(experiment)
     assert {(one.role(v), v.family) for v in one.verdicts} == {("", 4)}
+    assert all("4 tests)" in in_words(v) for v in one.verdicts)
     least = min(one.verdicts, key=alone)
     assert least.p == pytest.approx(4 * alone(least))
     assert not any("declared" in note for note in build_table(experiment).notes)

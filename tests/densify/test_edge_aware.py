@@ -88,6 +88,19 @@ def test_a_candidate_that_covers_no_edge_is_not_split_though_there_is_room() -> 
     assert event.blocked_by_cap == ((scores == 0) & (gradient >= 1e-9)).sum()
 
 
+@pytest.mark.parametrize("room", [0, 9])
+def test_where_nothing_can_grow_no_view_is_rendered(room: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without room all candidates are told as blocked; without candidates none is."""
+    densifier = EdgeAware(max_gaussians=COUNT + room, cap="hard")
+    trainable, _ = started(densifier, 0)
+    monkeypatch.delattr(EdgeAware, "scores")
+    candidates = torch.zeros(COUNT, dtype=torch.bool)
+    candidates[: 0 if room else 5] = True
+    chosen, blocked = densifier.choose(at(600, trainable, torch.Generator()), candidates, 1)
+    assert not chosen.any()
+    assert blocked == candidates.sum()
+
+
 def test_the_growth_control_is_a_root() -> None:
     densifier = EdgeAware(max_gaussians=10_000, start=500, stop=15_000)
     trainable, _ = started(densifier, 0)

@@ -215,6 +215,9 @@ def test_the_file_is_among_what_a_trial_is_made_of(tmp_path: Path) -> None:
         (lambda d: d.update(k4=0.1), "k3 and k4 are read of OPENCV_FISHEYE alone"),
         (lambda d: d.pop("fl_x"), "no focal length"),
         (lambda d: (d.pop("fl_x"), d.update(camera_angle_x=4.0)), "no focal length"),
+        (lambda d: (d.pop("fl_x"), d.update(camera_angle_x=0)), "no focal length"),
+        (lambda d: d.update(fl_x=0), "no focal length"),
+        (lambda d: d.update(h=0), "w and h must be whole numbers"),
         (lambda d: d.update(w=40.5), "w and h must be whole numbers"),
         (lambda d: d.update(fl_x="50"), "fl_x is '50'"),
         (lambda d: d["frames"][1].update(file_path="../secret.png"), "lies outside the folder"),
@@ -233,6 +236,13 @@ def test_what_cannot_be_understood_is_one_line_that_names_the_file(tmp_path: Pat
         read_transforms(folder)
     assert str(folder / "transforms.json") in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_a_line_of_pixels_is_a_picture(tmp_path: Path) -> None:
+    folder = write(tmp_path / "in", w=1)
+    for k in range(len(EYES)):
+        Image.new("RGB", (1, 30)).save(folder / "images" / f"{k}.png")
+    assert {image.camera.width for image in read_transforms(folder).images.values()} == {1}
 
 
 def test_no_file_and_a_name_without_a_decision(tmp_path: Path) -> None:
