@@ -25,7 +25,7 @@ LOCKED_ROUNDS = 5  # rounds after an opacity reset in which the governor does no
 
 
 class Grown(NamedTuple):
-    """What each of N Gaussians becomes by the growth of a round, before pruning."""
+    """Results of the growth of a round for each of N Gaussians, before pruning."""
 
     number: Tensor  # [N] of Gaussians in its place, itself included
     log_scales: Tensor  # [N, 3] of each of them
@@ -133,7 +133,7 @@ class ADC(Budgeted):
         return admit(candidates, self.mean_gradient(), gain, self.allowance(refinement))
 
     def grown(self, refinement: Refinement) -> Grown:
-        """What each Gaussian would become if the cap admitted all candidates."""
+        """Result of growth for each Gaussian if the cap admitted all candidates."""
         values = refinement.gaussians.values
         over, large = self.candidates(refinement)
         logits = torch.where(over, revised_logits(values.opacity_logits), values.opacity_logits)
@@ -149,7 +149,7 @@ class ADC(Budgeted):
         return int(grown.number[~pruned].sum())
 
     def grow_by_gradient(self, refinement: Refinement) -> None:
-        """Of the Gaussians whose mean gradient reaches the threshold, clone the small and split the large."""
+        """Clone small Gaussians and split large ones if their mean gradient reaches the threshold."""
         gaussians, event = refinement.gaussians, refinement.event
         over, large = self.candidates(refinement)
         selected, blocked = self.choose(refinement, over, max(1, self.split_children - 1))

@@ -81,7 +81,7 @@ NEVER = 10**9  # an iteration, or an interval, beyond any training
 
 @dataclass(frozen=True)
 class DensifyContext:
-    """What a densifier knows of its training."""
+    """Facts of a training that its densifier may use."""
 
     extent: float  # size of the scene in world units: 3DGS's cameras_extent
     white_background: bool = False

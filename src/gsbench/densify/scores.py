@@ -115,9 +115,9 @@ def edge_scores(
     step: int,
     normalize: Callable[[Tensor], Tensor],
 ) -> Tensor:
-    """How much of the photographs' edges each Gaussian covers, [N].
+    """Scores [N] by the edges in photographs that each Gaussian covers.
 
-    In a view it is the sum over pixels of (edge strength) alpha T, passed through ``normalize``; the result is the
+    In a view the score is the sum over pixels of (edge strength) alpha T, passed through ``normalize``; the result is the
     mean over the views ``chosen``.
     """
     total = torch.zeros_like(gaussians.opacity_logits)

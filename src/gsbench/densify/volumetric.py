@@ -152,7 +152,7 @@ class Volumetric(ADC):
         return (volumes > threshold) & (children <= threshold)
 
     def grown(self, refinement: Refinement) -> Grown:
-        """What each Gaussian would become if the cap admitted all candidates of both rules."""
+        """Result of growth for each Gaussian if the cap admitted all candidates of both rules."""
         grown = super().grown(refinement)
         if not self.volume_due(refinement.step):
             return grown

@@ -50,7 +50,7 @@ class Executor:
         return not self.devices or device_type in self.devices
 
     def obstacle(self, device_type: str) -> str | None:
-        """Why it cannot run here on a device of this type, and the remedy; None if it can run."""
+        """The reason why it cannot run here on a device of this type, and the remedy; None if it can run."""
         if not self.runs_on(device_type):
             needed = " or ".join(self.devices)
             others = ", ".join(other.name for other in EXECUTORS if other.runs_on(device_type))

@@ -86,7 +86,7 @@ def is_held(path: Path) -> bool:
 
 @dataclass(frozen=True, kw_only=True)
 class LockHolder(Record):
-    """What the holder of a lock writes about itself: host, process, Slurm job, start (Unix time) and work."""
+    """Record of a lock's holder about itself: host, process, Slurm job, start (Unix time) and work."""
 
     host: str
     pid: int

@@ -41,7 +41,7 @@ def requested() -> bool:
 
 @contextmanager
 def stop_on_signals(signals: Sequence[int] = SIGNALS) -> Iterator[None]:
-    """Within the block, a signal raises `Stopped` in the main thread. Then the earlier handlers are restored."""
+    """Raise `Stopped` in the main thread if a signal comes within the block; restore the earlier handlers after it."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -78,7 +78,7 @@ def reinstall_handlers() -> None:
 
 @contextmanager
 def deferred() -> Iterator[None]:
-    """Within the block, a first signal sets `requested` and raises `Stopped` at the end; a second stops at once."""
+    """Defer a first signal within the block: it sets `requested`, and `Stopped` is raised at the end; a second stops."""
     reinstall_handlers()
     _State.deferring += 1
     try:

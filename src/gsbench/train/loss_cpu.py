@@ -101,7 +101,7 @@ def similarity_rows(
     derivatives: Any,
     sums: Any,
 ) -> None:
-    """For the rows ``begin`` to ``end``, write the sums of SSIM and of |image - target| to ``sums`` [H, 2].
+    """Write the sums of SSIM and of |image - target| of the rows ``begin`` to ``end`` to ``sums`` [H, 2].
 
     ``derivatives`` [3, H, PAD + 3 W rounded up + PAD], if not empty, gets the derivatives of the sum of SSIM by the
     blurred image, its blurred square and its blurred product with the target, padded with zeros. ``memory`` is scratch.

@@ -24,7 +24,7 @@ NUM_POINTS = 32  # of the schedule, equally spaced in the spectrum that they sho
 
 @dataclass(frozen=True)
 class ScaleSchedule:
-    """At iteration ``begins[i]`` the sides of pictures are divided by ``scales[i]``, which falls to 1."""
+    """A schedule: from iteration ``begins[i]`` the sides of pictures are divided by ``scales[i]``, which falls to 1."""
 
     begins: tuple[int, ...]
     scales: tuple[float, ...]

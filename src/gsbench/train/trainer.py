@@ -39,7 +39,7 @@ SHARE_FOR_IMAGES = 0.5  # of a GPU's free memory; the rest is for the model and 
 
 @dataclass(frozen=True)
 class Status:
-    """What a progress bar shows."""
+    """Values for a progress bar."""
 
     step: int
     loss: float

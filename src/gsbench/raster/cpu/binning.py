@@ -99,7 +99,7 @@ def pair_shards(
     pairs: Any,
     made: Any,
 ) -> None:
-    """For the shards ``first`` to ``past`` of the sorted ``keys``, write all pairs of tile (high word) and record.
+    """Write all pairs of tile (high word) and record, for the shards ``first`` to ``past`` of the sorted ``keys``.
 
     Shard s has the keys from ``edges[s]`` to ``edges[s + 1]`` and writes to ``pairs[s]``. ``counts[s]`` [tiles] gets
     the number of pairs of each tile, ``made[s]`` the total. Pairs for which ``pairs`` has no room are only counted.
