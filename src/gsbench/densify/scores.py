@@ -117,8 +117,8 @@ def edge_scores(
 ) -> Tensor:
     """Scores [N] by the edges in photographs that each Gaussian covers.
 
-    In a view the score is the sum over pixels of (edge strength) alpha T, passed through ``normalize``; the result is the
-    mean over the views ``chosen``.
+    In a view the score is the sum over pixels of (edge strength) alpha T, passed through ``normalize``; the result is
+    the mean over the views ``chosen``.
     """
     total = torch.zeros_like(gaussians.opacity_logits)
     for index in chosen:

@@ -78,7 +78,7 @@ def reinstall_handlers() -> None:
 
 @contextmanager
 def deferred() -> Iterator[None]:
-    """Defer a first signal within the block: it sets `requested`, and `Stopped` is raised at the end; a second stops."""
+    """Defer a first signal within the block: it sets `requested` and raises `Stopped` at the end; a second stops."""
     reinstall_handlers()
     _State.deferring += 1
     try:
