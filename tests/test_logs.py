@@ -18,7 +18,7 @@ from gsbench.errors import InputError
 from gsbench.logs import LOGGER, log_to, printable_output, set_up_logging
 from gsbench.words import printable
 
-OBEYED = [
+CONTROL_CHARACTERS = [
     "\x1b[2J",
     "\x1b]0;title\x07",
     "\x9b31m",
@@ -34,7 +34,7 @@ OBEYED = [
 TURNING = set("LRE RLE LRO RLO PDF LRI RLI FSI PDI".split())  # noqa: SIM905
 
 
-@pytest.mark.parametrize("text", OBEYED)
+@pytest.mark.parametrize("text", CONTROL_CHARACTERS)
 def test_control_characters_are_written_out(text: str) -> None:
     shown = printable(f"a {text} b")
     assert shown.isprintable()
@@ -61,7 +61,7 @@ def test_words_of_all_languages_stay() -> None:
         assert printable(text) == text
 
 
-@pytest.mark.parametrize("text", OBEYED)
+@pytest.mark.parametrize("text", CONTROL_CHARACTERS)
 def test_neither_what_is_printed_nor_what_is_logged_reaches_a_terminal_as_it_is(
     text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -1,4 +1,4 @@
-"""Downloads over HTTP: tries that follow a failure, and what to say when there is none left."""
+"""Downloads over HTTP, with retries after failures and error messages in one line."""
 
 import hashlib
 import logging
@@ -15,32 +15,32 @@ T = TypeVar("T")
 log = logging.getLogger(__name__)
 
 USER_AGENT = {"User-Agent": "gsbench"}
-TRANSIENT = (408, 425, 429, 500, 502, 503, 504)  # HTTP statuses that may be another in a moment
+TRANSIENT = (408, 425, 429, 500, 502, 503, 504)  # HTTP statuses that may change on a retry
 MAX_PAUSE_SECONDS = 30.0
 
 
 class FetchError(GsbenchError):
-    """Error of the network or the server (exit code 1); the same command goes on from here."""
+    """Error of the network or the server (exit code 1). The same command continues where it stopped."""
 
 
 @dataclass(frozen=True)
-class Patience:
-    """Limits of waiting for a server: seconds without a byte, and tries of one file (each waits twice as long)."""
+class RetryPolicy:
+    """Limits of waiting for a server."""
 
-    timeout: float = 30.0
-    tries: int = 5
-    pause: float = 1.0  # seconds before the second try
+    timeout: float = 30.0  # seconds without a byte
+    tries: int = 5  # of one file
+    pause: float = 1.0  # seconds before the second try; doubles before each further one
 
 
-def retried(action: Callable[[], T], url: str, patience: Patience) -> T:
-    """The result of ``action``, which asks the server of ``url``; tried again after a failure of the network.
+def with_retries(action: Callable[[], T], url: str, policy: RetryPolicy) -> T:
+    """The result of ``action``, which requests ``url`` and is repeated after failures of the network.
 
-    Raises `InputError` where the server refuses for good, `FetchError` after the last try.
+    Raises `InputError` for a permanent refusal by the server, and `FetchError` after the last try.
     """
     import requests
     import urllib3
 
-    for failures in range(1, patience.tries + 1):
+    for failures in range(1, policy.tries + 1):
         try:
             return action()
         except requests.exceptions.SSLError as error:
@@ -56,48 +56,48 @@ def retried(action: Callable[[], T], url: str, patience: Patience) -> T:
                     f"{url}: the server says {answer.status_code} {answer.reason}: give another address with --mirror"
                 ) from None
             reason = _reason(error)
-            if failures == patience.tries:
+            if failures == policy.tries:
                 raise FetchError(
                     f"{url}: {failures} failures in a row ({reason}): to continue, give the same command again"
                 ) from error
-        pause = min(MAX_PAUSE_SECONDS, patience.pause * 2 ** (failures - 1))
+        pause = min(MAX_PAUSE_SECONDS, policy.pause * 2 ** (failures - 1))
         log.info("%s: trying again in %.3g s", reason, pause)
         time.sleep(pause)
     raise AssertionError("no try was allowed")
 
 
-def download(url: str, target: Path, patience: Patience, advance: Callable[[int, int | None], None]) -> str:
+def download(url: str, target: Path, policy: RetryPolicy, advance: Callable[[int, int | None], None]) -> str:
     """Write the file at ``url`` to ``target``; returns its sha256 in hexadecimal.
 
-    ``advance`` gets the bytes so far and in all, as far as the server says. A try that fails starts from the beginning.
-    Raises as `retried` does.
+    ``advance`` gets the number of bytes so far and in total, or None if the server does not say. Each try starts from
+    the beginning. Raises the errors of `with_retries`.
     """
     import requests
 
     def once() -> str:
         digest, done = hashlib.sha256(), 0
-        # A packed answer would have another length than the file.
+        # The length of a compressed answer would not be that of the file.
         headers = USER_AGENT | {"Accept-Encoding": "identity"}
         with (
-            requests.get(url, headers=headers, stream=True, timeout=patience.timeout) as answer,
+            requests.get(url, headers=headers, stream=True, timeout=policy.timeout) as answer,
             target.open("wb") as file,
         ):
             answer.raise_for_status()
             length = answer.headers.get("Content-Length", "")
             total = int(length) if length.isdigit() else None
             advance(0, total)
-            for piece in answer.iter_content(CHUNK):  # which raises where fewer bytes come than were announced
+            for piece in answer.iter_content(CHUNK):  # raises if fewer bytes arrive than announced
                 file.write(piece)
                 digest.update(piece)
                 done += len(piece)
                 advance(done, total)
         return digest.hexdigest()
 
-    return retried(once, url, patience)
+    return with_retries(once, url, policy)
 
 
 def _reason(error: Exception) -> str:
-    """The innermost cause of an error of requests, which wraps those of urllib3, in a few words."""
+    """The innermost cause of an error of requests, which wraps errors of urllib3, in a few words."""
     import requests
     import urllib3
 

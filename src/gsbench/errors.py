@@ -2,12 +2,12 @@
 
 
 class GsbenchError(Exception):
-    """Base of every error that gsbench raises on purpose; its text is one line: the cause, then the mend."""
+    """Base of all errors that gsbench raises on purpose. The message is one line: the cause, then the remedy."""
 
 
 class InputError(GsbenchError, ValueError):
-    """Error of the user's files or settings (exit code 2)."""
+    """Error in the user's files or settings (exit code 2)."""
 
 
 class TrainingError(GsbenchError):
-    """Error of a trial that started well and could not go on, for example on a non-finite loss (exit code 1)."""
+    """Error that stops a running trial, for example a non-finite loss (exit code 1)."""

@@ -1,4 +1,4 @@
-"""Table of what refinements do, and of the causes of Gaussians. Loads no torch."""
+"""Records of refinements, and the causes of Gaussians. Loads no torch."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from typing import ClassVar
 
 
 class Cause(IntEnum):
-    """Cause of a Gaussian's existence: the number in ``lineage.npz``, words, and a colour (r, g, b) for pictures.
+    """Cause of a Gaussian's existence: its number in ``lineage.npz``, words, and a colour (r, g, b) for pictures.
 
-    The colours are those of Okabe and Ito (2008), which colour-blind people can tell apart.
+    The colours are from Okabe and Ito (2008), so that colour-blind people can distinguish them.
     """
 
     words: str
@@ -40,16 +40,16 @@ class Cause(IntEnum):
 
 @dataclass
 class RefineEvent:
-    """One refinement, as a closed record of counts by cause.
+    """Counts of one refinement by cause.
 
-    ``after`` is ``before`` plus the counts in ``GROWN`` minus those in ``PRUNED``, where a split counts the Gaussians
-    that it adds beyond its parent (one per parent, for two children). ``blocked_by_cap`` counts candidates that the
-    budget refused. ``isotropic_resplit`` counts parents split by volume whose children are still above the threshold,
-    so that they are split again at the next refinement; ``vanished`` counts parents split by volume whose children are
-    far below a pixel. ``relocated`` moves dead Gaussians and changes no count (3DGS-MCMC).
+    ``after`` is ``before`` plus the counts in ``GROWN`` minus the counts in ``PRUNED``. A split counts the Gaussians
+    that it adds beyond the parent, which is one for two children. ``relocated`` dead Gaussians change no count
+    (3DGS-MCMC). ``blocked_by_cap`` counts candidates that the budget refused. ``isotropic_resplit`` counts parents
+    split by volume whose children are still above the threshold, so that the next refinement splits them again.
+    ``vanished`` counts parents split by volume whose children are far smaller than a pixel.
 
-    Under ``cap=governor``, ``target`` is the count that was aimed at, ``strictness`` the factor on the thresholds of
-    growth and ``cull`` that on the opacity below which Gaussians are pruned.
+    Under ``cap=governor``, ``target`` is the intended count, ``strictness`` the factor on the thresholds of growth, and
+    ``cull`` the factor on the opacity below which Gaussians are pruned.
     """
 
     GROWN: ClassVar[tuple[str, ...]] = ("cloned", "split_gradient", "split_volume", "added")
@@ -80,16 +80,16 @@ class RefineEvent:
         return self.after == self.before + grown - sum(getattr(self, name) for name in self.PRUNED)
 
     def as_dict(self) -> dict[str, object]:
-        """The record as written to ``events.jsonl``."""
+        """The record for ``events.jsonl``, without unset and infinite values."""
         return {key: value for key, value in asdict(self).items() if value is not None and math.isfinite(value)}
 
     @staticmethod
     def count_names() -> tuple[str, ...]:
-        """The fields that can be summed over a trial."""
+        """The names of fields that can be summed over a trial."""
         names = (f.name for f in fields(RefineEvent) if f.default is not None)
         return tuple(name for name in names if name not in ("step", "before", "after"))
 
 
 def sum_events(events: Sequence[Mapping[str, object]]) -> dict[str, int]:
-    """Totals by cause over the records of ``events.jsonl``."""
+    """The sum of each count over the records of ``events.jsonl``."""
     return {name: sum(int(event.get(name, 0)) for event in events) for name in RefineEvent.count_names()}  # type: ignore[call-overload]

@@ -1,4 +1,4 @@
-"""Files that are whole or absent, and what to say when the disk is full or cannot be written to."""
+"""Atomic writing of files, protection against links, and messages about full or read-only disks."""
 
 import errno
 import hashlib
@@ -16,27 +16,28 @@ from typing import Any
 from gsbench.errors import GsbenchError, InputError
 
 CHUNK = 1 << 20
-TEMPORARY = re.compile(r"^\..+\.tmp(-\d+)?$")  # how gsbench names a file that it is still writing
+TEMPORARY = re.compile(r"^\..+\.tmp(-\d+)?$")  # name of a file that gsbench is still writing
 FULL = (errno.ENOSPC, errno.EDQUOT)
 BROKEN = (errno.EIO, errno.ELOOP, errno.ESTALE)
 FORBIDDEN = (errno.EROFS, errno.EACCES, errno.EPERM)
-# Messages of libraries, without an error number, when a write is cut short: numpy's tofile, torch's zip writer, SQLite.
+# Libraries' messages without an error number for an incomplete write: numpy's tofile, torch's zip writer, SQLite.
 FULL_TEXT = re.compile(
     r"No space left|requested and \d+ written|PytorchStreamWriter failed|unexpected pos|disk is full"
 )
-NEARLY_NOTHING = 64 * 1024  # bytes free: with less, any failed write is a full disk
+NEARLY_NOTHING = 64 * 1024  # free bytes; with less, any failed write counts as a full disk
 
 
 class DiskFullError(GsbenchError):
-    """Error of a full disk of the runs folder: no trial can go on (exit code 1)."""
+    """Raised if the disk of the runs folder is full, so that no trial can continue (exit code 1)."""
 
 
 @contextmanager
 def atomic(path: Path, sync: bool = True) -> Iterator[Path]:
-    """Give the block a temporary path beside ``path`` to write; published under its name by a rename when it ends well.
+    """Yield a temporary path beside ``path``, and rename it to ``path`` if the block succeeds.
 
-    A reader sees the old file or the new one, never a part. What an error leaves is removed; what a kill leaves is
-    hidden, and `remove_temporaries` finds it. ``sync``: wait until the content is on the disk before it is published.
+    A reader sees the old file or the new one, never a part. After an error the temporary file is removed. A killed
+    process leaves a hidden file, which `remove_temporaries` removes. With ``sync``, the content is written to the disk
+    before the rename.
     """
     temporary = path.with_name(f".{path.name}.tmp-{os.getpid()}")
     temporary.unlink(missing_ok=True)
@@ -44,29 +45,29 @@ def atomic(path: Path, sync: bool = True) -> Iterator[Path]:
         yield temporary
         if sync:
             with temporary.open("rb+") as stream:
-                os.fsync(stream.fileno())  # where writing is delayed, here a full disk is noticed
+                os.fsync(stream.fileno())  # with delayed writing, a full disk is only noticed here
         os.replace(temporary, path)
     finally:
         with suppress(OSError):
-            temporary.unlink(missing_ok=True)  # os.replace leaves it where both are links to one file
+            temporary.unlink(missing_ok=True)  # os.replace does nothing if both names are links to one file
 
 
 def write_json(path: Path, values: Any) -> None:
-    """Write JSON, whole or not at all. NaN and infinity are refused."""
+    """Write a JSON file atomically. NaN and infinity raise ValueError."""
     write_text(path, json.dumps(values, indent=1, allow_nan=False) + "\n")
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text file, whole or not at all."""
+    """Write a text file atomically."""
     with atomic(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
 
 @contextmanager
-def place_of(out: Path) -> Iterator[None]:
-    """Make the folder of what ``--out`` names for the block that writes it.
+def writable_output(out: Path) -> Iterator[None]:
+    """Make the parent folder of ``out``, the value of ``--out``, for the block that writes it.
 
-    Raises InputError for an OSError of the block: the place was asked for, and another mends it.
+    Turns an OSError of the block into an InputError that asks for another ``--out``.
     """
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
@@ -76,7 +77,7 @@ def place_of(out: Path) -> Iterator[None]:
 
 
 def link_or_copy(source: Path, target: Path) -> None:
-    """Show ``source`` as ``target`` too, as a hard link where the file system has them; replaces what is there."""
+    """Make ``target`` a hard link to ``source``, or a copy where hard links do not work; replaces ``target``."""
     with atomic(target, sync=False) as temporary:
         try:
             os.link(source, temporary)
@@ -85,15 +86,15 @@ def link_or_copy(source: Path, target: Path) -> None:
 
 
 def open_plain(path: Path, flags: int = os.O_RDONLY) -> int:
-    """A descriptor of the regular file ``path``, whose last part is no link.
+    """Open the regular file ``path`` and return its descriptor; a link as the last part is not followed.
 
-    Raises InputError for a link, and for a pipe or a device, whose reading need not end; OSError as `os.open` does.
+    Raises InputError for a link, a pipe or a device (whose reading may never end), and OSError as `os.open` does.
     """
     flags |= getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
     try:
         descriptor = os.open(path, flags, 0o666)
     except OSError as error:
-        if error.errno in (errno.ELOOP, errno.ENXIO):  # a link; a pipe that nobody reads
+        if error.errno in (errno.ELOOP, errno.ENXIO):  # a link; a pipe without a reader
             raise _no_plain_file(path) from None
         raise
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):
@@ -102,30 +103,30 @@ def open_plain(path: Path, flags: int = os.O_RDONLY) -> int:
     return descriptor
 
 
-def require_own(runs: Path, place: Path, below: bool = False) -> None:
-    """Raise InputError where a part of the way from the folder ``runs`` to ``place`` is a link, a pipe or a device.
+def require_no_links(runs: Path, place: Path, below: bool = False) -> None:
+    """Raise InputError if a part of the path from the folder ``runs`` to ``place`` is a link, a pipe or a device.
 
-    With ``below``, also where something in the folder ``place`` is. What is not there is let pass.
+    With ``below``, everything in the folder ``place`` is checked too. Missing parts are allowed.
     """
-    # A runs folder that somebody sends may hold links: what we write to `log.txt` would come into the file behind it,
-    # and what we pack or publish would come from there.
-    way = runs
+    # A runs folder from someone else may hold links. Through them, a log would overwrite files outside the folder, and
+    # packing or publishing would include such files.
+    path = runs
     for part in place.relative_to(runs).parts:
-        way /= part
+        path /= part
         with suppress(FileNotFoundError, NotADirectoryError):
-            _require_plain(way, os.lstat(way).st_mode)
-    waiting = [place] if below else []
-    while waiting:
-        with suppress(FileNotFoundError, NotADirectoryError), os.scandir(waiting.pop()) as entries:
+            _require_plain(path, os.lstat(path).st_mode)
+    folders = [place] if below else []
+    while folders:
+        with suppress(FileNotFoundError, NotADirectoryError), os.scandir(folders.pop()) as entries:
             for entry in entries:
                 if entry.is_dir(follow_symlinks=False):
-                    waiting.append(Path(entry.path))
+                    folders.append(Path(entry.path))
                 elif not entry.is_file(follow_symlinks=False):
                     raise _no_plain_file(Path(entry.path))
 
 
-def remove_strange(folder: Path) -> None:
-    """Remove the links, pipes and devices below ``folder``; what they lead to stays."""
+def remove_special_files(folder: Path) -> None:
+    """Remove the links, pipes and devices below ``folder``, but not the targets of links."""
     for path in sorted(folder.rglob("*")):
         mode = os.lstat(path).st_mode
         if not stat.S_ISDIR(mode) and not stat.S_ISREG(mode):
@@ -144,7 +145,7 @@ def _no_plain_file(path: Path) -> InputError:
 
 
 def require_regular(path: Path) -> None:
-    """Raise InputError for a pipe, a device or a socket, whose reading need not end; what is not there is let pass."""
+    """Raise InputError for a pipe, a device or a socket, whose reading may never end. A missing file is allowed."""
     with suppress(OSError):
         mode = path.stat().st_mode
         if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):
@@ -152,7 +153,7 @@ def require_regular(path: Path) -> None:
 
 
 def sync_to_disk(path: Path) -> None:
-    """Wait until a file or folder is on the disk, where the system can say so."""
+    """Wait until a file or folder is written to the disk, if the system supports that."""
     with suppress(OSError):
         descriptor = os.open(path, os.O_RDONLY)
         try:
@@ -162,7 +163,7 @@ def sync_to_disk(path: Path) -> None:
 
 
 def remove_temporaries(folder: Path) -> None:
-    """Remove what killed writers left below ``folder``; nobody may be writing there."""
+    """Remove temporary files of killed processes below ``folder``. No process may be writing there."""
     for path in folder.rglob(".*"):
         if TEMPORARY.match(path.name) and path.is_file():
             with suppress(OSError):
@@ -170,9 +171,9 @@ def remove_temporaries(folder: Path) -> None:
 
 
 def checked_runs_folder(name: str) -> Path:
-    """The runs folder called ``name``, made absolute; it need not be there yet.
+    """The absolute path of the runs folder ``name``, which need not exist yet.
 
-    Raises InputError where a folder of this name can neither be there nor be made.
+    Raises InputError if no folder of this name can exist.
     """
     advice = "set runs=FOLDER or GSBENCH_RUNS to another folder"
     try:
@@ -188,9 +189,9 @@ def checked_runs_folder(name: str) -> Path:
 
 
 def make_runs_folder(folder: Path) -> None:
-    """Make the runs folder, and see that it can be filled.
+    """Make the runs folder, and check that it can be written to.
 
-    Raises InputError where it cannot, and OSError where the disk is full or writing is forbidden (`storage_errors`).
+    Raises OSError if the disk is full or writing is forbidden (see `storage_errors`), else InputError.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -206,18 +207,18 @@ def make_runs_folder(folder: Path) -> None:
 
 @contextmanager
 def storage_errors(folder: Path) -> Iterator[None]:
-    """Turn a full disk and forbidden writing within the block into one line that names ``folder``."""
+    """Turn errors of a full or read-only disk within the block into one line that names ``folder``."""
     try:
         yield
     except Exception as error:
-        found = explain_storage(error, folder)
-        if found is None or isinstance(error, GsbenchError):
+        explained = explain_storage(error, folder)
+        if explained is None or isinstance(error, GsbenchError):
             raise
-        raise found from error
+        raise explained from error
 
 
 def explain_storage(error: BaseException, folder: Path) -> GsbenchError | None:
-    """The error in gsbench's words if storage is its cause, else None."""
+    """An error of gsbench that explains ``error`` if its cause is storage, else None."""
     number = error.errno if isinstance(error, OSError) else None
     place = getattr(error, "filename", None) or folder
     if number in FULL or FULL_TEXT.search(str(error)) or (_is_write_error(error) and _free(folder) < NEARLY_NOTHING):
@@ -254,7 +255,7 @@ def _free(folder: Path) -> int:
         usage = shutil.disk_usage(place)
     except OSError:
         return NEARLY_NOTHING
-    return usage.free if usage.total else NEARLY_NOTHING  # a file system without a size, such as /proc, is never full
+    return usage.free if usage.total else NEARLY_NOTHING  # file systems without a size, such as /proc, are never full
 
 
 def file_sha256(path: Path) -> str:

@@ -1,4 +1,4 @@
-"""Destinations of gsbench's log lines: stderr for people, and a trial's own file."""
+"""Logging to stderr and to a trial's own file, and progress bars."""
 
 import logging
 import os
@@ -20,14 +20,14 @@ LOGGER = logging.getLogger("gsbench")
 
 
 class _Printable(logging.Formatter):
-    """What is logged may quote anybody's file or program; no terminal that shows it obeys it."""
+    """Makes log lines `printable`, because they may quote control characters from a file or a program."""
 
     def format(self, record: logging.LogRecord) -> str:
         return printable(super().format(record))
 
 
 class PrintableStream:
-    """A text stream of the program's in which everything is `printable`; ``raw`` is the stream as it was."""
+    """A stream that writes to ``raw`` and makes everything `printable`."""
 
     def __init__(self, raw: TextIO) -> None:
         self.raw = raw
@@ -46,7 +46,7 @@ class PrintableStream:
 
 @contextmanager
 def printable_output() -> Iterator[None]:
-    """Let what the block prints, and what the libraries that it calls print, be `printable`."""
+    """Make everything that the block and its libraries print `printable`."""
     out, err = sys.stdout, sys.stderr
     sys.stdout, sys.stderr = PrintableStream(out), PrintableStream(err)
     try:
@@ -55,18 +55,18 @@ def printable_output() -> Iterator[None]:
         sys.stdout, sys.stderr = out, err
 
 
-class _People(logging.StreamHandler[TextIO]):
-    """Shows lines on what is stderr at that moment."""
+class _CurrentStderrHandler(logging.StreamHandler[TextIO]):
+    """Writes to the current ``sys.stderr``, which a calling program may have redirected since the start."""
 
     def emit(self, record: logging.LogRecord) -> None:
-        self.stream = sys.stderr  # another than at the start, where a program that calls gsbench redirects it
+        self.stream = sys.stderr
         super().emit(record)
 
 
 def set_up_logging() -> None:
-    """Show what gsbench logs, from INFO on, on stderr."""
+    """Show gsbench's log lines of level INFO and above on stderr."""
     if not LOGGER.handlers:
-        handler = _People()
+        handler = _CurrentStderrHandler()
         handler.setLevel(logging.INFO)
         handler.setFormatter(_Printable("%(message)s"))
         LOGGER.addHandler(handler)
@@ -76,7 +76,7 @@ def set_up_logging() -> None:
 
 @contextmanager
 def log_to(path: Path) -> Iterator[None]:
-    """Write everything that gsbench logs within the block, tracebacks included, to ``path`` as well."""
+    """Also write everything that gsbench logs within the block, including tracebacks, to ``path``."""
     handler = _QuietHandler(os.fdopen(open_plain(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT), "a", encoding="utf-8"))
     handler.setLevel(logging.DEBUG)
     handler.setFormatter(_Printable("%(asctime)s %(levelname)s %(name)s: %(message)s"))
@@ -90,7 +90,7 @@ def log_to(path: Path) -> Iterator[None]:
 
 
 class _QuietHandler(logging.StreamHandler[TextIO]):
-    """Keeps silent where it cannot write: on a full disk the trial's own error says so."""
+    """Ignores failed writes, because on a full disk the trial itself raises an error."""
 
     def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802 - logging's name
         return
@@ -102,22 +102,22 @@ SECONDS_BETWEEN_LINES = 20.0
 
 
 class Progress(Protocol):
-    """Receiver of a ``phase``'s progress: ``done`` of a ``total`` that may be unknown.
+    """Receives the progress of a ``phase``: ``done`` of ``total``, which is None if unknown.
 
-    The unit is the phase's own (images, pairs, bytes), and a phase may start anew at 0. ``note`` is shown as it is.
+    Each phase has its own unit (images, pairs, bytes), and may start again at 0. ``note`` is shown unchanged.
     """
 
     def __call__(self, phase: str, done: int, total: int | None, note: str = "") -> None: ...
 
 
 def no_progress(phase: str, done: int, total: int | None, note: str = "") -> None:
-    """A `Progress` that reports nowhere."""
+    """A `Progress` that reports nothing."""
 
 
 @contextmanager
 def progress(title: str) -> Iterator[Progress]:
     """Show progress of the work called ``title`` while the block runs."""
-    console = Console(file=getattr(sys.stderr, "raw", sys.stderr))  # which may obey: it draws a bar
+    console = Console(file=getattr(sys.stderr, "raw", sys.stderr))  # raw, since a bar needs control characters
     if not console.is_terminal:
         yield _lines(title)
         return

@@ -1,8 +1,8 @@
-"""Reading the small files that gsbench writes, whoever wrote or broke them since: bounded, and plain values alone.
+"""Reading small JSON and YAML files with limits, because someone else may have written or damaged them.
 
-A file is read if it is a regular one of at most `MOST_BYTES`; nothing else is opened, so that a FIFO or a device holds
-nobody up, and no link is followed: a user's own file is read by its `resolved` path. What it holds is JSON or YAML of
-at most `MOST_DEPTH` levels, whose numbers are finite.
+Only regular files of at most `MAX_BYTES` are opened, so that a FIFO or a device cannot block the reader. Links are not
+followed; a user's own file is read by its `resolved` path. The content has at most `MAX_DEPTH` levels and only plain
+values.
 """
 
 import os
@@ -18,20 +18,20 @@ from pydantic_core import from_json
 from gsbench.errors import InputError
 from gsbench.files import open_plain
 
-MOST_BYTES = 64 << 20  # the plan of 80,000 trials; a training that logs each of 300,000 iterations
+MAX_BYTES = 64 << 20  # enough for the plan of 80,000 trials, or a training that logs each of 300,000 iterations
 SPARE = 1 << 16  # bytes that are read at once beyond a file's size
-MOST_YAML_BYTES = 1 << 20  # a configuration has 2 to 10 kB, and its parser takes a second for this much
-MOST_DEPTH = 40  # levels of nesting: ours have up to six, and what a user's class is given adds a few
-MOST_WORD = 4000  # characters of plain YAML: what could be a number
-MOST_VALUES = 100_000  # of YAML, whose aliases let a few lines stand for billions
-MOST_OF_LINE = 300  # characters of a message about a file
-LARGEST_INT = 2**64  # beyond the seeds of torch and times in ns
+MAX_YAML_BYTES = 1 << 20  # a configuration has 2 to 10 kB; the parser needs a second for this much
+MAX_DEPTH = 40  # levels of nesting: gsbench's files have up to six, and arguments of a user's class add a few
+MAX_WORD = 4000  # characters of an unquoted YAML word, which could be a number
+MAX_VALUES = 100_000  # in a YAML file, whose aliases let a few lines stand for billions of values
+MAX_MESSAGE = 300  # characters of a message about a file
+LARGEST_INT = 2**64  # larger than the seeds of torch and times in ns
 KEYS = {str, int}
 LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 class DamagedError(InputError):
-    """A file of ours cannot be read, or is not what it ought to be; ``reason`` says why without its name."""
+    """Raised for a file of gsbench that cannot be read or has wrong content; ``reason`` does not name the file."""
 
     def __init__(self, path: Path, reason: str) -> None:
         self.path, self.reason = path, one_line(reason)
@@ -39,13 +39,13 @@ class DamagedError(InputError):
 
 
 def one_line(text: str) -> str:
-    """A text for people, whatever a file or a library put into it."""
+    """Shorten a text from a file or a library to one line for a message."""
     line = " ".join(text.split())
-    return line if len(line) <= MOST_OF_LINE else f"{line[:MOST_OF_LINE]}…"
+    return line if len(line) <= MAX_MESSAGE else f"{line[:MAX_MESSAGE]}…"
 
 
-def read_bytes(path: Path, most: int = MOST_BYTES) -> bytes:
-    """The content of a regular file; raises DamagedError for any other, and FileNotFoundError where there is none."""
+def read_bytes(path: Path, most: int = MAX_BYTES) -> bytes:
+    """The content of a regular file; raises DamagedError for any other file, FileNotFoundError for a missing one."""
     with _opened(path) as descriptor:
         content = _read_up_to(descriptor, most + 1)
     if len(content) > most:
@@ -61,15 +61,15 @@ def read_tail(path: Path, count: int) -> bytes:
 
 
 def resolved(path: Path) -> Path:
-    """The place that a user's own ``path`` leads to, by whatever links."""
+    """The path without links to which a user's ``path`` leads."""
     return Path(os.path.realpath(path))
 
 
 @contextmanager
 def _opened(path: Path) -> Iterator[int]:
-    """A descriptor of a regular file, closed afterwards; what goes wrong meanwhile is said of the file."""
+    """Yield the descriptor of a regular file; errors within the block become errors that name the file."""
     try:
-        if not stat.S_ISREG(os.lstat(path).st_mode):  # a link is none: see `gsbench.files.require_own`
+        if not stat.S_ISREG(os.lstat(path).st_mode):  # refuses links too: see `gsbench.files.require_no_links`
             raise DamagedError(path, "cannot be read: it is not a regular file")
         descriptor = open_plain(path)
         try:
@@ -85,7 +85,7 @@ def _opened(path: Path) -> Iterator[int]:
 
 
 def _read_up_to(descriptor: int, most: int) -> bytes:
-    """At most ``most`` bytes: by one call where the file is as long as it says, which those of ``/proc`` are not."""
+    """Read at most ``most`` bytes. One call is enough, except for files such as in ``/proc`` that report no size."""
     content = os.read(descriptor, min(most, os.fstat(descriptor).st_size + 1))
     parts = [content]
     while (left := most - sum(map(len, parts))) > 0 and (part := os.read(descriptor, min(left, SPARE))):
@@ -94,7 +94,7 @@ def _read_up_to(descriptor: int, most: int) -> bytes:
 
 
 def read_json(path: Path) -> Any:
-    """The plain value in a JSON file; raises as `read_bytes` does, and DamagedError for what `fault_of` finds."""
+    """The value in a JSON file; raises as `read_bytes` does, and DamagedError if `fault_of` finds a fault."""
     content = read_bytes(path)
     try:
         value = from_json(content)
@@ -106,18 +106,18 @@ def read_json(path: Path) -> Any:
 
 
 def read_yaml(path: Path, unique: bool = False) -> Any:
-    """The plain value in a YAML file; raises as `read_json` does.
+    """The value in a YAML file; raises as `read_json` does.
 
-    With ``unique``, also for a key that stands twice in a mapping, of which the first would be lost without a word.
+    With ``unique``, a key that occurs twice in a mapping is an error; YAML would silently drop the first.
     """
-    return parse_yaml(read_bytes(path, MOST_YAML_BYTES), path, unique)
+    return parse_yaml(read_bytes(path, MAX_YAML_BYTES), path, unique)
 
 
 def parse_yaml(content: bytes, path: Path, unique: bool = False) -> Any:
-    """Parse YAML; raises DamagedError for what is none, or has values that `fault_of` names.
+    """Parse YAML; raises DamagedError if it is no YAML or if `fault_of` finds a fault.
 
-    Numbers need not be finite: YAML is what users set, and a class may have an infinite default. ``unique`` is as
-    for `read_yaml`.
+    Numbers may be infinite, because users write settings in YAML and a class may have an infinite default. ``unique``
+    is as in `read_yaml`.
     """
     try:
         text = content.decode("utf-8")
@@ -126,38 +126,41 @@ def parse_yaml(content: bytes, path: Path, unique: bool = False) -> Any:
     except (yaml.YAMLError, ValueError, TypeError, OverflowError, RecursionError) as error:
         reason = getattr(error, "problem", None) or error  # PyYAML's own text has several lines
         raise DamagedError(path, f"is not YAML ({reason})") from None
-    if fault := fault or fault_of(value, MOST_VALUES, infinite=True):
+    if fault := fault or fault_of(value, MAX_VALUES, infinite=True):
         raise DamagedError(path, f"is damaged: {fault}")
     return value
 
 
 def _danger_in_yaml(text: str) -> str:
-    """Name what of YAML must not reach its loader: depth (it goes down by recursion in C), merges that multiply,
-    numbers whose digits take hours; "" where there is nothing."""
+    """Name a construct that must not reach the YAML loader, or "".
+
+    These are tags, deep nesting (the loader recurses in C), merge keys (they multiply), and numbers with so many digits
+    that their conversion takes hours.
+    """
     level = 0
     for event in yaml.parse(text, Loader=LOADER):
         if getattr(event, "tag", None) is not None:
             return f"it has the tag {event.tag}"
         if isinstance(event, yaml.CollectionStartEvent):
             level += 1
-            if level > MOST_DEPTH:
-                return f"it has more than {MOST_DEPTH} levels"
+            if level > MAX_DEPTH:
+                return f"it has more than {MAX_DEPTH} levels"
         elif isinstance(event, yaml.CollectionEndEvent):
             level -= 1
-        elif isinstance(event, yaml.ScalarEvent) and event.implicit[0]:  # a plain word, which may become anything
+        elif isinstance(event, yaml.ScalarEvent) and event.implicit[0]:  # an unquoted word, which may become a number
             if event.value == "<<":
                 return "it has a merge key"
-            if len(event.value) > MOST_WORD:
+            if len(event.value) > MAX_WORD:
                 return f"it has a word of {len(event.value):,} characters without quotes"
     return ""
 
 
 def _key_that_stands_twice(text: str) -> str:
-    """Name the first key of a mapping that stands there again, with its line; "" where there is none."""
+    """Name the first key that occurs twice in a mapping, with its line, or "" if there is none."""
     waiting, seen = [yaml.compose(text, Loader=LOADER)], set()
     while waiting:
         node = waiting.pop()
-        if id(node) in seen:  # an alias
+        if id(node) in seen:  # an alias of a node that was already checked
             continue
         seen.add(id(node))
         if isinstance(node, yaml.MappingNode):
@@ -174,13 +177,13 @@ def _key_that_stands_twice(text: str) -> str:
 
 
 def fault_of(value: Any, most: int | None = None, infinite: bool = False) -> str:
-    """The reason why ``value`` is not plain, "" where it is: keys are texts or integers, levels at most `MOST_DEPTH`.
+    """The reason why ``value`` is not plain, or "" if it is.
 
-    ``most`` is how many values it may have, an alias of YAML counted as often as it stands there. Numbers are finite
-    unless ``infinite``.
+    A plain value has keys that are texts or integers, at most `MAX_DEPTH` levels, finite numbers (unless ``infinite``)
+    and at most ``most`` values, where a YAML alias counts each time it is used.
     """
     level, count = [value], 0
-    for _ in range(MOST_DEPTH):
+    for _ in range(MAX_DEPTH):
         below: list[Any] = []
         for item in level:
             kind = type(item)
@@ -198,12 +201,12 @@ def fault_of(value: Any, most: int | None = None, infinite: bool = False) -> str
         if not below:
             return ""
         level = below
-    return f"it has more than {MOST_DEPTH} levels"
+    return f"it has more than {MAX_DEPTH} levels"
 
 
 def _named_fault(value: Any, place: str = "", depth: int = 0) -> str:
-    """The first key or number that is none, with its place; "" where there is none above `MOST_DEPTH`."""
-    if not isinstance(value, dict | list) or depth > MOST_DEPTH:
+    """The first invalid key or value with its place, or "" if there is none within `MAX_DEPTH` levels."""
+    if not isinstance(value, dict | list) or depth > MAX_DEPTH:
         fault = _fault_of_leaf(value)
         return f"{place or 'it'} is {fault}" if fault else ""
     if isinstance(value, dict) and (fault := _fault_of_keys(value)):
@@ -226,7 +229,7 @@ def _fault_of_leaf(item: Any) -> str:
 
 def _fault_of_keys(mapping: dict[Any, Any]) -> str:
     kinds = set(map(type, mapping))
-    if len(kinds) > 1 or not kinds <= KEYS:  # sorted JSON needs them of one kind
+    if len(kinds) > 1 or not kinds <= KEYS:  # JSON with sorted keys needs keys of one type
         return "keys that are not all texts, or all integers"
     if kinds == {str} and all(map(str.isascii, mapping)):
         return ""

@@ -1,7 +1,7 @@
-"""Types of the files that gsbench writes: dataclasses whose annotations say what may stand there, read from JSON.
+"""Reading and writing JSON files through dataclasses whose annotations say what is allowed.
 
-A file is written through the same type that reads it. Numbers are finite and of their own kind (no ``"27"``, no
-``true`` for 1); keys that a type does not know may stand beside its own.
+A file is written and read through the same type. Numbers are finite, and types are strict (no ``"27"`` and no ``true``
+for a number). Unknown keys are ignored.
 """
 
 import logging
@@ -22,10 +22,10 @@ log = logging.getLogger(__name__)
 
 T = TypeVar("T")
 
-MOST = 1e30  # of a measured number: no mean or variance of such overflows, and no measure comes near
+MAX_NUMBER = 1e30  # of a measured value: means and variances of such numbers do not overflow
 
-Number = Annotated[float, Field(ge=-MOST, le=MOST)]
-Amount = Annotated[float, Field(ge=0, le=MOST)]
+Number = Annotated[float, Field(ge=-MAX_NUMBER, le=MAX_NUMBER)]
+Amount = Annotated[float, Field(ge=0, le=MAX_NUMBER)]
 Count = Annotated[int, Field(ge=0, lt=2**63)]
 Whole = Annotated[int, Field(gt=-(2**63), lt=2**63)]
 Text = Annotated[str, MinLen(1)]
@@ -34,20 +34,20 @@ STRICT = ConfigDict(strict=True, allow_inf_nan=False, extra="ignore")
 
 @dataclass(frozen=True, kw_only=True)
 class Record:
-    """Base of the records: strict types, finite numbers; further keys may stand beside the known ones."""
+    """Base of records: strict types and finite numbers; unknown keys are ignored."""
 
     __pydantic_config__: ClassVar[ConfigDict] = STRICT
 
     def to_json(self) -> dict[str, Any]:
-        """The object of the file; an optional key that says nothing is left out."""
+        """The JSON object of the file, without optional keys that have their default value."""
         kind: Any = type(self)
-        whole: dict[str, Any] = adapter(kind).dump_python(self, mode="json")
-        return {entry.name: whole[entry.name] for entry in fields(self) if not _says_nothing(self, entry)}
+        values: dict[str, Any] = adapter(kind).dump_python(self, mode="json")
+        return {field.name: values[field.name] for field in fields(self) if not _is_default(self, field)}
 
 
-def _says_nothing(record: Record, entry: Any) -> bool:
-    default = entry.default if entry.default_factory is MISSING else entry.default_factory()
-    return default is not MISSING and getattr(record, entry.name) == default
+def _is_default(record: Record, field: Any) -> bool:
+    default = field.default if field.default_factory is MISSING else field.default_factory()
+    return default is not MISSING and getattr(record, field.name) == default
 
 
 def read_typed(path: Path, kind: type[T]) -> T:
@@ -56,7 +56,7 @@ def read_typed(path: Path, kind: type[T]) -> T:
 
 
 def read_if_sound(path: Path, kind: type[T]) -> T | None:
-    """The JSON file as an object of ``kind``; None where it is absent or damaged."""
+    """The JSON file as an object of ``kind``, or None if it is missing or damaged."""
     try:
         return read_typed(path, kind)
     except (FileNotFoundError, DamagedError):
@@ -64,9 +64,9 @@ def read_if_sound(path: Path, kind: type[T]) -> T | None:
 
 
 def typed(content: bytes, kind: type[T], path: Path) -> T:
-    """JSON as an object of the type ``kind``, of the file ``path``; raises DamagedError naming the first misfit.
+    """Parse the JSON ``content`` of the file ``path`` as an object of ``kind``; raises DamagedError for a misfit.
 
-    More than 200 levels and integers of more than 4,300 digits are refused by the parser.
+    The parser refuses more than 200 levels and integers of more than 4,300 digits.
     """
     try:
         reader: Any = kind
@@ -78,12 +78,12 @@ def typed(content: bytes, kind: type[T], path: Path) -> T:
 
 @cache
 def adapter(kind: Any) -> TypeAdapter[Any]:
-    """pydantic's reader of a type: a dataclass, which brings `STRICT`, or one that is put together and given it."""
+    """pydantic's reader of a type. Dataclasses have the configuration `STRICT`; other types get it here."""
     return TypeAdapter(kind) if is_dataclass(kind) else TypeAdapter(kind, config=STRICT)
 
 
 def misfit(error: ValidationError) -> str:
-    """Describe the fault of a file: ``is damaged: metrics.psnr is '27' (input should be a valid number)``."""
+    """Describe the first fault: ``is damaged: metrics.psnr is '27' (input should be a valid number)``."""
     first: ErrorDetails = error.errors(include_url=False)[0]
     key, kind = ".".join(str(part) for part in first["loc"]), first["type"]
     if kind == "json_invalid":
@@ -96,16 +96,18 @@ def misfit(error: ValidationError) -> str:
 
 
 def iterate_rows(content: bytes, kind: type[T], path: Path) -> Iterator[tuple[str, T]]:
-    """The lines of JSON-lines, of the file ``path``, each with what it says as an object of ``kind``.
+    """Parse the JSON lines of the file ``path``; yields each line with its object of ``kind``.
 
-    What follows a damaged line is left out, with a warning unless it is the torn last one of a killed writer.
+    A damaged line and the lines after it are left out. There is a warning, except for an incomplete last line, which a
+    killed process leaves.
     """
     lines = content.splitlines(keepends=True)
+    # Parsing all lines at once is faster. Only if that fails are they parsed one by one.
     try:
-        rows = typed(b"[" + b",".join(lines) + b"]", list[kind], path)  # type: ignore[valid-type] # at once, mostly
+        rows = typed(b"[" + b",".join(lines) + b"]", list[kind], path)  # type: ignore[valid-type]
     except DamagedError:
         rows = []
-    if len(rows) == len(lines):  # else a line holds several
+    if len(rows) == len(lines):  # otherwise a line holds several values
         yield from ((line.decode("utf-8").rstrip("\r\n"), row) for line, row in zip(lines, rows, strict=True))
         return
     for number, line in enumerate(lines, 1):

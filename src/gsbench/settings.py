@@ -1,8 +1,8 @@
-"""Settings are dataclasses whose annotations say what is allowed; this module holds values against them.
+"""Checking settings, which are dataclasses whose annotations say what is allowed.
 
-A field's rule stands at the field: its type, bounds (`annotated_types`, or pydantic's ``PositiveInt`` and its like), a
-``Literal`` of choices. pydantic checks it, `describe` puts it into words. Numbers must be finite unless a class's own
-default is not. Rules between fields belong into the ``__post_init__`` of their class.
+The annotation of a field is its rule: a type, bounds (`annotated_types`, or pydantic's types such as ``PositiveInt``),
+or a ``Literal`` of choices. pydantic checks it, and `describe` puts it into words. Numbers must be finite, except a
+default of the class. Rules between fields belong in the ``__post_init__`` of their class.
 """
 
 import dataclasses
@@ -24,11 +24,11 @@ from gsbench.words import closest, is_path
 
 PathName = Annotated[str, Predicate(is_path), doc("a path")]
 AnyPath = Annotated[str | Path, Predicate(lambda path: is_path(str(path))), doc("a path")]
-MAX_NAME_BYTES = 100  # of a name: folders are made of two, and file systems end at 255
+MAX_NAME_BYTES = 100  # of a name: a folder's name can combine two, and file systems allow 255
 
 
 def is_folder_name(value: str) -> bool:
-    """Return whether a text can name a folder, on any system and in the address of a trial (``x:scene:arm:0``)."""
+    """Return whether a text can name a folder on any system, and fits the address of a trial (``x:scene:arm:0``)."""
     is_plain = value.isprintable() and not set(value) & set('/\\:*?"<>|') and value == value.strip()
     return is_plain and value[:1] not in ("", ".", "-") and len(value.encode()) <= MAX_NAME_BYTES
 
@@ -47,20 +47,17 @@ TargetName = Annotated[
 ]
 MISSING: Any = "???"  # a value that must be given, as Hydra writes it in YAML
 Fraction = Annotated[float, Interval(ge=0, le=1)]
-Threads = Annotated[int, Interval(ge=1, le=4096)]  # more is a slip, and no system starts them
+Threads = Annotated[int, Interval(ge=1, le=4096)]  # a larger number is a mistake, and no system could start them
 OpenFraction = Annotated[float, Interval(gt=0, lt=1)]
 
 
 @dataclasses.dataclass(frozen=True)
 class Switch:
-    """A part of a method that can be taken out (``gsbench ablate``): by the settings ``off``; ``words`` say what it is.
+    """A part of a method that ``gsbench ablate`` can switch off."""
 
-    Without the switch ``within`` this one does nothing.
-    """
-
-    off: dict[str, Any]
-    words: str = ""
-    within: str = ""
+    off: dict[str, Any]  # the settings that switch it off
+    words: str = ""  # what it is
+    within: str = ""  # a switch without which this one has no effect
 
 
 CONFIG = ConfigDict(allow_inf_nan=False, arbitrary_types_allowed=True, coerce_numbers_to_str=True)
@@ -68,9 +65,9 @@ PLAIN = {int: "a whole number", float: "a number", bool: "true or false", str: "
 
 
 def check_settings(settings: Any, group: str) -> None:
-    """Hold every option of the dataclass object ``settings`` against its annotation, and convert it (``1e3`` to 1000).
+    """Check every field of the dataclass object ``settings`` by its annotation, and convert it (``1e3`` to 1000).
 
-    Raises InputError that names ``group`` and the field, what is allowed, and what was given.
+    Raises InputError that names ``group`` and the field, the allowed values, and the given value.
     """
     given = {field.name: getattr(settings, field.name) for field in option_fields(type(settings))}
     for name, value in checked(type(settings), given, group).items():
@@ -78,10 +75,10 @@ def check_settings(settings: Any, group: str) -> None:
 
 
 def checked(cls: type, values: Mapping[str, Any], group: str) -> dict[str, Any]:
-    """``values``, options of the dataclass ``cls``, converted to what its annotations say.
+    """``values``, options of the dataclass ``cls``, converted to the types of its annotations.
 
-    Raises InputError for the first that is unknown or not allowed; its text starts with ``group``'s name and a dot
-    (nothing for the root, ``""``).
+    Raises InputError for the first unknown or forbidden option. Its message starts with the name of ``group`` and a
+    dot, or with the option for the root group ``""``.
     """
     prefix = f"{group}." if group else ""
     known = {field.name: field for field in option_fields(cls)}
@@ -94,19 +91,19 @@ def checked(cls: type, values: Mapping[str, Any], group: str) -> dict[str, Any]:
 
 
 def unknown_setting(key: str, name: str, known: Iterable[str]) -> str:
-    """The words for a ``key`` whose last part ``name`` is none of the ``known``."""
+    """The message for a ``key`` whose last part ``name`` is not among the ``known`` settings."""
     known = list(known)
-    there = f"there are: {', '.join(known)}" if known else "there are no settings"
-    return f"{key} is not a setting{closest(name, known)} ({there})"
+    existing = f"there are: {', '.join(known)}" if known else "there are no settings"
+    return f"{key} is not a setting{closest(name, known)} ({existing})"
 
 
 def option_fields(cls: type) -> list[dataclasses.Field[Any]]:
-    """The fields of a dataclass that its constructor takes."""
+    """The fields of a dataclass that are arguments of its constructor."""
     return [field for field in dataclasses.fields(cls) if field.init]
 
 
 def describe(hint: Any) -> str:
-    """An annotation in words, as they stand after "must be".
+    """An annotation in words that fit after "must be".
 
     Examples:
         >>> from annotated_types import Gt
@@ -139,14 +136,14 @@ def _converted(value: Any, field: dataclasses.Field[Any], cls: type, key: str) -
         reason = ""
     except ValidationError as error:
         if value is field.default or (isinstance(value, float) and value == field.default):
-            return value  # the author of a class may know better than the annotation
+            return value  # a class's own default is allowed even if its annotation forbids it
         first = error.errors()[0]
         reason = f": {first['ctx']['error']}" if first["type"] in ("value_error", "assertion_error") else ""
     raise InputError(f"{key} must be {describe(hint)}, got {_shown(value)}{reason}")
 
 
 def _has_switch_for_number(given: Any, result: Any) -> bool:
-    """Return whether a ``true`` became a number, which pydantic lets pass."""
+    """Return whether a ``true`` or ``false`` became a number, which pydantic allows."""
     if isinstance(given, Sequence) and not isinstance(given, str):
         return any(map(_has_switch_for_number, given, result))
     return isinstance(given, bool) and not isinstance(result, bool)
@@ -159,13 +156,13 @@ def _adapters(cls: type) -> dict[str, tuple[Any, TypeAdapter[Any]]]:
         hint = _hint(cls, field.name)
         try:
             result[field.name] = hint, TypeAdapter(hint, config=CONFIG)
-        except PydanticUserError:  # a type that brings a configuration of its own, such as a nested dataclass
+        except PydanticUserError:  # a type with its own configuration, such as a nested dataclass
             result[field.name] = hint, TypeAdapter(hint)
     return result
 
 
 def _hint(cls: type, name: str) -> Any:
-    """The annotation of a field with its constraints; Any where it names what only type checkers import."""
+    """The annotation of a field with its constraints; Any if it uses a name that only type checkers import."""
     owner = next(base for base in cls.__mro__ if name in inspect.get_annotations(base))
     holder = types.SimpleNamespace(__annotations__={name: inspect.get_annotations(owner)[name]})
     scope = vars(sys.modules[owner.__module__]) if owner.__module__ in sys.modules else {}
@@ -176,9 +173,9 @@ def _hint(cls: type, name: str) -> Any:
 
 
 def _describe_annotated(base: Any, rules: list[Any]) -> str:
-    said = next((rule.documentation for rule in rules if isinstance(rule, DocInfo)), None)
-    if said is not None:
-        return str(said)
+    documentation = next((rule.documentation for rule in rules if isinstance(rule, DocInfo)), None)
+    if documentation is not None:
+        return str(documentation)
     bounds = {
         bound: getattr(rule, bound) for rule in rules for bound in ("gt", "ge", "lt", "le") if hasattr(rule, bound)
     }

@@ -1,7 +1,8 @@
-"""Weights of networks: found in a folder, or downloaded, and in every case checked before they are read.
+"""Finding, downloading and checking the weights of networks.
 
-A file is looked for in the folder given by the caller, then in ``$GSBENCH_WEIGHTS`` (both with their sub-folders), then
-in the torch hub cache; if it lies nowhere it is downloaded into that cache. Nothing is ever unpickled as code.
+A file is searched in the folder given by the caller, then in ``$GSBENCH_WEIGHTS`` (both with sub-folders), then in the
+torch hub cache. If it is not found, it is downloaded into that cache. It is always checked before it is read, and no
+code in it is ever unpickled.
 """
 
 from __future__ import annotations
@@ -25,20 +26,20 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 WEIGHTS_VARIABLE = "GSBENCH_WEIGHTS"
-ONE_TRY = downloads.Patience(timeout=10.0, tries=1)  # without a network the answer must come at once
+ONE_TRY = downloads.RetryPolicy(timeout=10.0, tries=1)  # without a network, the error must come at once
 SAFETENSORS_SUFFIX = ".safetensors"
 
 
 class MissingWeights(InputError):  # noqa: N818  it says what is the matter
-    """Error of a weights file that lies nowhere and cannot be downloaded, or is not the one that is wanted."""
+    """Raised for a weights file that is not found and cannot be downloaded, or that is not the expected one."""
 
 
 @dataclass(frozen=True)
 class WeightsFile:
     """One file of weights.
 
-    ``names`` are the accepted file names, the first being the one that a download gets; ``sha256`` is the checksum in
-    hexadecimal, whole or its first digits, or None where none is published (then the shapes are the only check);
+    ``names`` are the accepted file names, of which a download gets the first. ``sha256`` is the checksum in
+    hexadecimal, complete or its first digits, or None if none is published; then only the shapes are checked.
     ``source`` says in a few words where the file comes from.
     """
 
@@ -50,10 +51,10 @@ class WeightsFile:
 
 
 def find_weights(spec: WeightsFile, folder: Path | None = None, download: bool = True) -> Path:
-    """The path of a checked copy of ``spec``; downloads it into the torch hub cache where it is not at hand.
+    """The path of a checked copy of ``spec``, which is downloaded into the torch hub cache if it is not found.
 
-    Raises ``InputError`` where ``folder`` does not exist, ``MissingWeights`` where no file has the right checksum or
-    nothing was found and nothing could be downloaded.
+    Raises ``InputError`` if ``folder`` does not exist, and ``MissingWeights`` if every file found has a wrong checksum,
+    or if none is found and none can be downloaded.
     """
     return find_all_weights([spec], folder, download)[0]
 
@@ -73,10 +74,10 @@ def find_all_weights(specs: Sequence[WeightsFile], folder: Path | None = None, d
             try:
                 found[spec] = _download(spec, hub_cache())
             except (OSError, GsbenchError) as error:
-                if isinstance(error, MissingWeights):  # what came is damaged
+                if isinstance(error, MissingWeights):  # the downloaded file is damaged
                     raise
                 reasons.append(f"the download failed: {error}")
-                break  # without a network the others would only fail as slowly
+                break  # without a network, each further download would fail as slowly
     still_missing = [spec for spec in missing if found[spec] is None]
     if still_missing:
         names = ", ".join(spec.names[0] for spec in still_missing)
@@ -90,17 +91,17 @@ def find_all_weights(specs: Sequence[WeightsFile], folder: Path | None = None, d
 
 
 def digests_of_unpinned(specs: Sequence[WeightsFile], folder: Path | None = None) -> list[str]:
-    """The sha256 of those files of ``specs`` that have no published checksum and were put into a folder by hand.
+    """The sha256 of files of ``specs`` without a published checksum that the user put into a folder.
 
-    Any file of the right shapes may lie there; what is in the torch hub cache was downloaded from the address.
+    Such a file can be any file of the right shapes. Files in the torch hub cache were downloaded from the address.
     """
-    hand_made = [(place, below) for place, below in _search_folders(folder) if place != hub_cache()]
-    found = [_find_local(spec, hand_made) for spec in specs if spec.sha256 is None]
+    users = [(place, sub_folders) for place, sub_folders in _search_folders(folder) if place != hub_cache()]
+    found = [_find_local(spec, users) for spec in specs if spec.sha256 is None]
     return [file_sha256(path) for path in found if path is not None]
 
 
 def _find_local(spec: WeightsFile, folders: Sequence[tuple[Path, bool]]) -> Path | None:
-    """The first file with the right checksum; raises ``MissingWeights`` where all that are there have a wrong one."""
+    """The first file with the right checksum; raises ``MissingWeights`` if all files found have a wrong one."""
     faults = []
     for place, sub_folders in folders:
         for path in _candidates(place, spec.names, sub_folders):
@@ -116,8 +117,8 @@ def _find_local(spec: WeightsFile, folders: Sequence[tuple[Path, bool]]) -> Path
 def load_state(path: Path, entry: str | None = None) -> dict[str, Tensor]:
     """The tensors in ``path`` (.safetensors, or a PyTorch file read with ``weights_only``), on the CPU, by name.
 
-    ``entry`` is the key under which a PyTorch file keeps them, where they are not all it holds. Raises
-    ``MissingWeights`` where the file is truncated, is no weights file, or holds anything but tensors.
+    ``entry`` is the key of the tensors in a PyTorch file that holds more. Raises ``MissingWeights`` if the file is
+    truncated, is not a weights file, or holds anything but tensors.
     """
     import torch
 
@@ -129,7 +130,7 @@ def load_state(path: Path, entry: str | None = None) -> dict[str, Tensor]:
         state = torch.load(path, map_location="cpu", weights_only=True)
     except ModuleNotFoundError as error:
         raise InputError(f"weights file {path} needs the package safetensors: pip install safetensors") from error
-    except Exception as error:  # of a damaged or foreign file the two readers and pickle raise a dozen kinds
+    except Exception as error:  # the two readers and pickle raise a dozen kinds of errors on a damaged or foreign file
         raise _unreadable(path, str(error).partition("\n")[0] or type(error).__name__) from error
     if not isinstance(state, Mapping):
         raise _unreadable(path, f"it holds a {type(state).__name__}, not tensors by name")
@@ -143,13 +144,13 @@ def load_state(path: Path, entry: str | None = None) -> dict[str, Tensor]:
 
 
 def hub_cache() -> Path:
-    """The folder in which torch.hub keeps downloaded checkpoints (``$TORCH_HOME``, else ``$XDG_CACHE_HOME``)."""
+    """The folder of torch.hub's downloaded checkpoints, below ``$TORCH_HOME``, else ``$XDG_CACHE_HOME``."""
     cache = Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")) / "torch"
     return Path(os.environ.get("TORCH_HOME", cache)).expanduser() / "hub" / "checkpoints"
 
 
 def _search_folders(folder: Path | None) -> list[tuple[Path, bool]]:
-    """Folders to look in, in order, each with whether its sub-folders count."""
+    """The folders to search, in order, each with whether its sub-folders are searched too."""
     folders: list[tuple[Path, bool]] = []
     if folder is not None:
         if not folder.is_dir():
@@ -179,7 +180,7 @@ def _checksum_fault(path: Path, spec: WeightsFile) -> str | None:
 
 
 def _download(spec: WeightsFile, folder: Path) -> Path:
-    """Fetch ``spec`` into ``folder``; the file appears under its name only when it is whole and checked."""
+    """Download ``spec`` into ``folder``. The file appears under its name only after it is complete and checked."""
     assert spec.url is not None
     folder.mkdir(parents=True, exist_ok=True)
     target = folder / spec.names[0]

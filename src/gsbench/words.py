@@ -1,17 +1,19 @@
-"""Numbers as people say them, the nearest right word for a wrong one, and what can be a path."""
+"""Text for people: readable numbers, lists of names, suggestions for wrong words, and safe output."""
 
 import difflib
 import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path, PurePath
 
-MAX_NAMED = 3  # names that an error or warning lists before it only counts
-# Characters that a terminal obeys in place of showing: control characters, but for line feed and tab; line separators;
-# marks that turn the direction of writing (UAX #9); halves of characters, which names of files may have.
-OBEYED = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
+MAX_NAMED = 3  # names that a message lists; further ones are only counted
+# Characters that a terminal acts on instead of showing: control characters except line feed and tab, line separators,
+# marks that change the direction of writing (UAX #9), and surrogates, which file names may contain.
+CONTROL_CHARACTERS = re.compile(
+    "[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]"
+)
 
-# A path from the root or the home folder within a sentence, up to a blank or what ends the naming of one.
-PLACE = re.compile(r"""(?<![^\s=(['"`])(?:~[\w.-]*)?/[^\s,;:'"`)\]]+""")
+# A path within a sentence that starts at the root or a home folder, up to a blank, a quote, a bracket or punctuation.
+PATH_IN_TEXT = re.compile(r"""(?<![^\s=(['"`])(?:~[\w.-]*)?/[^\s,;:'"`)\]]+""")
 
 
 def counted(count: int, noun: str) -> str:
@@ -20,7 +22,7 @@ def counted(count: int, noun: str) -> str:
 
 
 def readable_time(seconds: float) -> str:
-    """Seconds as people say them."""
+    """Seconds in a readable unit."""
     if seconds < 90:
         return f"{seconds:.0f} s"
     if seconds < 90 * 60:
@@ -31,24 +33,24 @@ def readable_time(seconds: float) -> str:
 
 
 def signed(value: float, spec: str) -> str:
-    """A number with its sign and a true minus, as ``spec`` formats it (``.2f``, ``.1%``): +0.50, −3.0%."""
+    """A number with its sign, formatted by ``spec`` (``.2f``, ``.1%``) with a minus sign: +0.50, −3.0%."""
     return true_minus(f"{value:+{spec}}")
 
 
 def true_minus(number: str) -> str:
-    """A formatted number with the minus sign of print in the place of the hyphen."""
+    """A formatted number with a minus sign instead of the hyphen."""
     return number.replace("-", "−")
 
 
 def closest(word: str, choices: Iterable[str]) -> str:
-    """'; did you mean X?' where one choice is near, else ''."""
+    """'; did you mean X?' if a choice is similar to ``word``, else ''."""
     choices = list(choices)
     near = difflib.get_close_matches(word, choices, n=1) or difflib.get_close_matches(word.lower(), choices, n=1)
     return f"; did you mean {near[0]}?" if near else ""
 
 
 def readable_bytes(count: int | None) -> str:
-    """Bytes as people say them, in powers of ten; ``unknown size`` for None."""
+    """Bytes in a readable unit (powers of ten); ``unknown size`` for None."""
     if count is None:
         return "unknown size"
     for unit, size in (("GB", 10**9), ("MB", 10**6), ("kB", 10**3)):
@@ -57,18 +59,18 @@ def readable_bytes(count: int | None) -> str:
     return f"{count} bytes"
 
 
-def without_places(text: str) -> str:
-    """The text, with the last name of each path of this machine in its place.
+def without_folders(text: str) -> str:
+    """The text with each absolute path replaced by its last part.
 
     Examples:
-        >>> without_places("weights not found (looked in /home/me/weights, ~/.cache/torch; no /): see https://a.org/b")
+        >>> without_folders("weights not found (looked in /home/me/weights, ~/.cache/torch; no /): see https://a.org/b")
         'weights not found (looked in weights, torch; no /): see https://a.org/b'
     """
-    return PLACE.sub(lambda found: PurePath(found[0]).name, text)
+    return PATH_IN_TEXT.sub(lambda match: PurePath(match[0]).name, text)
 
 
 def is_path(value: str) -> bool:
-    """Return whether a text can be a path: not empty, no control characters, no ``~user`` that is not known."""
+    """Return whether a text can be a path: not empty, without control characters or an unknown ``~user``."""
     try:
         return value.strip() != "" and value.isprintable() and bool(Path(value).expanduser())
     except RuntimeError:
@@ -76,13 +78,15 @@ def is_path(value: str) -> bool:
 
 
 def printable(text: str) -> str:
-    """``text`` with its control characters written out, so that a terminal shows them and obeys none.
+    """``text`` with its control characters escaped, so that a terminal shows them instead of acting on them.
 
     Examples:
         >>> printable("red \\x1b[31m")
         'red \\\\x1b[31m'
     """
-    return OBEYED.sub(lambda found: found[0].encode("unicode_escape").decode("ascii"), text.replace("\r\n", "\n"))
+    return CONTROL_CHARACTERS.sub(
+        lambda found: found[0].encode("unicode_escape").decode("ascii"), text.replace("\r\n", "\n")
+    )
 
 
 def listed(names: Sequence[str]) -> str:
@@ -91,6 +95,6 @@ def listed(names: Sequence[str]) -> str:
 
 
 def some_of(names: Sequence[str]) -> str:
-    """The first few names and the count of the others, for messages."""
+    """The first few names and the number of further ones, for messages."""
     more = len(names) - MAX_NAMED
     return ", ".join(names[:MAX_NAMED]) + (f" and {more} more" if more > 0 else "")

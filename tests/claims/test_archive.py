@@ -203,7 +203,7 @@ def test_damage_of_every_kind_is_one_line_and_leaves_nothing(
 
 def test_a_file_too_large_is_not_unpacked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file = export(tmp_path)
-    monkeypatch.setattr("gsbench.claims.archive.MOST_BYTES", 1000)
+    monkeypatch.setattr("gsbench.claims.archive.MAX_BYTES", 1000)
     with pytest.raises(InputError, match="no archive of gsbench's has so many"):
         unpack_archive(file, tmp_path / "other")
 

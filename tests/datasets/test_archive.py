@@ -14,17 +14,17 @@ import numpy as np
 import pytest
 
 from gsbench.datasets.archive import (
-    DamagedError,
+    DamagedMemberError,
     extract,
-    members_of,
     open_archive,
-    opened,
+    open_archive_at,
+    wanted_members,
 )
-from gsbench.downloads import FetchError, Patience, download, retried
+from gsbench.downloads import FetchError, RetryPolicy, download, with_retries
 from gsbench.errors import InputError
 from tests.datasets.server import Manners, Server, serve
 
-PATIENT = Patience(timeout=0.3, tries=3, pause=0.01)
+PATIENT = RetryPolicy(timeout=0.3, tries=3, pause=0.01)
 
 
 def packed(*names: str) -> bytes:
@@ -54,8 +54,8 @@ def test_an_archive_of_a_later_version_is_refused(version: int, tmp_path: Path) 
 def test_a_wrong_offset_is_damage(offset: int, layout: str, value: int, tmp_path: Path) -> None:
     data = patched(packed("s/images/a.jpg"), DIRECTORY, offset, layout, value)
     with open_archive(io.BytesIO(data), "x.zip") as archive:
-        (member,) = members_of(archive, "s", ["images"], "x.zip").values()
-        with pytest.raises(DamagedError):
+        (member,) = wanted_members(archive, "s", ["images"], "x.zip").values()
+        with pytest.raises(DamagedMemberError):
             extract(archive, member, tmp_path / "a.jpg", lambda count: None)
     assert not (tmp_path / "a.jpg").exists()
 
@@ -65,7 +65,7 @@ def test_a_member_without_a_name_is_passed_over() -> None:
     data = patched(data, b"x" + data[data.rindex(b"x") + 1 :], 0, "<B", 0)  # zipfile takes a name up to the first NUL
     with open_archive(io.BytesIO(data), "x.zip") as archive:
         assert "" in archive.namelist()
-        assert list(members_of(archive, "s", ["images"], "x.zip")) == ["images/a.jpg"]
+        assert list(wanted_members(archive, "s", ["images"], "x.zip")) == ["images/a.jpg"]
 
 
 @pytest.mark.parametrize(
@@ -79,7 +79,7 @@ def test_a_member_without_a_name_is_passed_over() -> None:
 )
 def test_names_that_cannot_lie_side_by_side_are_refused(names: tuple[str, ...], said: str) -> None:
     with open_archive(io.BytesIO(packed(*names)), "x.zip") as archive, pytest.raises(InputError, match=said):
-        members_of(archive, "s", ["images"], "x.zip")
+        wanted_members(archive, "s", ["images"], "x.zip")
 
 
 @pytest.mark.parametrize("compression", [zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
@@ -92,8 +92,8 @@ def test_damaged_bytes_of_a_member_are_damage(compression: int, tmp_path: Path) 
     for place in range(begin, begin + 200):
         damaged = data[:place] + bytes([data[place] ^ 0xFF]) + data[place + 1 :]
         with open_archive(io.BytesIO(damaged), "x.zip") as archive:
-            (member,) = members_of(archive, "s", ["images"], "x.zip").values()
-            with contextlib.suppress(DamagedError, InputError):
+            (member,) = wanted_members(archive, "s", ["images"], "x.zip").values()
+            with contextlib.suppress(DamagedMemberError, InputError):
                 extract(archive, member, tmp_path / "a.jpg", lambda count: None)
                 assert (tmp_path / "a.jpg").read_bytes() == content  # the byte was one that no reader looks at
                 (tmp_path / "a.jpg").unlink()
@@ -112,9 +112,9 @@ def served(tmp_path: Path) -> Iterator[Server]:
 def fetched(server: Server, target: Path) -> bytes:
     """The bytes of the second member."""
     url = f"{server.url}/file.zip"
-    with opened(url, PATIENT) as archive:
-        (_, member) = members_of(archive, "s", ["images"], url).values()
-        retried(lambda: extract(archive, member, target, lambda count: None), url, PATIENT)
+    with open_archive_at(url, PATIENT) as archive:
+        (_, member) = wanted_members(archive, "s", ["images"], url).values()
+        with_retries(lambda: extract(archive, member, target, lambda count: None), url, PATIENT)
     return target.read_bytes()
 
 
@@ -144,8 +144,8 @@ def test_a_member_comes_whole_and_alone(served: Server, tmp_path: Path, manners:
         (Manners(status={"/file.zip": 403}), InputError, r"403 Forbidden.*--mirror"),
         (Manners(status={"/file.zip": 503}), FetchError, r"3 failures in a row .*503"),
         (Manners(ranges=False), InputError, "whole files only.*--mirror FOLDER"),
-        (Manners(claimed_size=590_000), (FetchError, InputError, DamagedError), None),
-        (Manners(shift=7), DamagedError, None),
+        (Manners(claimed_size=590_000), (FetchError, InputError, DamagedMemberError), None),
+        (Manners(shift=7), DamagedMemberError, None),
     ],
 )
 def test_says_what_the_server_did(
@@ -158,22 +158,22 @@ def test_says_what_the_server_did(
 
 
 def test_no_server_at_all() -> None:
-    with pytest.raises(FetchError, match="Connection refused"), opened("http://127.0.0.1:9/file.zip", PATIENT):
+    with pytest.raises(FetchError, match="Connection refused"), open_archive_at("http://127.0.0.1:9/file.zip", PATIENT):
         pass
 
 
 def test_a_file_that_changes_in_between_is_damage(served: Server, tmp_path: Path) -> None:
     url = f"{served.url}/file.zip"
-    with opened(url, PATIENT) as archive:
-        (_, member) = members_of(archive, "s", ["images"], url).values()
+    with open_archive_at(url, PATIENT) as archive:
+        (_, member) = wanted_members(archive, "s", ["images"], url).values()
         content = bytearray((served.folder / "file.zip").read_bytes())
         content[400_000:400_010] = bytes(10)
         (served.folder / "file.zip").write_bytes(content)
-        with pytest.raises(DamagedError, match="CRC-32"):
+        with pytest.raises(DamagedMemberError, match="CRC-32"):
             extract(archive, member, tmp_path / "out", lambda count: None)
         os.truncate(served.folder / "file.zip", 1000)
         with pytest.raises(InputError, match="416"):
-            retried(lambda: extract(archive, member, tmp_path / "out", lambda count: None), url, PATIENT)
+            with_retries(lambda: extract(archive, member, tmp_path / "out", lambda count: None), url, PATIENT)
 
 
 def test_a_whole_file_comes_whole_or_not_at_all(served: Server, tmp_path: Path) -> None:
@@ -196,9 +196,9 @@ def test_offsets_beyond_four_gigabytes(tmp_path: Path) -> None:
         stream.seek(5 << 30)
         with zipfile.ZipFile(stream, "w") as archive:
             archive.writestr("garden/a.JPG", b"far out")
-    with serve(tmp_path) as server, opened(f"{server.url}/large.zip", PATIENT) as remote:
+    with serve(tmp_path) as server, open_archive_at(f"{server.url}/large.zip", PATIENT) as remote:
         assert remote.getinfo("garden/a.JPG").header_offset == 5 << 30
         assert remote.read("garden/a.JPG") == b"far out"
         assert server.sent < 1_000_000
-    with opened(str(file), PATIENT) as local:
+    with open_archive_at(str(file), PATIENT) as local:
         assert local.read("garden/a.JPG") == b"far out"

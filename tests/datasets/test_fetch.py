@@ -12,7 +12,7 @@ import pytest
 
 from gsbench.cli import run
 from gsbench.datasets.catalog import read_catalog, wanted_files
-from gsbench.downloads import Patience
+from gsbench.downloads import RetryPolicy
 from gsbench.system.install import conf_dir
 from tests.datasets.conftest import archive_content, write_archive
 from tests.datasets.server import Manners, Server
@@ -31,7 +31,7 @@ def data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture
 def fetch(server: Server, data: Path, monkeypatch: pytest.MonkeyPatch) -> Fetch:
-    monkeypatch.setattr("gsbench.verbs.fetch.PATIENCE", Patience(timeout=0.3, tries=3, pause=0.01))
+    monkeypatch.setattr("gsbench.verbs.fetch.PATIENCE", RetryPolicy(timeout=0.3, tries=3, pause=0.01))
 
     def call(*words: str) -> int:
         return run(["fetch", *words, "--mirror", server.url])

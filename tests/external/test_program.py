@@ -17,7 +17,7 @@ from PIL import Image
 from gsbench.errors import InputError, TrainingError
 from gsbench.external.exchange import write_test_cameras, write_training_views
 from gsbench.external.program import run_program
-from gsbench.external.settings import External, fill, words_of
+from gsbench.external.settings import External, fill_placeholders, split_command
 from gsbench.init.base import PointCloud
 from gsbench.runs.keys import config_hash
 from gsbench.scene.camera import Camera
@@ -86,13 +86,13 @@ def test_test_cameras_have_no_pixel_and_project_alike(views: list[View], tmp_pat
 
 
 def test_placeholders() -> None:
-    assert words_of("a 'b c' {d}", "x") == ["a", "b c", "{d}"]
-    assert fill("{a}-{b}-{a}", {"a": "{b}", "b": 2}, "x") == "{b}-2-{b}"  # each is replaced once
+    assert split_command("a 'b c' {d}", "x") == ["a", "b c", "{d}"]
+    assert fill_placeholders("{a}-{b}-{a}", {"a": "{b}", "b": 2}, "x") == "{b}-2-{b}"  # each is replaced once
     for command, said in (("", "x is empty"), ("'a", "cannot be split")):
         with pytest.raises(InputError, match=said):
-            words_of(command, "x")
+            split_command(command, "x")
     with pytest.raises(InputError, match=r"x: nothing is known as \{tset\}; did you mean test\?"):
-        fill("{tset}", {"test": 1}, "x")
+        fill_placeholders("{tset}", {"test": 1}, "x")
 
 
 def test_yaml_of_the_original_code_hands_our_schedule_on() -> None:

@@ -17,7 +17,7 @@ from random import Random
 import numpy as np
 from PIL import Image
 
-from gsbench.datasets.archive import DamagedError, extract, members_of, open_archive
+from gsbench.datasets.archive import DamagedMemberError, extract, open_archive, wanted_members
 from gsbench.errors import InputError
 from gsbench.gaussians.ply import read_ply, write_ply
 from gsbench.scene.colmap import read_model
@@ -118,12 +118,12 @@ def _check_picture(path: Path) -> None:
 
 def _check_archive(path: Path, work: Path) -> None:
     with path.open("rb") as file, open_archive(file, str(path)) as archive:
-        members = members_of(archive, "scene", ("images",), str(path))
+        members = wanted_members(archive, "scene", ("images",), str(path))
         for number, member in enumerate(members.values()):
             target = work / f"member{number}"
             try:
                 extract(archive, member, target, lambda count: None)
-            except DamagedError as error:
+            except DamagedMemberError as error:
                 raise InputError(" ".join(str(error).split())) from error
             assert target.stat().st_size == member.file_size
 

@@ -13,7 +13,7 @@ import pytest
 
 from gsbench.analysis.results import read_experiment
 from gsbench.errors import InputError
-from gsbench.files import remove_strange, require_own
+from gsbench.files import remove_special_files, require_no_links
 from gsbench.launch.record import declare, forget, remove
 from gsbench.launch.states import states_of_experiment
 from gsbench.logs import log_to
@@ -124,7 +124,7 @@ def test_a_trial_that_holds_something_strange_is_left_out(
     assert not found.trials
     assert name in found.warnings[0]
     with pytest.raises(InputError, match="not a regular file"):
-        require_own(trial.parents[3], trial, below=True)
+        require_no_links(trial.parents[3], trial, below=True)
 
 
 @pytest.mark.parametrize("make", [_link, _pipe])
@@ -158,7 +158,7 @@ def test_what_a_killed_build_linked_is_removed_and_what_it_led_to_stays(tmp_path
     (partial / "work").mkdir(parents=True)
     (partial / "work" / "images").symlink_to(outside)
     (partial / "kept").write_text("")
-    remove_strange(partial)
+    remove_special_files(partial)
     assert sorted(path.name for path in partial.iterdir()) == ["kept", "work"]
     assert not list((partial / "work").iterdir())
     assert (outside / "private").read_text() == SECRET

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from gsbench.errors import GsbenchError
-from gsbench.view.visitors import is_welcome, only_welcome_visitors
+from gsbench.view.visitors import is_own_page, refuse_other_pages
 
 WELCOME = [
     (["127.0.0.1:8080"], []),
@@ -41,18 +41,18 @@ UNWELCOME = [
 
 @pytest.mark.parametrize(("hosts", "origins"), WELCOME)
 def test_its_own_page_and_programs_are_welcome(hosts: list[str], origins: list[str]) -> None:
-    assert is_welcome(hosts, origins)
+    assert is_own_page(hosts, origins)
 
 
 @pytest.mark.parametrize(("hosts", "origins"), UNWELCOME)
 def test_no_other_page_is(hosts: list[str], origins: list[str]) -> None:
-    assert not is_welcome(hosts, origins)
+    assert not is_own_page(hosts, origins)
 
 
 @pytest.fixture(scope="module")
 def server() -> Iterator[Any]:
     viser = pytest.importorskip("viser", reason="the viewer needs viser (extra view)")
-    with only_welcome_visitors():
+    with refuse_other_pages():
         server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
     yield server
     server.stop()
@@ -86,5 +86,5 @@ def test_the_server_itself_answers_so(server: Any, upgrade: bool) -> None:
 
 def test_a_server_that_was_started_otherwise_is_not_trusted() -> None:
     pytest.importorskip("viser", reason="the viewer needs viser (extra view)")
-    with pytest.raises(GsbenchError, match="cannot be kept from strange web pages"), only_welcome_visitors():
+    with pytest.raises(GsbenchError, match="cannot be kept from strange web pages"), refuse_other_pages():
         types.SimpleNamespace()

@@ -31,7 +31,7 @@ UNKNOWN, NONE = "not recorded", "–"
 ALIKE, UNLIKE = "", "≠"
 DIFFERS = "differs"  # heading of the column that marks differing rows
 EQUAL_COUNTS = 0.02  # relative difference up to which counts are equal; densify.cap=governor holds counts closer
-MOST_VALUES = 8  # shown points of a search
+MAX_VALUES = 8  # shown points of a search
 NOTHING = "No tuning is recorded: each arm ran with one choice of settings. What was tried elsewhere is not known."
 VIEWS = "validation views"  # every search judges its points on them
 
@@ -217,9 +217,9 @@ def _search_line(own: Sequence[TrialResult], experiment: str, search: TuningReco
     chosen = listed([f"{key.lstrip('+~')}={value}" for key, value in sorted(best.settings.items())])
     tried = [
         f"{', '.join(map(str, point.settings.values()))} ({'failed' if point.value is None else f'{point.value:.4g}'})"
-        for point in search.points[:MOST_VALUES]
+        for point in search.points[:MAX_VALUES]
     ]
-    more = len(search.points) - MOST_VALUES
+    more = len(search.points) - MAX_VALUES
     line = (
         f"{search.arm}: {chosen} is the best of {counted(len(search.points), 'point')} by {search.metric} of {VIEWS} "
         f"({listed(search.scenes)}; seed {', '.join(map(str, search.seeds))}; the search {experiment}), "

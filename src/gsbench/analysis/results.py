@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 
 from gsbench.analysis.configurations import Configurations, canonical, load_flat_config
 from gsbench.errors import InputError
-from gsbench.files import require_own
+from gsbench.files import require_no_links
 from gsbench.parsing import DamagedError, one_line
 from gsbench.runs.declaration import QUESTIONS, trial_key, unix_time
 from gsbench.runs.declaration import Arm as Arm
@@ -333,7 +333,7 @@ class _UnusableError(Exception):
 def read_trial(path: Path, runs_dir: Path, settings: Configurations) -> TrialResult:
     """Read and check one trial folder; raises `_UnusableError`."""
     try:
-        require_own(runs_dir, path, below=True)
+        require_no_links(runs_dir, path, below=True)
         record = TrialFolder(path).record()
     except FileNotFoundError:
         raise _UnusableError(_why_unfinished(path)) from None

@@ -40,7 +40,7 @@ from gsbench.parsing import read_bytes, read_yaml
 from gsbench.runs.declaration import read_declarations
 from gsbench.runs.layout import CONFIG, DECLARED, FROM_PIXELS, GROUND_TRUTH, PER_VIEW, RENDERS, RESULTS
 from gsbench.settings import is_folder_name
-from gsbench.words import readable_bytes, without_places
+from gsbench.words import readable_bytes, without_folders
 
 FORMAT, VERSION = "gsbench results", 1
 PIXELS = "from_pixels.jsonl"
@@ -48,7 +48,7 @@ MANIFEST, CRATE = "archive.json", "ro-crate-metadata.json"
 TRIALS, CONFIGURATIONS = "results.jsonl", "configurations.jsonl"
 PICTURES_FOLDER, PICTURES = "pictures", (RENDERS, GROUND_TRUTH)
 # Archives may come from strangers: these limits stop a zip bomb. They are larger than any experiment needs.
-MOST_BYTES = 1 << 28  # bytes of one unpacked file
+MAX_BYTES = 1 << 28  # bytes of one unpacked file
 MOST_TOGETHER = 1 << 30  # bytes of all unpacked files
 FIXED_DATE = (1980, 1, 1, 0, 0, 0)  # of all files in the zip, so that archives do not depend on time: zip's earliest
 PRIVATE = ("runs", "tracking")  # settings that only name the user's folders and servers
@@ -195,10 +195,10 @@ def _member(archive: zipfile.ZipFile, name: str) -> bytes:
         info = archive.getinfo(name)
     except KeyError:
         raise InputError(f"it lacks {name}: it is not an archive of gsbench, or it is incomplete") from None
-    if info.file_size > MOST_BYTES:
+    if info.file_size > MAX_BYTES:
         raise InputError(f"{name} would be {info.file_size} bytes: no archive of gsbench's has so many")
     with archive.open(info) as stream:
-        return stream.read(MOST_BYTES)
+        return stream.read(MAX_BYTES)
 
 
 def _unpack(home: Path, trials: Sequence[tuple[str, dict[str, Any]]], contents: Mapping[str, bytes]) -> None:
@@ -283,7 +283,7 @@ def _configuration(trial: TrialResult) -> str:
 def _results(trial: TrialResult) -> dict[str, Any]:
     """The record of the trial without paths of this machine."""
     record = trial.record.to_json()
-    reasons = {metric: without_places(reason) for metric, reason in record["unavailable"].items()}
+    reasons = {metric: without_folders(reason) for metric, reason in record["unavailable"].items()}
     results: dict[str, Any] = without_paths(record | {"unavailable": reasons})
     return results
 
@@ -295,9 +295,9 @@ def without_paths(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [without_paths(entry) for entry in value]
     if isinstance(value, str):
-        if value.startswith(("/", "~")) or PurePath(value).is_absolute():  # `without_places` would stop at a blank
+        if value.startswith(("/", "~")) or PurePath(value).is_absolute():  # `without_folders` would stop at a blank
             return PurePath(value).name
-        return without_places(FOLDERS.sub("///", PASSWORD.sub("", value)))
+        return without_folders(FOLDERS.sub("///", PASSWORD.sub("", value)))
     return value
 
 

@@ -22,7 +22,7 @@ from gsbench.records import read_if_sound
 from gsbench.runs.declaration import Declaration, declared_now, latest_declaration, read_declarations
 from gsbench.runs.layout import FAILED, SEED
 from gsbench.runs.trial_folder import Failure
-from gsbench.words import some_of, without_places
+from gsbench.words import some_of, without_folders
 
 FindMissing = Callable[[Sequence[Trial]], Sequence[str]]  # a line for each thing that these trials need and lack
 NOT_TESTABLE = "not testable here"
@@ -151,7 +151,7 @@ def prepare(file: ClaimsFile, runs: Path, find_missing: FindMissing, permissions
         if scenes:
             questions.append(file.question(claim, scenes))
         if reasons:
-            missing[claim.id] = [without_places(f"{some_of(names)}: {reason}") for reason, names in reasons.items()]
+            missing[claim.id] = [without_folders(f"{some_of(names)}: {reason}") for reason, names in reasons.items()]
     declaration = declared_now(
         questions=tuple(questions), error_rate=file.error_rate, looks=file.looks, missing=missing
     )

@@ -31,7 +31,7 @@ from gsbench.config.hydra_entry import CONFIG_NAME, explained, hydra_ready
 from gsbench.config.schema import Config, checked_values
 from gsbench.config.trust import PERMISSIONS, check_composed, check_permissions
 from gsbench.errors import InputError
-from gsbench.parsing import LOADER, MOST_VALUES
+from gsbench.parsing import LOADER, MAX_VALUES
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.settings import checked
 from gsbench.system.own_modules import allow_modules
@@ -96,8 +96,8 @@ def check_files(folders: Sequence[Path]) -> None:
             count = _expanded_size(text)
         except (OSError, ValueError, yaml.YAMLError):  # Hydra reports it if it reads the file
             continue
-        if count > MOST_VALUES:
-            raise InputError(f"{file}: its aliases stand for more than {MOST_VALUES:,} values")
+        if count > MAX_VALUES:
+            raise InputError(f"{file}: its aliases stand for more than {MAX_VALUES:,} values")
 
 
 def _expanded_size(text: str) -> int:

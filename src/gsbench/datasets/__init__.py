@@ -1,1 +1,1 @@
-"""Public data sets: what there is, where it lies, and how its wanted parts come here. Loads no torch."""
+"""Public data sets: the catalogue, and fetching the wanted parts of their archives. Loads no torch."""

@@ -1,7 +1,7 @@
-"""Zip archives of scenes, here or on a server, and what of them comes here: which members are wanted, and each checked.
+"""Fetching scenes from zip archives, local or on a server: selecting the wanted members and checking each.
 
-Of an archive on a server only the directory and the wanted members come, each by a request of its own (remotezip). A
-scene appears in the data folder when all that was missing of it is here.
+From an archive on a server only the directory and the wanted members are read, each with its own request (remotezip).
+The missing folders of a scene appear in the data folder once all of them are complete.
 """
 
 import lzma
@@ -16,27 +16,28 @@ from pathlib import Path, PurePosixPath
 from typing import IO
 
 from gsbench.datasets.catalog import SceneFiles
-from gsbench.downloads import USER_AGENT, FetchError, Patience, retried
+from gsbench.downloads import USER_AGENT, FetchError, RetryPolicy, with_retries
 from gsbench.errors import InputError
 from gsbench.files import CHUNK, atomic, require_regular
 from gsbench.logs import Progress
 from gsbench.words import counted, readable_bytes
 
-MAX_NAME_BYTES = 220  # file systems end at 255 for each folder, and a file that is being written has a longer name
+# File systems allow 255 for each part of a path, but the temporary name of a file that is being written is longer.
+MAX_NAME_BYTES = 220
 
 
-class DamagedError(Exception):
-    """Error of a file that is not what the archive's directory promises."""
+class DamagedMemberError(Exception):
+    """Raised for a member whose content does not match the archive's directory."""
 
 
 @contextmanager
-def opened(where: str, patience: Patience) -> Iterator[zipfile.ZipFile]:
-    """The archive at an address, read by ranges, or at a path of this machine.
+def open_archive_at(where: str, policy: RetryPolicy) -> Iterator[zipfile.ZipFile]:
+    """Open the archive at an address, which is read by ranges, or at a path of this machine.
 
-    Raises `InputError` where it cannot be read, is no archive, or lies on a server that sends whole files only.
+    Raises `InputError` if it cannot be read or is not an archive, or if its server only sends whole files.
     """
     if "://" in where:
-        with _remote(where, patience) as archive:
+        with _remote(where, policy) as archive:
             yield archive
         return
     path = Path(where).expanduser()
@@ -50,25 +51,25 @@ def opened(where: str, patience: Patience) -> Iterator[zipfile.ZipFile]:
 
 
 @contextmanager
-def _remote(url: str, patience: Patience) -> Iterator[zipfile.ZipFile]:
+def _remote(url: str, policy: RetryPolicy) -> Iterator[zipfile.ZipFile]:
     import remotezip
     import requests
 
     def once() -> zipfile.ZipFile:
         try:
-            return remotezip.RemoteZip(url, session=session, timeout=patience.timeout, headers=USER_AGENT)
+            return remotezip.RemoteZip(url, session=session, timeout=policy.timeout, headers=USER_AGENT)
         except remotezip.RangeNotSupported:
             raise InputError(
                 f"{url}: the server sends whole files only: get the file into a folder, and give --mirror FOLDER"
             ) from None
         except remotezip.RemoteIOError as error:
-            raise (error.__context__ or error) from None  # the library keeps the words of the cause alone
+            raise (error.__context__ or error) from None  # remotezip keeps only the text of the cause
         except remotezip.RemoteZipError as error:
             raise zipfile.BadZipFile(str(error)) from None
 
     with requests.Session() as session:
         try:
-            archive = retried(once, url, patience)
+            archive = with_retries(once, url, policy)
         except (zipfile.BadZipFile, NotImplementedError, ValueError, struct.error) as error:
             if isinstance(error, InputError):
                 raise
@@ -78,7 +79,7 @@ def _remote(url: str, patience: Patience) -> Iterator[zipfile.ZipFile]:
 
 
 def open_archive(file: IO[bytes], where: str) -> zipfile.ZipFile:
-    """The zip archive in ``file``; `InputError`, one line naming ``where``, if it is none or has been cut."""
+    """Open the zip archive in ``file``; raises `InputError` naming ``where`` if it is no archive or is truncated."""
     try:
         return zipfile.ZipFile(file)
     except (zipfile.BadZipFile, NotImplementedError, ValueError, struct.error) as error:
@@ -89,10 +90,12 @@ def _no_archive(where: str, error: Exception) -> InputError:
     return InputError(f"{where} is not a complete zip archive ({error}): give another address with --mirror")
 
 
-def members_of(archive: zipfile.ZipFile, folder: str, wanted: Sequence[str], where: str) -> dict[str, zipfile.ZipInfo]:
-    """The files of the folders ``wanted`` below ``folder`` (and no others), by their names below it, sorted.
+def wanted_members(
+    archive: zipfile.ZipFile, folder: str, wanted: Sequence[str], where: str
+) -> dict[str, zipfile.ZipInfo]:
+    """The members in the folders ``wanted`` below ``folder``, by their names below it, sorted.
 
-    Raises `InputError` where a wanted folder is empty, or a name would lead out of the scene's folder.
+    Raises `InputError` if a wanted folder is empty, or if a name would lead out of the scene's folder.
     """
     members: dict[str, zipfile.ZipInfo] = {}
     for info in archive.infolist():
@@ -100,7 +103,7 @@ def members_of(archive: zipfile.ZipFile, folder: str, wanted: Sequence[str], whe
             continue
         name = info.filename[len(folder) + 1 :]
         if not any(name.startswith(f"{part}/") for part in wanted) or "/." in f"/{name}":
-            continue  # hidden files, ".." among them, are never wanted
+            continue  # hidden files, including "..", are never wanted
         if "\\" in name or "//" in name or ":" in name or PurePosixPath(name).is_absolute():
             raise InputError(f"{where}: the member {info.filename!r} has an unsafe name: give another --mirror")
         if len(name.encode("utf-8", "surrogatepass")) > MAX_NAME_BYTES or not name.isprintable():
@@ -117,8 +120,8 @@ def members_of(archive: zipfile.ZipFile, folder: str, wanted: Sequence[str], whe
     return dict(sorted(members.items()))
 
 
-def holds(path: Path, size: int, crc: int) -> bool:
-    """Return whether the file ``path`` is there with this size and CRC-32."""
+def is_complete(path: Path, size: int, crc: int) -> bool:
+    """Return whether the file ``path`` exists with this size and CRC-32."""
     try:
         if path.stat().st_size != size:
             return False
@@ -132,74 +135,75 @@ def holds(path: Path, size: int, crc: int) -> bool:
 
 
 def extract(archive: zipfile.ZipFile, member: zipfile.ZipInfo, target: Path, advance: Callable[[int], None]) -> None:
-    """Write the member to ``target``, which appears only when size and CRC-32 are right; ``advance`` gets bytes.
+    """Write the member to ``target``, which appears only if size and CRC-32 are right; ``advance`` gets byte counts.
 
-    Raises `DamagedError`, `InputError` for a member that the archive has packed in a way not known here, and what the
-    network raises.
+    Raises `DamagedMemberError`, `InputError` for an unknown compression, and errors of the network.
     """
     target.parent.mkdir(parents=True, exist_ok=True)
     written = 0
     try:
         with (
-            atomic(target, sync=False) as temporary,  # a later fetch reads what is here and compares its CRC
+            atomic(
+                target, sync=False
+            ) as temporary,  # not synced, because a later fetch checks the CRC of existing files
             archive.open(member) as source,
             temporary.open("wb") as file,
         ):
-            while piece := source.read(CHUNK):  # checks the CRC at the end
+            while piece := source.read(CHUNK):  # zipfile checks the CRC at the end
                 file.write(piece)
                 written += len(piece)
                 advance(len(piece))
             if written != member.file_size:
-                raise DamagedError(f"{written} bytes instead of {member.file_size}")
+                raise DamagedMemberError(f"{written} bytes instead of {member.file_size}")
     except Exception as error:
         advance(-written)
         raise _cause(error, member) from error
 
 
-# The kinds of error that zipfile and its decompressors raise for damaged bytes; the last two are of LZMA's filter.
+# Errors that zipfile and its decompressors raise for damaged bytes; the last two come from LZMA's filter.
 DAMAGE = (zipfile.BadZipFile, zlib.error, struct.error, lzma.LZMAError, EOFError, ValueError, IndexError, TypeError)
 
 
 def _cause(error: Exception, member: zipfile.ZipInfo) -> Exception:
-    """The error to raise for one that `extract` met: of the file, of gsbench, else the error itself."""
+    """The error that `extract` raises for ``error``: an error of gsbench for a known cause, else the error itself."""
     from remotezip import RemoteIOError, RemoteZipError
 
-    if isinstance(error, InputError | DamagedError):
+    if isinstance(error, InputError | DamagedMemberError):
         return error
     if isinstance(error, RemoteIOError):
         cause = error.__context__
         return cause if isinstance(cause, Exception) else error
-    # Of the system's errors, EINVAL is a place before the file's beginning; bzip2's own has no number.
+    # An OSError with EINVAL is a seek before the start of the file; bzip2 raises one without a number.
     if isinstance(error, (*DAMAGE, RemoteZipError)) or (isinstance(error, OSError) and error.errno in (None, EINVAL)):
-        return DamagedError(str(error) or type(error).__name__)
+        return DamagedMemberError(str(error) or type(error).__name__)
     if isinstance(error, NotImplementedError | RuntimeError):
         return InputError(f"{member.filename} is packed in a way that cannot be read here ({error})")
     return error
 
 
-STAGING = ".fetch"  # below the data folder: what has come so far
+STAGING = ".fetch"  # folder below the data folder for unfinished scenes
 
 
 def missing_parts(data: Path, files: SceneFiles) -> tuple[str, ...]:
-    """The folders of a scene that are not in the folder ``data``; one that is there is whole."""
+    """The folders of a scene that are not in the folder ``data``. An existing folder is complete."""
     return tuple(part for part in files.parts if not (data / files.folder / part).exists())
 
 
 def fetch_scene(
-    archive: zipfile.ZipFile, folder: str, where: str, data: Path, files: SceneFiles, patience: Patience, say: Progress
+    archive: zipfile.ZipFile, folder: str, where: str, data: Path, files: SceneFiles, policy: RetryPolicy, say: Progress
 ) -> str:
-    """Bring what is missing of a scene out of its ``archive``, where it lies in ``folder``; returns a line about it.
+    """Fetch the missing folders of a scene from ``folder`` of its ``archive``; returns a line about them.
 
-    ``where`` is the archive's place, for errors; ``say`` is told bytes. The caller holds the lock of ``data``.
+    ``where`` is the archive's address, for errors; ``say`` gets byte counts. The caller holds the lock of ``data``.
     """
     parts, staging = missing_parts(data, files), data / STAGING / files.scene
-    members = members_of(archive, folder, parts, where)
+    members = wanted_members(archive, folder, parts, where)
     for path in [path for path in staging.rglob("*") if path.is_file()]:
         if path.relative_to(staging).as_posix() not in members:
-            path.unlink()  # of an earlier fetch that wanted something else
+            path.unlink()  # from an earlier fetch of other folders
     missing = {
-        name: info for name, info in members.items() if not holds(staging / name, info.file_size, info.CRC)
-    }  # of what came before it was stopped, nothing comes again
+        name: info for name, info in members.items() if not is_complete(staging / name, info.file_size, info.CRC)
+    }  # members that an interrupted fetch completed are not fetched again
     total, done = sum(info.file_size for info in missing.values()), 0
 
     def advance(count: int) -> None:
@@ -208,17 +212,20 @@ def fetch_scene(
         say(files.scene, done, total)
 
     for name, info in sorted(missing.items(), key=lambda member: member[1].header_offset):
-        for is_last_try in (False, True):  # of damage on the way; a cut connection is tried again within
+        for is_last_try in (
+            False,
+            True,
+        ):  # two tries against damage in transit; `with_retries` handles lost connections
             try:
-                retried(lambda: extract(archive, info, staging / name, advance), where, patience)  # noqa: B023
+                with_retries(lambda: extract(archive, info, staging / name, advance), where, policy)  # noqa: B023
                 break
-            except DamagedError as error:
+            except DamagedMemberError as error:
                 if is_last_try:
                     raise FetchError(
                         f"{where}: {info.filename} arrives damaged ({error}): try again later, or give another address "
                         "with --mirror"
                     ) from error
-    for part in parts:  # each by one rename, so that no folder of images is ever half there
+    for part in parts:  # each by one rename, so that no folder of images is ever incomplete
         (data / files.folder / part).parent.mkdir(parents=True, exist_ok=True)
         shutil.move(staging / part, data / files.folder / part)
     shutil.rmtree(staging, ignore_errors=True)

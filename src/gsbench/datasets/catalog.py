@@ -1,4 +1,4 @@
-"""The data file of public data sets (``catalog.yaml``): where scenes lie, and which files of them are wanted."""
+"""The catalogue of public data sets (``catalog.yaml``): archives of scenes, and the files of a scene to fetch."""
 
 import os
 import re
@@ -21,13 +21,11 @@ CATALOG_FILE = Path(__file__).with_name("catalog.yaml")
 
 @dataclass(frozen=True)
 class Archive:
-    """One zip file: its address, its approximate size in words ("" where it is not known), and the folder of each of
-    its scenes in it.
-    """
+    """One zip file of scenes."""
 
     url: str
-    size: str
-    scenes: Mapping[str, str]
+    size: str  # approximate, in words; "" if unknown
+    scenes: Mapping[str, str]  # the folder of each scene in the archive
 
     @property
     def name(self) -> str:
@@ -35,8 +33,8 @@ class Archive:
 
 
 @dataclass(frozen=True)
-class Dataset:
-    """A published set of scenes, whose licence and citation are shown to who fetches it."""
+class PublicDataset:
+    """A published set of scenes. Its licence and citation are shown before it is fetched."""
 
     name: str
     title: str
@@ -52,15 +50,15 @@ class Dataset:
 
 @dataclass(frozen=True)
 class SceneFiles:
-    """Files that conf/scene/<scene>.yaml asks for: its folder below the data folder, and the folders in it."""
+    """Folders that conf/scene/<scene>.yaml needs: ``parts`` in ``folder``, which is below the data folder."""
 
     scene: str
     folder: str
-    parts: tuple[str, ...]  # images before the model: a model alone is no scene
+    parts: tuple[str, ...]  # images before the model, because a model alone is no scene
 
 
 def wanted_files(scene: str, images: str | None = None) -> SceneFiles:
-    """The files that a scene file asks for; ``images`` names another image folder than it does."""
+    """The folders that a scene's YAML file needs; ``images`` replaces its image folder."""
     settings = yaml.safe_load((conf_dir() / "scene" / f"{scene}.yaml").read_text(encoding="utf-8"))
     match = SCENE_PATH.fullmatch(settings["path"])
     if match is None:
@@ -69,26 +67,26 @@ def wanted_files(scene: str, images: str | None = None) -> SceneFiles:
     return SceneFiles(scene, match["folder"], parts)
 
 
-def read_catalog() -> dict[str, Dataset]:
+def read_catalog() -> dict[str, PublicDataset]:
     """The data sets of gsbench's catalogue by name."""
     content: dict[str, Any] = yaml.safe_load(CATALOG_FILE.read_text(encoding="utf-8"))
     return {name: _dataset(name, entry) for name, entry in content.items()}
 
 
-def _dataset(name: str, entry: Mapping[str, Any]) -> Dataset:
+def _dataset(name: str, entry: Mapping[str, Any]) -> PublicDataset:
     texts = {key: entry[key] for key in ("title", "page", "licence", "citation")}
     archives = tuple(Archive(one["url"], one.get("size", ""), one["scenes"]) for one in entry["archives"])
-    return Dataset(name=name, archives=archives, **texts)
+    return PublicDataset(name=name, archives=archives, **texts)
 
 
 def data_dir() -> Path:
-    """The folder in which the scene files look for public data: ``$GSBENCH_DATA``, else ``data`` here."""
+    """The folder of public data: ``$GSBENCH_DATA``, else ``data`` in the current folder."""
     return Path(os.environ.get(DATA_VARIABLE, "data")).expanduser()
 
 
 @cache
-def _known() -> dict[str, tuple[str, str]]:
-    """Of each scene in the catalogue: its data set, and its folder."""
+def _catalogued_scenes() -> dict[str, tuple[str, str]]:
+    """The data set and the folder of each scene in the catalogue."""
     return {
         scene: (dataset.name, folder)
         for dataset in read_catalog().values()
@@ -98,11 +96,11 @@ def _known() -> dict[str, tuple[str, str]]:
 
 
 def how_to_get(scenes: Iterable[tuple[str, Path]]) -> str:
-    """The mend for scenes whose folders ``(scene, folder)`` are not there: the commands that fetch them, if any do."""
+    """Advice for missing scenes, given as (scene, folder): the commands that fetch those in the catalogue."""
     wanted = defaultdict(list)
     for scene, folder in scenes:
-        dataset, place = _known().get(scene, ("", ""))
-        if dataset and folder.expanduser().absolute() == (data_dir() / place).absolute():
+        dataset, catalogued = _catalogued_scenes().get(scene, ("", ""))
+        if dataset and folder.expanduser().absolute() == (data_dir() / catalogued).absolute():
             wanted[dataset].append(scene)
     commands = [f"`gsbench fetch {dataset} {' '.join(sorted(names))}`" for dataset, names in sorted(wanted.items())]
     if not commands:

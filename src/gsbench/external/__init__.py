@@ -1,1 +1,1 @@
-"""Running another program as a trainer: what it is given, how it is run and ended, what it leaves."""
+"""Running another program as a trainer: its settings, input folders, process and results."""

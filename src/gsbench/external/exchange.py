@@ -1,4 +1,4 @@
-"""Folders of another program: what it is given (training views, test cameras alone), and what it leaves, checked."""
+"""Input folders of another program (training views, test cameras), and the check of its results."""
 
 import shutil
 from collections.abc import Sequence
@@ -24,13 +24,13 @@ from gsbench.words import counted, some_of
 IMAGES = "images"
 TRANSFORMS = "transforms.json"
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenCV's camera axes (y down, z forward) to OpenGL's (y up, z backward)
-FAST_PNG = 1  # zlib's level: files that live as long as one training
+FAST_PNG = 1  # zlib level; the files are deleted after the training
 
 
 def write_training_views(folder: Path, views: Sequence[View], cloud: PointCloud) -> None:
     """Write ``views`` as a COLMAP folder: PNG files, PINHOLE cameras of their size, and ``cloud`` as its points.
 
-    The points have no observations: which test views saw them, and where, stays here.
+    The points have no observations, which would reveal what test views saw.
     """
     check_picture_names([view.name for view in views], folder / IMAGES)
     (folder / IMAGES).mkdir(parents=True)
@@ -40,9 +40,9 @@ def write_training_views(folder: Path, views: Sequence[View], cloud: PointCloud)
 
 
 def write_test_cameras(folder: Path, views: Sequence[View]) -> None:
-    """Write the cameras of ``views`` and no pixel: a COLMAP model, and the same as nerfstudio's ``transforms.json``.
+    """Write the cameras of ``views``, without images, as a COLMAP model and as nerfstudio's ``transforms.json``.
 
-    Renders are expected under the names that stand there.
+    Renders are expected under the names in these files.
     """
     cameras = _cameras(views)
     write_model(folder / MODEL_FOLDER, cameras)
@@ -61,10 +61,10 @@ def _frame(name: str, camera: Camera) -> dict[str, Any]:
     return {"file_path": name} | intrinsics | {"cx": camera.cx, "cy": camera.cy} | pose
 
 
-def take_model(output: Path, pattern: str, target: Path) -> Gaussians:
-    """The Gaussians of the one file below ``output`` that fits ``pattern``, copied to ``target``.
+def collect_model(output: Path, pattern: str, target: Path) -> Gaussians:
+    """Copy the one file below ``output`` that fits ``pattern`` to ``target``, and return its Gaussians.
 
-    Raises `TrainingError` where there is not exactly one, or where it is no sound 3DGS PLY.
+    Raises `TrainingError` if there is not exactly one such file, or if it is not a valid 3DGS PLY.
     """
     files = _files(output, pattern)
     if len(files) > 1:
@@ -79,10 +79,10 @@ def take_model(output: Path, pattern: str, target: Path) -> Gaussians:
     return gaussians
 
 
-def take_renders(output: Path, pattern: str, by_order: bool, views: Sequence[View], target: Path) -> None:
-    """The pictures below ``output`` that fit ``pattern``, as PNG files of the names of ``views`` in ``target``.
+def collect_renders(output: Path, pattern: str, by_order: bool, views: Sequence[View], target: Path) -> None:
+    """Write the pictures below ``output`` that fit ``pattern`` to ``target``, as PNG files named after ``views``.
 
-    Raises `TrainingError` where a view has none or several, or where one is damaged or of another size.
+    Raises `TrainingError` if a view has no or several pictures, or if a picture is damaged or has another size.
     """
     files = _files(output, pattern)
     names = [file.relative_to(output).as_posix() for file in files]
@@ -104,12 +104,12 @@ def take_renders(output: Path, pattern: str, by_order: bool, views: Sequence[Vie
 
 
 def _files(output: Path, pattern: str) -> list[Path]:
-    """The files that fit ``pattern``, sorted; raises `TrainingError`, naming those that there are, for none."""
+    """The files that fit ``pattern``, sorted; raises `TrainingError` if there are none, naming the existing files."""
     files = sorted(path for path in output.glob(pattern) if path.is_file())
     if not files:
-        there = sorted(path for path in output.rglob("*") if path.is_file())
+        existing = sorted(path for path in output.rglob("*") if path.is_file())
         raise TrainingError(
-            f"it left no {pattern} (densify.result); it wrote {_named(there, output) if there else 'no file'}"
+            f"it left no {pattern} (densify.result); it wrote {_named(existing, output) if existing else 'no file'}"
         )
     return files
 

@@ -1,4 +1,4 @@
-"""Another program, run to its end or to a limit of time, of which nothing is left running."""
+"""Running another program until it ends or its time limit passes, without leaving processes behind."""
 
 import subprocess
 import time
@@ -14,15 +14,15 @@ from gsbench.system.isolate import CrashError, describe_exit, error_tail, run_is
 from gsbench.system.resources import MIB, peak_child_mb
 from gsbench.words import readable_time
 
-SECONDS_BETWEEN_LOOKS = 0.5  # at the memory of the program and its children
-FIRST_LOOK = 0.02  # seconds; the pauses double up to the above, so that a short program is seen too
+SECONDS_BETWEEN_LOOKS = 0.5  # between two measurements of the memory of the program and its children
+FIRST_LOOK = 0.02  # seconds; pauses double up to SECONDS_BETWEEN_LOOKS, so that short programs are measured too
 
 
 @dataclass(frozen=True)
-class Ended:
-    """End of a program: its exit code (negative: by a signal; None: its time was up), and what it took."""
+class ProgramResult:
+    """Exit code, time and memory of a program that has ended."""
 
-    code: int | None
+    code: int | None  # negative: ended by a signal; None: ended by the time limit
     seconds: float
     peak_memory_mb: float  # resident, of the program and its children together
 
@@ -33,11 +33,11 @@ def run_program(
     folder: Path,
     environment: Mapping[str, str],
     limit: float | None,
-) -> Ended:
+) -> ProgramResult:
     """Run ``command`` in ``folder`` with ``environment``, its output in the file ``log``; ``limit`` is in seconds.
 
-    All that it started ends with it, with the limit, and with gsbench, however that ends; daemons do so on Linux.
-    Raises `TrainingError`, with the last words of the log, unless the program ends well and in time.
+    All processes that it started end with it, at the limit, and when gsbench ends for any reason; on Linux this
+    includes daemons. Raises `TrainingError`, with the last lines of the log, unless it succeeds within the limit.
     """
     name = Path(command[0]).name
     try:
@@ -53,27 +53,27 @@ def run_program(
     raise TrainingError(f"{name} {what}; its last lines: {error_tail(log)}; log: {log}")
 
 
-def watch(command: Sequence[str], folder: Path, environment: Mapping[str, str], limit: float | None) -> Ended:
+def watch(command: Sequence[str], folder: Path, environment: Mapping[str, str], limit: float | None) -> ProgramResult:
     """Run ``command`` as a child of this process, which `run_isolated` started, and measure it.
 
-    What a program that is killed here has started itself, `run_isolated` ends.
+    If the program is killed here, `run_isolated` ends the processes that it had started.
     """
     started = time.monotonic()
     program = subprocess.Popen(command, cwd=folder, env=dict(environment), stdin=subprocess.DEVNULL)
     pause, peak = FIRST_LOOK, 0.0
     while limit is None or time.monotonic() - started < limit:
-        peak = max(peak, resident_mb(program.pid))
+        peak = max(peak, resident_memory_mb(program.pid))
         with suppress(subprocess.TimeoutExpired):
             code = program.wait(pause)
-            return Ended(code, time.monotonic() - started, max(peak, peak_child_mb()))
+            return ProgramResult(code, time.monotonic() - started, max(peak, peak_child_mb()))
         pause = min(2 * pause, SECONDS_BETWEEN_LOOKS)
     program.kill()
     program.wait()
-    return Ended(None, time.monotonic() - started, peak)
+    return ProgramResult(None, time.monotonic() - started, peak)
 
 
-def resident_mb(pid: int) -> float:
-    """The memory that a process and its descendants have resident now; MiB, 0 where it is gone."""
+def resident_memory_mb(pid: int) -> float:
+    """The resident memory of a process and its descendants in MiB, 0 if the process has ended."""
     total = 0
     with suppress(psutil.Error):
         program = psutil.Process(pid)

@@ -1,7 +1,7 @@
-"""Another program as an arm: the settings of what trains in place of gsbench.
+"""The settings of another program that trains in place of gsbench.
 
-It is chosen in the group ``densify``, because an arm of a table is an initialiser and a densifier. In its command
-``{name}`` stands for what is known when it runs. Loads no torch.
+It is chosen in the group ``densify``, because an arm of a table is an initialiser and a densifier. A placeholder
+``{name}`` in its command is replaced when it runs. Loads no torch.
 """
 
 import os
@@ -21,22 +21,22 @@ from gsbench.errors import InputError
 from gsbench.settings import MISSING, check_settings
 from gsbench.words import closest
 
-# Placeholders of a command beside the options of its YAML.
+# Placeholders of a command, in addition to the options of its YAML file.
 DATA = "data"  # folder of the training views: images/ and the COLMAP model sparse/0
 TEST_CAMERAS = "test_cameras"  # folder of the test views' cameras: transforms.json and the COLMAP model sparse/0
-OUTPUT = "output"  # empty folder, in which the program also starts
-KNOWN = (DATA, TEST_CAMERAS, OUTPUT, "iterations", "seed", "device", "threads")
-PLACES = (DATA, TEST_CAMERAS, OUTPUT)  # folders, which are absolute
+OUTPUT = "output"  # empty folder, which is also the program's working folder
+PLACEHOLDERS = (DATA, TEST_CAMERAS, OUTPUT, "iterations", "seed", "device", "threads")
+FOLDERS = (DATA, TEST_CAMERAS, OUTPUT)  # absolute paths
 MODEL_SUFFIX = ".ply"
 
 Text = Annotated[str, MinLen(1), Predicate(lambda text: text != MISSING and bool(text.strip())), doc("a text")]
 CommandLine = Annotated[list[str] | str, doc("a list of words, or a text that is split as a shell would")]
 PLACEHOLDER = re.compile(r"\{(\w+)\}")
-Command = str | Sequence[str]  # one text is split as a shell would; none is run
+Command = str | Sequence[str]  # one text is split as a shell would, but no shell runs
 
 
-def words_of(command: Command, key: str) -> list[str]:
-    """A command's words; the setting ``key`` is named in errors. Raises InputError for an empty one, or open quotes."""
+def split_command(command: Command, key: str) -> list[str]:
+    """A command's words. Raises InputError, naming the setting ``key``, for an empty command or open quotes."""
     try:
         words = shlex.split(command) if isinstance(command, str) else [str(word) for word in command]
     except ValueError as error:
@@ -47,30 +47,30 @@ def words_of(command: Command, key: str) -> list[str]:
 
 
 def program_of(command: Command, options: Mapping[str, object], key: str = "densify.command") -> str:
-    """The program that the setting ``key`` runs: its first word, in which ``options`` may stand."""
-    return fill(words_of(command, key)[0], options, key)
+    """The program that the setting ``key`` runs: its first word, with ``options`` filled in."""
+    return fill_placeholders(split_command(command, key)[0], options, key)
 
 
-def names_in(texts: Iterable[str]) -> set[str]:
-    """The placeholders that stand in ``texts``."""
+def placeholders_in(texts: Iterable[str]) -> set[str]:
+    """The names of the placeholders in ``texts``."""
     return {name for text in texts for name in PLACEHOLDER.findall(text)}
 
 
-def fill(text: str, values: Mapping[str, object], key: str) -> str:
-    """``text`` with every placeholder replaced once. Raises InputError, naming ``key``, for one that is not known."""
+def fill_placeholders(text: str, values: Mapping[str, object], key: str) -> str:
+    """Replace every placeholder in ``text`` once. Raises InputError, naming ``key``, for an unknown placeholder."""
 
     def value(match: re.Match[str]) -> str:
         name = match[1]
         if name not in values:
-            there = ", ".join(f"{{{known}}}" for known in values)
-            raise InputError(f"{key}: nothing is known as {{{name}}}{closest(name, values)} (there are {there})")
+            names = ", ".join(f"{{{known}}}" for known in values)
+            raise InputError(f"{key}: nothing is known as {{{name}}}{closest(name, values)} (there are {names})")
         return str(values[name])
 
     return PLACEHOLDER.sub(value, text)
 
 
 def check_pattern(pattern: str) -> None:
-    """Raise InputError for a pattern that can fit no file below a folder."""
+    """Raise InputError for a pattern that cannot fit any file below a folder."""
     key = f"densify.result={pattern}"
     parts = PurePosixPath(pattern).parts
     if (
@@ -91,13 +91,12 @@ def check_pattern(pattern: str) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class External:
-    """A program that trains on a folder of training views and leaves a model, or renders of the test views.
+    """A program that trains on a folder of training views and writes a model, or renders of the test views.
 
-    ``command`` is run without a shell; ``{data}``, ``{output}`` and the other names of `KNOWN`, and those of
-    ``options``, are replaced in it, in ``result`` and in ``environment``. ``result`` is a pattern below the output
-    folder: of one 3DGS PLY, or of the pictures of the test views, whose names are matched (or ``by_order``).
-    ``version`` names the program's version: it is part of the results' key. ``version_command`` prints something that
-    must contain it.
+    ``command`` runs without a shell. ``{data}``, ``{output}``, the other `PLACEHOLDERS` and the names of ``options``
+    are replaced in ``command``, ``result`` and ``environment``. ``result`` is a pattern below the output folder: of one
+    3DGS PLY, or of pictures of the test views, which are matched by name or ``by_order``. ``version`` is the program's
+    version, which is part of the key of its results. The output of ``version_command`` must contain it.
 
     Examples:
         A program ``train.py`` that writes ``point_cloud.ply``:
@@ -120,49 +119,54 @@ class External:
     version: Text
     version_command: CommandLine | None = None
     options: dict[str, Any] = field(default_factory=dict)
-    environment: dict[str, str] = field(default_factory=dict)  # further variables
+    environment: dict[str, str] = field(default_factory=dict)  # additional environment variables
     by_order: bool = False
-    time_limit_minutes: PositiveFloat | None = None  # then the program is ended, and the trial has failed
+    time_limit_minutes: PositiveFloat | None = None  # after it, the program is ended and the trial fails
 
     def __post_init__(self) -> None:
         check_settings(self, "densify")
         for name, value in self.options.items():
             if value == MISSING:
                 raise InputError(f"densify.options.{name} is not set: give it a value")
-            if not str(name).isidentifier() or name in KNOWN or isinstance(value, Mapping | list):
+            if not str(name).isidentifier() or name in PLACEHOLDERS or isinstance(value, Mapping | list):
                 raise InputError(
-                    f"densify.options.{name}: an option is one value with a name of its own, none of {', '.join(KNOWN)}"
+                    f"densify.options.{name}: an option is one value with a name of its own, none of "
+                    f"{', '.join(PLACEHOLDERS)}"
                 )
         check_pattern(
-            fill(self.result, dict.fromkeys(KNOWN, "1") | dict.fromkeys(PLACES, "/") | self.options, "densify.result")
+            fill_placeholders(
+                self.result,
+                dict.fromkeys(PLACEHOLDERS, "1") | dict.fromkeys(FOLDERS, "/") | self.options,
+                "densify.result",
+            )
         )
-        known = dict.fromkeys((*KNOWN, *self.options))
+        known = dict.fromkeys((*PLACEHOLDERS, *self.options))
         for key, text in [("command", word) for word in self.words] + [("result", self.result)]:
-            fill(text, known, f"densify.{key}")
-        if not names_in(self.words) & {DATA}:
+            fill_placeholders(text, known, f"densify.{key}")
+        if not placeholders_in(self.words) & {DATA}:
             raise InputError("densify.command has no {data}: the folder that the program is to train on")
 
     @property
     def words(self) -> list[str]:
         """The command's words, with their placeholders."""
-        return words_of(self.command, "densify.command")
+        return split_command(self.command, "densify.command")
 
     @property
     def leaves_model(self) -> bool:
-        """Return whether the result is a model; else it is pictures."""
+        """Return whether the result is a model instead of pictures."""
         return self.result.lower().endswith(MODEL_SUFFIX)
 
     @property
     def needs_test_cameras(self) -> bool:
-        return TEST_CAMERAS in names_in([*self.words, *self.environment.values()])
+        return TEST_CAMERAS in placeholders_in([*self.words, *self.environment.values()])
 
     @property
     def program(self) -> str:
-        """The program as it is called."""
+        """The program as the command calls it."""
         return program_of(self.command, self.options)
 
     def executable(self) -> str:
-        """The path of the program. Raises InputError where this machine has none."""
+        """The path of the program; raises InputError if this machine does not have it."""
         path = self.environment.get("PATH", os.environ.get("PATH"))
         found = shutil.which(Path(self.program).expanduser(), path=path)
         if found is None:

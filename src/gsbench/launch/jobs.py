@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gsbench.config.compose import Trial
-from gsbench.files import require_own
+from gsbench.files import require_no_links
 from gsbench.launch.serial import Outcome, outcome_of_results
 from gsbench.launch.states import forget_submission
 from gsbench.runs.keys import sha256_of
@@ -108,12 +108,12 @@ def job_folder(values: dict[str, Any]) -> Path:
     """The folder in which the jobs of an experiment write what they print; made if it is not there."""
     runs = TrialFolder.of(values).runs
     folder = runs / JOBS / values["name"]
-    require_own(runs, folder)
+    require_no_links(runs, folder)
     # For each job script submitit leaves a link, which nobody reads again; a link of anybody else's is refused.
     for link in folder.glob(".submission_file_*.sh"):
         if link.is_symlink():
             link.unlink(missing_ok=True)
-    require_own(runs, folder, below=True)
+    require_no_links(runs, folder, below=True)
     folder.mkdir(parents=True, exist_ok=True)
     return folder
 

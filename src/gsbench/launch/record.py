@@ -17,7 +17,7 @@ from pydantic import AfterValidator
 
 from gsbench.config.compose import Trial
 from gsbench.errors import InputError
-from gsbench.files import require_own, write_json, write_text
+from gsbench.files import require_no_links, write_json, write_text
 from gsbench.parsing import DamagedError
 from gsbench.records import Amount, Record, read_typed
 from gsbench.runs.declaration import (
@@ -93,7 +93,7 @@ def remove(home: Path, folders: Iterable[Path]) -> None:
     """
     folders = list(folders)
     for folder in folders:
-        require_own(home.parent, folder)
+        require_no_links(home.parent, folder)
         (folder / RESULTS).unlink(missing_ok=True)  # first, so that no part of a trial is ever taken for all of it
         shutil.rmtree(folder)
     forget(home, folders)

@@ -13,7 +13,7 @@ import torch
 
 from gsbench.config.compose import Trial
 from gsbench.errors import GsbenchError, InputError, TrainingError
-from gsbench.files import link_or_copy, remove_temporaries, require_own, storage_errors, write_json, write_text
+from gsbench.files import link_or_copy, remove_temporaries, require_no_links, storage_errors, write_json, write_text
 from gsbench.init import Sfm
 from gsbench.init.base import PICTURE_FILE, REPORT_FILE
 from gsbench.logs import log_to
@@ -94,8 +94,8 @@ def run_trial(trial: Trial, wait: bool = True) -> TrialRecord:
     reinstall_handlers()
     folder = trial.files
     with storage_errors(folder.runs):
-        folder.require_own()
-        require_own(folder.runs, folder.runs / layout.STORE / layout.VIEWS)
+        folder.require_no_links()
+        require_no_links(folder.runs, folder.runs / layout.STORE / layout.VIEWS)
         folder.path.mkdir(parents=True, exist_ok=True)
         with hold(folder.lock, folder.label, wait), log_to(folder.path / LOG):
             if not folder.why_not_done(trial.values):

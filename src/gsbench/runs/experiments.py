@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 from gsbench.errors import InputError
-from gsbench.files import require_own
+from gsbench.files import require_no_links
 from gsbench.records import Count, Number, Record, Text, Whole, read_typed
 from gsbench.runs.layout import IN_RUNS, TUNING
 
@@ -32,7 +32,7 @@ def experiment_home(runs_dir: Path, name: str) -> Path:
 
 def make_home(home: Path) -> None:
     """Make the folder of an experiment; raises InputError where it is a link."""
-    require_own(home.parent, home)
+    require_no_links(home.parent, home)
     home.mkdir(parents=True, exist_ok=True)
 
 

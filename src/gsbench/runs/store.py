@@ -20,9 +20,9 @@ from gsbench import __version__
 from gsbench.errors import InputError
 from gsbench.files import (
     file_sha256,
-    remove_strange,
+    remove_special_files,
     remove_temporaries,
-    require_own,
+    require_no_links,
     storage_errors,
     sync_to_disk,
     write_json,
@@ -112,7 +112,7 @@ class Store:
         with suppress(ValueError):
             return self._read_verified(final)
         with storage_errors(self.root.parent):
-            require_own(self.root.parent, self.partial(step.stage, step.key))
+            require_no_links(self.root.parent, self.partial(step.stage, step.key))
             final.parent.mkdir(parents=True, exist_ok=True)
             with hold(final.parent / f".{step.key}.lock", f"{step.stage.name} {step.key[:8]}"):
                 if os.path.lexists(final):
@@ -142,7 +142,7 @@ class Store:
                 _remove(partial)
             partial.mkdir(exist_ok=True)
             remove_temporaries(partial)
-            remove_strange(partial)
+            remove_special_files(partial)
             (partial / MANIFEST).unlink(missing_ok=True)
             self.on_build(stage, partial)
             started = time.perf_counter()
@@ -219,7 +219,7 @@ def read_manifest(folder: Path, key: str | None = None, thorough: bool = False) 
 def _is_sound(folder: Path, name: str, recorded: Output, thorough: bool) -> bool:
     path = folder / name
     try:
-        require_own(folder, path)
+        require_no_links(folder, path)
         state = path.stat()
         if not stat.S_ISREG(state.st_mode) or state.st_size != recorded.size:
             return False

@@ -19,9 +19,9 @@ from typing import Any, Literal
 from pydantic_core import to_json
 
 from gsbench.errors import InputError
-from gsbench.files import atomic, require_own
+from gsbench.files import atomic, require_no_links
 from gsbench.parsing import DamagedError, one_line, read_bytes, read_tail, read_yaml
-from gsbench.records import MOST, Amount, Count, Record, read_if_sound, read_typed, typed
+from gsbench.records import MAX_NUMBER, Amount, Count, Record, read_if_sound, read_typed, typed
 from gsbench.runs.keys import config_hash
 from gsbench.runs.layout import (
     BUILDING,
@@ -148,9 +148,9 @@ class TrialFolder:
         hash8, _, seed = self.path.name.partition(SEED)
         return f"{self.path.parent.parent.name}/{self.path.parent.name} seed {seed} ({hash8})"
 
-    def require_own(self) -> None:
+    def require_no_links(self) -> None:
         """Raise InputError where the folder, what is above it, or anything below it is a link, a pipe or a device."""
-        require_own(self.runs, self.path, below=True)
+        require_no_links(self.runs, self.path, below=True)
 
     # ---- state
 
@@ -355,6 +355,6 @@ def _lacking(
 
 def _number(text: str) -> float:
     value = float(text)
-    if not abs(value) <= MOST:
+    if not abs(value) <= MAX_NUMBER:
         raise ValueError(f"{text} is not a measured number")
     return value

@@ -12,7 +12,19 @@ from typing import Annotated, Any, Final, Literal
 from pydantic import AfterValidator, Field, ValidationError
 
 from gsbench.parsing import DamagedError, fault_of, read_bytes
-from gsbench.records import MOST, Amount, Count, Number, Record, Text, Whole, adapter, iterate_rows, misfit, read_typed
+from gsbench.records import (
+    MAX_NUMBER,
+    Amount,
+    Count,
+    Number,
+    Record,
+    Text,
+    Whole,
+    adapter,
+    iterate_rows,
+    misfit,
+    read_typed,
+)
 from gsbench.runs.layout import METRICS, TRAINING
 
 log = logging.getLogger(__name__)
@@ -60,7 +72,7 @@ class MetricRecord(Record):
     direction: Literal[-1, 0, 1] = 0
     decimals: Annotated[int, Field(ge=0, le=12)] = 3
     unit: str = ""
-    worthwhile: Annotated[float, Field(gt=0, le=MOST)] | None = None
+    worthwhile: Annotated[float, Field(gt=0, le=MAX_NUMBER)] | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -38,7 +38,7 @@ class TrackerRun:
     """
 
     def __init__(self, folder: TrialFolder, options: dict[str, Any], values: dict[str, Any]) -> None:
-        folder.require_own()
+        folder.require_no_links()
         self._options, self._trial = options, TrackedTrial(folder, values)
         with ExitStack() as held:
             held.enter_context(hold(folder.path / LOCK, "mirroring", wait=False))

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 from filelock import FileLock
 
 from gsbench.errors import InputError
-from gsbench.files import atomic, require_own, write_json
+from gsbench.files import atomic, require_no_links, write_json
 from gsbench.runs import layout
 from gsbench.runs.layout import ARTIFACTS, DATABASE
 from gsbench.tracking.trial import Scalar, Summary, TrackedTrial
@@ -74,7 +74,7 @@ def connect(uri: str | None, runs: Path) -> MlflowClient:
         logging.getLogger(logger).setLevel(logging.WARNING)
     address = tracker_uri(uri, runs)
     for name in (DATABASE, ARTIFACTS):
-        require_own(runs, runs / name)
+        require_no_links(runs, runs / name)
     with FileLock(runs / LOCK):
         _create_sqlite(address)
         client = mlflow.MlflowClient(tracking_uri=address)  # the first client creates the tables
@@ -120,7 +120,7 @@ def require_own_artifacts(client: MlflowClient, address: str, runs: Path) -> Non
             f"{runs / DATABASE} would send artifacts to {address}; if this runs folder was moved, remove {DATABASE} "
             f"and {ARTIFACTS} there: `gsbench sync` makes them again"
         )
-    require_own(runs, place, below=True)
+    require_no_links(runs, place, below=True)
 
 
 def user_tags() -> dict[str, str]:

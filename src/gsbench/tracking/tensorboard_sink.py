@@ -5,7 +5,7 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
-from gsbench.files import require_own
+from gsbench.files import require_no_links
 from gsbench.runs.layout import TENSORBOARD
 from gsbench.tracking.trial import Scalar, Summary, TrackedTrial
 
@@ -27,7 +27,7 @@ class TensorBoardSink:
             return state
         from torch.utils.tensorboard import SummaryWriter
 
-        require_own(self._trial.folder.runs, self._folder)
+        require_no_links(self._trial.folder.runs, self._folder)
         shutil.rmtree(self._folder, ignore_errors=True)
         self._writer = SummaryWriter(str(self._folder))
         for name, values in (("settings", self._trial.params()), ("trial", self._trial.tags())):

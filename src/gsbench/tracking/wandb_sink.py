@@ -5,7 +5,7 @@ import uuid
 from collections.abc import Sequence
 from typing import Any
 
-from gsbench.files import require_own
+from gsbench.files import require_no_links
 from gsbench.runs.layout import WANDB
 from gsbench.tracking.trial import Scalar, Summary, TrackedTrial
 
@@ -34,7 +34,7 @@ class WandbSink:
 
         trial = self._trial
         folder = trial.folder.runs / WANDB
-        require_own(trial.folder.runs, folder)
+        require_no_links(trial.folder.runs, folder)
         folder.mkdir(exist_ok=True)
         self._run = wandb.init(
             project=trial.values["name"],

@@ -10,7 +10,7 @@ from gsbench.claims.file import ClaimsFile, read_claims
 from gsbench.claims.stopping import KeyAndSeed, run_looks
 from gsbench.config.trust import PERMISSIONS
 from gsbench.errors import InputError
-from gsbench.files import make_runs_folder, place_of, write_text
+from gsbench.files import make_runs_folder, writable_output, write_text
 from gsbench.launch.batch import missing_folders
 from gsbench.launch.dry_run import describe_plan
 from gsbench.launch.record import declare_questions
@@ -76,7 +76,7 @@ def _recheck(file: ClaimsFile, archive: Path, out: Path | None) -> int:
         if out is None:
             print("The whole page says what each verdict rests on: --out PAGE.html")
         else:
-            with place_of(out):
+            with writable_output(out):
                 write_text(out, to_html(page))
             print(out)
     return 0

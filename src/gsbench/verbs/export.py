@@ -7,7 +7,7 @@ from pathlib import Path
 
 from gsbench.analysis.results import load_experiment
 from gsbench.errors import InputError
-from gsbench.files import atomic, place_of
+from gsbench.files import atomic, writable_output
 from gsbench.runs.keys import INIT
 from gsbench.runs.layout import STORE
 from gsbench.settings import is_folder_name
@@ -52,7 +52,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
         raise InputError(f"--out {out} is a folder: name the file to write")
     if not is_init:
         check_form(out)
-    with place_of(out):
+    with writable_output(out):
         if is_init:
             export_init(trial.path.parents[3] / STORE / INIT.name / trial.record.hashes[INIT.name], out)
         else:
@@ -73,7 +73,7 @@ def export_results(name: str, runs: Path, out: Path | None, pictures: bool = Fal
     file = Path(f"{name}.zip") if out is None else out
     if file.is_dir():
         file = file / f"{name}.zip"
-    with place_of(file):
+    with writable_output(file):
         left_out = write_archive(load_experiment(runs, name), file, pictures)
     for line in left_out:
         log.warning("left out: %s", line)

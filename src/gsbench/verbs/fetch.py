@@ -6,9 +6,9 @@ from contextlib import suppress
 from pathlib import Path
 from urllib.parse import urlsplit
 
-from gsbench.datasets.archive import STAGING, fetch_scene, missing_parts, opened
-from gsbench.datasets.catalog import DATA_VARIABLE, Dataset, data_dir, read_catalog, wanted_files
-from gsbench.downloads import Patience
+from gsbench.datasets.archive import STAGING, fetch_scene, missing_parts, open_archive_at
+from gsbench.datasets.catalog import DATA_VARIABLE, PublicDataset, data_dir, read_catalog, wanted_files
+from gsbench.downloads import RetryPolicy
 from gsbench.errors import InputError
 from gsbench.files import remove_temporaries, storage_errors
 from gsbench.logs import progress
@@ -18,7 +18,7 @@ from gsbench.words import closest, is_path, readable_bytes
 
 MIRROR_VARIABLE = "GSBENCH_MIRROR"
 LOCK = ".fetch.lock"
-PATIENCE = Patience()
+PATIENCE = RetryPolicy()
 
 
 def main(argv: Sequence[str], runs: Path) -> int:
@@ -49,7 +49,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
                     print(f"{files.scene}: is here, in {data / files.folder} ({', '.join(files.parts)})")
             where = archive.url if mirror is None else f"{mirror.rstrip('/')}/{archive.name}"
             if unfinished:
-                with opened(where, PATIENCE) as zipped:
+                with open_archive_at(where, PATIENCE) as zipped:
                     for files in unfinished:
                         folder = archive.scenes[files.scene]
                         line = fetch_scene(zipped, folder, where, data, files, PATIENCE, say)
@@ -57,7 +57,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
     return 0
 
 
-def listing(datasets: Sequence[Dataset], data: Path) -> list[str]:
+def listing(datasets: Sequence[PublicDataset], data: Path) -> list[str]:
     """A line for each data set, archive and scene: where it comes from, and whether it is here."""
     lines = []
     for dataset in datasets:
@@ -81,7 +81,7 @@ def _make_folder(data: Path) -> None:
         ) from error
 
 
-def _dataset(catalog: Mapping[str, Dataset], name: str) -> Dataset:
+def _dataset(catalog: Mapping[str, PublicDataset], name: str) -> PublicDataset:
     if name in catalog:
         return catalog[name]
     for dataset in catalog.values():
@@ -90,7 +90,7 @@ def _dataset(catalog: Mapping[str, Dataset], name: str) -> Dataset:
     raise InputError(f"no data set {name!r}{closest(name, list(catalog))} (there are: {', '.join(catalog)})")
 
 
-def _scenes(dataset: Dataset, names: Sequence[str]) -> Sequence[str]:
+def _scenes(dataset: PublicDataset, names: Sequence[str]) -> Sequence[str]:
     for name in names:
         if name not in dataset.scenes:
             raise InputError(

@@ -7,7 +7,7 @@ from pathlib import Path
 from gsbench.analysis.pairing import BASELINE
 from gsbench.analysis.results import load_experiment
 from gsbench.errors import InputError
-from gsbench.files import place_of, write_text
+from gsbench.files import writable_output, write_text
 from gsbench.verbs.arguments import ArgumentParser, path
 
 REPORT_NAME = "report.html"
@@ -33,7 +33,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
     for warning in experiment.warnings:
         print(f"left out: {warning}", file=sys.stderr)
     text = build_report(experiment, options.baseline or BASELINE)
-    with place_of(file):
+    with writable_output(file):
         write_text(file, text)
     print(file)
     return 0

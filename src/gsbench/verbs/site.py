@@ -5,7 +5,7 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from gsbench.files import place_of
+from gsbench.files import writable_output
 from gsbench.verbs.arguments import ArgumentParser, path
 
 DONE, LEFT_OUT = 0, 1
@@ -25,7 +25,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
     parser.add_argument("--title", default="Results of gsbench", help="of its first page")
     options = parser.parse_args(argv)
     page = options.out / INDEX
-    with tempfile.TemporaryDirectory() as scratch, place_of(page):
+    with tempfile.TemporaryDirectory() as scratch, writable_output(page):
         left_out = write_site(options.archives, options.out, options.title, Path(scratch))
     for line in left_out:
         print(f"gsbench: left out: {line}", file=sys.stderr)

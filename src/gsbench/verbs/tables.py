@@ -14,7 +14,7 @@ from gsbench.analysis.results import Arm, Experiment, TrialResult, load_experime
 from gsbench.analysis.table_formats import FORMATS
 from gsbench.analysis.tables import DEFAULT_ROWS, build_table
 from gsbench.errors import InputError
-from gsbench.files import place_of, write_text
+from gsbench.files import writable_output, write_text
 from gsbench.verbs.arguments import ArgumentParser, add_where, names, path
 
 TRIALS = "trials"
@@ -148,6 +148,6 @@ def _write(texts: Mapping[str, str], out: Path | None, name: str) -> None:
     for end, text in texts.items():
         is_file = out.suffix == Path(f"x{end}").suffix and not out.is_dir()
         file = out.with_name(f"{out.stem}{end}") if is_file else out / f"{name}{end}"
-        with place_of(file):
+        with writable_output(file):
             write_text(file, text)
         print(file)

@@ -1,4 +1,4 @@
-"""Pictures of trials from any camera: the render, and with it the initial cloud or what made the large Gaussians."""
+"""Pictures of trials from any camera: the render, the initial cloud, or large Gaussians coloured by their causes."""
 
 import math
 from collections.abc import Sequence
@@ -20,28 +20,26 @@ from gsbench.scene.camera import Camera
 from gsbench.scene.types import View
 from gsbench.view.trials import ViewedTrial
 
-DIMMED = 0.35  # brightness of the render behind Gaussians that are shown by their causes
+DIMMED = 0.35  # brightness of the render behind Gaussians coloured by their causes
 TEXT_COLOR, SHADOW_COLOR = (255, 255, 255), (0, 0, 0)
-TEXT_SIZE = 1 / 36  # of a picture's height; smaller where a word would not fit its pane
+TEXT_SIZE = 1 / 36  # of a picture's height; smaller if a word does not fit its pane
 MARGIN = 0.5  # of the text's size
 Picture = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
 class Layers:
-    """Settings of a picture: ``max_gaussians`` keeps the most opaque (None: all); ``cloud`` shows what the training
-    started from instead; ``causes`` shows those above a volume, each in the colour of what made it.
-    """
+    """Settings of a picture."""
 
     sh_degree: int = MAX_SH_DEGREE
-    max_gaussians: int | None = None
-    causes: bool = False
-    log10_volume: float = math.log10(VOLUME_THRESHOLD)
-    cloud: bool = False
+    max_gaussians: int | None = None  # keep only the most opaque; None: all
+    causes: bool = False  # show the Gaussians above a volume in the colours of their causes
+    log10_volume: float = math.log10(VOLUME_THRESHOLD)  # that volume
+    cloud: bool = False  # show the initial cloud instead of the trained model
 
 
 class TrialPainter:
-    """Draws one trial from any camera; safe to call from several threads, as its rasterizer is."""
+    """Draws one trial from any camera. Like its rasterizer, it can be called from several threads."""
 
     def __init__(self, trial: ViewedTrial, rasterizer: Rasterizer) -> None:
         self.trial, self.rasterizer = trial, rasterizer
@@ -50,7 +48,7 @@ class TrialPainter:
 
     @cached_property
     def _by_opacity(self) -> Gaussians:
-        """A copy with the most opaque first, so that a subset is a slice."""
+        """A copy sorted by opacity, most opaque first, so that a subset is a slice."""
         gaussians = self.trial.gaussians
         return gaussians.select(gaussians.opacity_logits.argsort(descending=True, stable=True))
 
@@ -67,7 +65,7 @@ class TrialPainter:
         return Gaussians(**(self.trial.gaussians.tensors() | {"sh_dc": rgb_to_dc(colors)}))
 
     def draw(self, camera: Camera, layers: Layers) -> Picture:
-        """The trial from ``camera``, [H, W, 3] uint8; without layers, just what the evaluation renders."""
+        """The trial from ``camera``, [H, W, 3] uint8. With default ``layers`` this is the evaluation's render."""
         gaussians = self._initial if layers.cloud else self.trial.gaussians
         limit = layers.max_gaussians
         if not layers.cloud and limit is not None and limit < len(gaussians):
@@ -86,7 +84,7 @@ class TrialPainter:
         return np.flatnonzero(self.trial.log10_volumes > log10_volume)
 
     def counts_above(self, log10_volume: float) -> dict[Cause, int]:
-        """Count the Gaussians above the volume by their causes."""
+        """Count the Gaussians above the volume by cause."""
         counts = np.bincount(self.trial.causes[self.above(log10_volume)], minlength=len(Cause))
         return {cause: int(counts[cause]) for cause in Cause}
 
@@ -96,10 +94,10 @@ class TrialPainter:
 
 
 def photograph_at(camera: Camera, view: View) -> Picture:
-    """The photograph of ``view`` with the intrinsics of ``camera``, black where it shows nothing."""
+    """The photograph of ``view`` resampled for the intrinsics of ``camera``, black outside the photograph."""
     own, photograph = view.camera, Image.fromarray(view.image)
     shrink = max(own.fx / camera.fx, own.fy / camera.fy)
-    if shrink > 1:  # with a filter first, since the transform looks at single pixels
+    if shrink > 1:  # shrink with a filter first, because the transform below only interpolates neighbouring pixels
         own = own.resized(max(1, round(own.width / shrink)), max(1, round(own.height / shrink)))
         photograph = photograph.resize((own.width, own.height), Image.Resampling.BOX)
     sx, sy = own.fx / camera.fx, own.fy / camera.fy  # photograph pixels for one of the picture
@@ -109,7 +107,7 @@ def photograph_at(camera: Camera, view: View) -> Picture:
 
 
 def side_by_side(panes: Sequence[tuple[str, Picture]]) -> Picture:
-    """Labelled pictures of one height, left to right."""
+    """Labelled pictures of the same height, from left to right."""
     row = np.hstack([picture for _, picture in panes])
     image = Image.fromarray(row)
     draw = ImageDraw.Draw(image)
@@ -126,11 +124,11 @@ def side_by_side(panes: Sequence[tuple[str, Picture]]) -> Picture:
 
 
 def _fitted(label: str, size: float, width: int) -> tuple[str, float]:
-    """The label in lines that fit into ``width`` px, and its text's size, smaller where a single word would not fit."""
+    """The label in lines that fit into ``width`` px, and the text size, which is reduced if a word does not fit."""
     length, room = ImageFont.load_default(size).getlength, width - 2 * MARGIN * size
-    first, *others = label.split()
+    first, *rest = label.split()
     lines = [first]
-    for word in others:
+    for word in rest:
         if length(f"{lines[-1]} {word}") <= room:
             lines[-1] += f" {word}"
         else:

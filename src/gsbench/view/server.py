@@ -1,7 +1,7 @@
-"""The viewer's page: viser carries the camera and the controls, gsbench's own rasterizer draws.
+"""The viewer's page: viser handles camera and controls, gsbench's rasterizers draw the pictures.
 
-One trial fills the page; two stand side by side under one camera. Everything on the page is drawn here, so that what is
-seen is what was evaluated, in any browser.
+One trial fills the page; two are shown side by side from the same camera. Because all pictures are drawn here, the page
+shows what was evaluated in any browser.
 """
 
 import logging
@@ -22,31 +22,31 @@ from gsbench.gaussians.paper_values import VOLUME_THRESHOLD
 from gsbench.scene.camera import Camera
 from gsbench.scene.types import View
 from gsbench.view.picture import Layers, Picture, TrialPainter, photograph_at, side_by_side
-from gsbench.view.visitors import only_welcome_visitors
+from gsbench.view.visitors import refuse_other_pages
 
 log = logging.getLogger(__name__)
 
-HOST = "127.0.0.1"  # nobody but this machine
+HOST = "127.0.0.1"  # only this machine can connect
 FREE_VIEW = "free"
 MOVING_HEIGHT = 240  # px while the camera moves
 HEIGHTS = ("270", "540", "810")  # px when it rests
-REST_SECONDS = 0.25  # after the last change the sharp picture is drawn
+REST_SECONDS = 0.25  # without a change, after which the sharp picture is drawn
 DEFAULT_THRESHOLD = math.log10(VOLUME_THRESHOLD)
-MAX_ASPECT = 10.0  # of a page: its width decides how large a picture is made
+MAX_ASPECT = 10.0  # of a page, whose width decides the size of the picture
 MIN_FOV = 1e-3  # radians
 MAX_DISTANCE = 1e9  # world units
-SHARES = (1, 100)  # %, of the Gaussians, the most opaque first
+SHARES = (1, 100)  # %, range of the share of Gaussians that is drawn, most opaque first
 
 
 class Viewer:
-    """Serves ``painters`` (one or two) on a loopback port until ``stop``; port 0 picks a free one."""
+    """Serves ``painters`` (one or two) on a loopback port until ``stop``; port 0 selects a free port."""
 
     def __init__(self, painters: Sequence[TrialPainter], port: int) -> None:
         import viser
 
         self.painters = tuple(painters)
         self.views: dict[str, View] = {view.name: view for view in painters[0].trial.views}
-        with only_welcome_visitors():
+        with refuse_other_pages():
             self.server: Any = viser.ViserServer(host=HOST, port=port or free_port(), verbose=False)
         self.server.gui.configure_theme(control_layout="collapsible", show_logo=False, show_share_button=False)
         self.server.scene.set_up_direction(mean_up(painters[0].trial.views))
@@ -66,7 +66,7 @@ class Viewer:
         self.server.stop()
 
     def draw(self, camera: Camera, layers: Layers, view: View | None) -> Picture:
-        """The page's picture: one pane for each trial and, with ``view``, its photograph; all from ``camera``."""
+        """The page's picture from ``camera``: one pane for each trial and, if ``view`` is given, its photograph."""
         panes = [] if view is None else [(f"photograph {view.name}", photograph_at(camera, view))]
         for painter in self.painters:
             label = f"{painter.trial.label}: {len(painter.trial.gaussians):,} Gaussians"
@@ -74,7 +74,7 @@ class Viewer:
         return side_by_side(panes)
 
     def layers(self) -> Layers:
-        """The layers that the controls ask for."""
+        """The layers selected by the controls."""
         return Layers(
             sh_degree=min(max(int(self._degree.value), 0), MAX_SH_DEGREE),
             causes=bool(self._causes.value),
@@ -95,7 +95,7 @@ class Viewer:
         lowest = min(float(painter.trial.log10_volumes.min()) for painter in self.painters)
         highest = max(float(painter.trial.log10_volumes.max()) for painter in self.painters)
         lowest, highest = math.floor(min(lowest, DEFAULT_THRESHOLD)), math.ceil(max(highest, DEFAULT_THRESHOLD))
-        # Closed where it can be: on a narrow page the panel lies over the picture.
+        # Most folders start closed, because the panel covers the picture on a narrow page.
         with gui.add_folder("Test views"):
             self._view = gui.add_dropdown("View", (FREE_VIEW, *self.views), initial_value=next(iter(self.views)))
             self._beside = gui.add_checkbox("Photograph beside", True)
@@ -113,7 +113,7 @@ class Viewer:
             control.on_update(lambda _: self._redraw())
         self._threshold.on_update(lambda _: self._update_threshold())
         self._view.on_update(self._go_to_view)
-        self._beside.on_update(self._go_to_view)  # the panes change their width
+        self._beside.on_update(self._go_to_view)  # because the width of the panes changes
 
     def _legend_text(self) -> str:
         volume = 10 ** float(self._threshold.value)
@@ -154,7 +154,7 @@ class Viewer:
 
 
 class Session:
-    """One browser page: a thread that draws the newest state, coarsely while it changes and sharply when it rests."""
+    """One browser page, whose thread draws the newest state: coarsely while it changes, sharply when it rests."""
 
     def __init__(self, viewer: Viewer, client: Any) -> None:
         self.viewer, self.client = viewer, client
@@ -176,7 +176,7 @@ class Session:
             self._thread.join(timeout=10)
 
     def go_to(self, view: View) -> None:
-        """Put the page's camera where ``view`` was taken, with a field of view that shows all of it."""
+        """Move the page's camera to that of ``view``, with a field of view that shows the whole view."""
         own, camera = view.camera, self.client.camera
         aspect = float(camera.aspect or 1.0) / self._panes()
         forward = own.rotation[2]  # [3] world
@@ -204,7 +204,7 @@ class Session:
         try:
             camera = page_camera(page.wxyz, page.position, page.fov, page.aspect, height, self._panes())
             image = self.viewer.draw(camera, self.viewer.layers(), self.viewer.photograph())
-        except Exception as error:  # noqa: BLE001 - a page may send anything, and the next picture is wanted all the same
+        except Exception as error:  # noqa: BLE001 - a page may send any values, and they must not end this thread
             log.debug("view: %r", error)
             return
         if not self._stopped.is_set():
@@ -212,7 +212,7 @@ class Session:
 
 
 def layers_of(layers: Layers, painter: TrialPainter, share: float) -> Layers:
-    """``layers`` with ``share`` per cent of the Gaussians of this trial."""
+    """``layers`` limited to ``share`` per cent of this trial's Gaussians."""
     count = len(painter.trial.gaussians)
     return layers if share >= SHARES[1] else replace(layers, max_gaussians=max(1, round(share / 100 * count)))
 
@@ -222,13 +222,13 @@ def page_camera(
 ) -> Camera:
     """The camera of one of ``panes`` equal panes of a page.
 
-    ``wxyz`` turns camera axes (x right, y down, z forward) to the world, ``position`` [3] is in world units,
-    ``fov`` the vertical field of view in radians, ``aspect`` the page's width over its height; ``height`` in px.
-    Raises ValueError for what is no camera, or a page too wide to be drawn.
+    ``wxyz`` rotates camera axes (x right, y down, z forward) to the world, and ``position`` [3] is in world units.
+    ``fov`` is the vertical field of view in radians, ``aspect`` the page's width over its height, ``height`` in px.
+    Raises ValueError for values that are no camera, or a page that is too wide.
     """
     numbers = np.concatenate([np.ravel(wxyz), np.ravel(position), [fov, aspect]]).astype(np.float64)
     length = float(np.linalg.norm(numbers[:4]))
-    # A page may send anything: each value here decides memory, or a division.
+    # A page may send any values. Each of them decides the memory of a picture, or is a divisor.
     if not np.isfinite(numbers).all() or np.abs(numbers).max() > MAX_DISTANCE or length < 1e-6:
         raise ValueError("the page has no camera")
     if not (MIN_FOV < fov < math.pi - MIN_FOV and 1 / MAX_ASPECT < aspect < MAX_ASPECT):
@@ -241,7 +241,7 @@ def page_camera(
 
 
 def fitting_fov(camera: Camera, aspect: float) -> float:
-    """The vertical field of view (radians) with which a pane of ``aspect`` shows all that ``camera`` sees."""
+    """The vertical field of view (radians) with which a pane of ``aspect`` shows the whole image of ``camera``."""
     half_height = max(camera.cy, camera.height - camera.cy) / camera.fy
     half_width = max(camera.cx, camera.width - camera.cx) / camera.fx
     return 2 * math.atan(max(half_height, half_width / aspect))
@@ -255,9 +255,9 @@ def mean_up(views: Sequence[View]) -> NDArray[np.float64]:
 
 
 def level_up(camera: Camera, up: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The upward direction nearest to ``up`` that leaves the picture of ``camera`` upright, a unit vector [3].
+    """The upward direction nearest to ``up`` that keeps the picture of ``camera`` upright, a unit vector [3].
 
-    A page turns around its upward direction: with the picture's own, the horizon would tilt.
+    A page rotates around its upward direction. Around the camera's own one, the horizon would tilt.
     """
     right = camera.rotation[0]
     level = up - (up @ right) * right
@@ -267,13 +267,13 @@ def level_up(camera: Camera, up: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def orbit_distance(views: Sequence[View]) -> float:
-    """The distance from a page's camera to its pivot: the mean distance of the views to their centre, world units."""
+    """The distance from a page's camera to its pivot: the mean distance of the views from their centre, world units."""
     centers = np.stack([view.camera.center for view in views])  # [V, 3]
     return max(float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).mean()), 1e-3)
 
 
 def free_port() -> int:
-    """A port of the loopback interface that nobody uses now."""
+    """A port of the loopback interface that is free now."""
     import socket
 
     with socket.socket() as probe:
@@ -282,7 +282,7 @@ def free_port() -> int:
 
 
 def check_port(port: int) -> None:
-    """Raise InputError where ``port`` cannot be used (0: any free one)."""
+    """Raise InputError if ``port`` cannot be used (0 means any free port)."""
     import socket
 
     with socket.socket() as probe:

@@ -1,4 +1,4 @@
-"""Trials as the viewer needs them, read from their folders and from the initial models in the store."""
+"""Reading trials for the viewer, from their folders and from the initial models in the store."""
 
 import zipfile
 import zlib
@@ -33,10 +33,11 @@ from gsbench.view import ADDRESS
 
 @dataclass(frozen=True)
 class ViewedTrial:
-    """A trained model with what can be drawn beside it.
+    """A trained model with everything that the viewer draws.
 
-    ``causes`` [N] holds the ``Cause`` that made each Gaussian and ``log10_volumes`` [N] its volume (world units^3);
-    ``cloud`` is the initial one; ``views`` are the test views with the cameras and photographs of the evaluation.
+    ``causes`` [N] are the values of ``Cause`` of the Gaussians, and ``log10_volumes`` [N] their volumes (world
+    units^3). ``cloud`` is the initial cloud. ``views`` are the test views with the evaluation's cameras and
+    photographs.
     """
 
     label: str
@@ -49,9 +50,9 @@ class ViewedTrial:
 
 
 def find_trial(address: str, runs: Path) -> TrialResult:
-    """The trial at ``address`` (see ``ADDRESS``), of several seeds the first.
+    """The trial at ``address`` (see ``ADDRESS``); if several seeds match, the first.
 
-    Raises InputError where there is none, and where several arms answer to it.
+    Raises InputError if there is no such trial, or if several arms match.
     """
     folder = Path(address).expanduser()
     if folder.is_dir():
@@ -88,14 +89,14 @@ def _trial_in(folder: Path) -> TrialResult:
 
 
 def model_file(trial: TrialResult) -> Path:
-    """The PLY of a trial's Gaussians; raises InputError for a trial that has none."""
+    """The PLY file of a trial's Gaussians; raises InputError for a trial without a model."""
     if trial.from_renders:
         raise InputError(f"{trial.label} was evaluated from renders: it has no model")
     return trial.path / POINT_CLOUD
 
 
 def load_viewed(trial: TrialResult, device: torch.device) -> ViewedTrial:
-    """Read what the viewer draws of ``trial``; raises InputError naming the file that is missing or damaged."""
+    """Read everything that the viewer draws of ``trial``; raises InputError naming a missing or damaged file."""
     gaussians = read_ply(model_file(trial), device)
     model_dir = _model_folder(trial)
     background = trial.config.get("train.background", (0.0, 0.0, 0.0))
@@ -111,7 +112,7 @@ def load_viewed(trial: TrialResult, device: torch.device) -> ViewedTrial:
 
 
 def read_causes(path: Path, num_gaussians: int) -> NDArray[np.uint8]:
-    """The cause that made each living Gaussian, [N], from ``lineage.npz``."""
+    """The cause of each remaining Gaussian, [N], from ``lineage.npz``."""
     try:
         with np.load(path) as lineage:
             causes = lineage["causes"][lineage["ids"]]
@@ -131,7 +132,7 @@ def _model_folder(trial: TrialResult) -> Path:
 
 
 def read_test_views(trial: TrialResult, model_dir: Path) -> tuple[View, ...]:
-    """The test views in the order of their names: ground truth and camera as the evaluation used them."""
+    """The test views in the order of their names, with the photographs and cameras of the evaluation."""
     import pycolmap
 
     model = read_model(model_dir)

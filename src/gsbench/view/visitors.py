@@ -1,7 +1,8 @@
-"""Visitors that the viewer admits: its own page, and programs of this machine that are no page of a browser.
+"""Access control of the viewer: only its own page and local programs that are not web pages may connect.
 
-A browser lets any web page connect to this machine. Of a page it tells the server where it came from (``Origin``), and
-what the server was called (``Host``), which a name of the page's own that leads here gives away (DNS rebinding).
+A browser lets any web page connect to servers of this machine. It sends the page's origin (``Origin``) and the name
+under which the page called the server (``Host``), which reveals a foreign name that resolves to this machine (DNS
+rebinding).
 """
 
 import http
@@ -14,29 +15,29 @@ from urllib.parse import urlsplit
 from gsbench.errors import GsbenchError
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
-SERVE = "websockets.asyncio.server.serve"  # what viser starts its server with
+SERVE = "websockets.asyncio.server.serve"  # the function with which viser starts its server
 
 
-def is_welcome(hosts: list[str], origins: list[str]) -> bool:
-    """Return whether ``Host`` and ``Origin`` headers are those of the viewer's own page, or of no page.
+def is_own_page(hosts: list[str], origins: list[str]) -> bool:
+    """Return whether ``Host`` and ``Origin`` headers belong to the viewer's own page or to a program without a page.
 
-    The port may be another one, as where a connection is forwarded, but page and server must have the same.
+    Any port is allowed, since connections may be forwarded, but both headers must have the same port.
     """
     if len(hosts) != 1 or len(origins) > 1:
         return False
     try:
         if urlsplit(f"//{hosts[0]}").hostname not in LOOPBACK:
             return False
-    except ValueError:  # such as an open bracket
+    except ValueError:  # not an address, for example with an open bracket
         return False
     return not origins or origins[0] == f"http://{hosts[0]}"
 
 
 @contextmanager
-def only_welcome_visitors() -> Iterator[None]:
-    """Let the server that viser starts within the block refuse all others, pages and connections alike.
+def refuse_other_pages() -> Iterator[None]:
+    """Make the server that viser starts within the block refuse foreign pages, for files and for connections.
 
-    Raises GsbenchError where viser has started none in the way that is known here.
+    Raises GsbenchError if viser did not start its server through `SERVE`.
     """
     import websockets.asyncio.server
     from websockets.datastructures import Headers
@@ -46,7 +47,7 @@ def only_welcome_visitors() -> Iterator[None]:
 
     def guarded(*words: Any, process_request: Callable[..., Any] | None = None, **settings: Any) -> Any:
         def process(connection: Any, request: Any) -> Any:
-            if not is_welcome(request.headers.get_all("Host"), request.headers.get_all("Origin")):
+            if not is_own_page(request.headers.get_all("Host"), request.headers.get_all("Origin")):
                 return Response(http.HTTPStatus.FORBIDDEN, "FORBIDDEN", Headers(), b"")
             return None if process_request is None else process_request(connection, request)
 

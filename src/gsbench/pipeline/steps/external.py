@@ -17,9 +17,9 @@ import numpy as np
 
 from gsbench.densify import Lineage
 from gsbench.errors import InputError, TrainingError
-from gsbench.external.exchange import take_model, take_renders, write_test_cameras, write_training_views
+from gsbench.external.exchange import collect_model, collect_renders, write_test_cameras, write_training_views
 from gsbench.external.program import run_program
-from gsbench.external.settings import DATA, OUTPUT, TEST_CAMERAS, External, fill, words_of
+from gsbench.external.settings import DATA, OUTPUT, TEST_CAMERAS, External, fill_placeholders, split_command
 from gsbench.files import write_json
 from gsbench.init import read_cloud
 from gsbench.init.base import MODEL_FOLDER
@@ -72,7 +72,7 @@ def external_step(views: Views, trainer: External, parts: Parts) -> Step:
         values = {name: str(place.resolve()) for name, place in places.items()} | trainer.options
         values |= {"iterations": iterations, "seed": seed, "device": str(device), "threads": threads}
         placeholders = {name: f"{{{name}}}" for name in places}  # for the record: the build's folders vanish
-        command = [executable, *(fill(word, values, "densify.command") for word in trainer.words[1:])]
+        command = [executable, *(fill_placeholders(word, values, "densify.command") for word in trainer.words[1:])]
         environment = environment_of(trainer, values)
         version_output = check_version(trainer, values, environment)
         places[OUTPUT].mkdir(parents=True)
@@ -87,7 +87,7 @@ def external_step(views: Views, trainer: External, parts: Parts) -> Step:
             for place in (DATA, TEST_CAMERAS):
                 shutil.rmtree(places[place], ignore_errors=True)
         log.info("train: %s ended after %s", trainer.program, readable_time(ended.seconds))
-        pattern = fill(trainer.result, values, "densify.result")
+        pattern = fill_placeholders(trainer.result, values, "densify.result")
         with naming_the_program(trainer, log_file):
             summary = take_result(trainer, pattern, views, places[OUTPUT], folder)
         shutil.rmtree(work)
@@ -105,7 +105,9 @@ def external_step(views: Views, trainer: External, parts: Parts) -> Step:
                 "program": trainer.program,
                 "version": trainer.version,
                 "said": version_output,
-                "command": [fill(word, values | placeholders, "densify.command") for word in trainer.words],
+                "command": [
+                    fill_placeholders(word, values | placeholders, "densify.command") for word in trainer.words
+                ],
             },
         }
         write_json(folder / TRAINING, summary)
@@ -118,9 +120,9 @@ def external_step(views: Views, trainer: External, parts: Parts) -> Step:
 def take_result(trainer: External, pattern: str, views: Views, output: Path, folder: Path) -> dict[str, Any]:
     """Keep in ``folder`` what the program left in ``output``; returns facts for the training's summary."""
     if not trainer.leaves_model:
-        take_renders(output, pattern, trainer.by_order, views.scene.test, folder / RENDERS)
+        collect_renders(output, pattern, trainer.by_order, views.scene.test, folder / RENDERS)
         return {"evaluated_from": FROM_RENDERS, "num_gaussians": None, "causes": {}}
-    gaussians = take_model(output, pattern, folder / POINT_CLOUD)
+    gaussians = collect_model(output, pattern, folder / POINT_CLOUD)
     lineage = Lineage(len(gaussians))  # without causes: which rule made a Gaussian is unknown here
     state: dict[str, Any] = {name: tensor.numpy() for name, tensor in lineage.state_dict().items()}
     np.savez_compressed(folder / LINEAGE, **state)
@@ -145,7 +147,8 @@ def environment_of(trainer: External, values: Mapping[str, object]) -> dict[str,
         if not name.startswith(OWN_VARIABLES) and (name, value) != SAFE_PATH
     }
     return inherited | {
-        name: fill(text, values, f"densify.environment.{name}") for name, text in trainer.environment.items()
+        name: fill_placeholders(text, values, f"densify.environment.{name}")
+        for name, text in trainer.environment.items()
     }
 
 
@@ -157,7 +160,7 @@ def check_version(trainer: External, values: Mapping[str, object], environment: 
     if trainer.version_command is None:
         return None
     key = "densify.version_command"
-    command = [fill(word, values, key) for word in words_of(trainer.version_command, key)]
+    command = [fill_placeholders(word, values, key) for word in split_command(trainer.version_command, key)]
     try:
         # In an empty folder: `python -c` would import modules that lie in the current one.
         with tempfile.TemporaryDirectory(prefix="gsbench-version-") as empty:
