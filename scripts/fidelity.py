@@ -29,25 +29,27 @@ PAGE = ROOT / "docs" / "fidelity.md"
 ROW = re.compile(r"^\| `(\w+)` \|.*\| (0|1e-\d+) \|[^|]*\|$", re.MULTILINE)
 HEAD = """# How near each arm is to its source
 
-`scripts/fidelity.py --write` makes this page from the facts at the end of each arm's file in `conf/densify/`; a test
-makes it again and compares. We read the sources for facts; we copied nothing and ran none of them. Each row says: we
-wrote the source's rules a second time, one Gaussian at a time in numpy (`tests/densify/`), as we understood them. On
-random Gaussians with uneven Adam moments, gsbench's arm did the same: the same Gaussians in the same order, the same
-parameters and moments, the same counts. The largest difference is relative to the larger of 1 and the value, in
-float64, rounded up to a power of ten. Random draws come from gsbench's generator; a source draws others.
+We read the sources for facts; we copied nothing and ran none of them. Then we wrote each source's rules a second time,
+as we understood them: one Gaussian at a time in numpy (`tests/densify/`). Each row says how far gsbench's arm is from
+that restatement, on random Gaussians with uneven Adam moments. Both give the same Gaussians in the same order, with the
+same counts, parameters and moments, up to the largest difference. It is relative to the larger of 1 and the value, in
+float64, rounded up to a power of ten. Random numbers come from gsbench's generator; a source draws others.
 
-| `densify=` | source | compared | largest difference | not implemented, or otherwise |
+`scripts/fidelity.py --write` makes this page from the facts at the end of each arm's file in `conf/densify/`. A test
+makes it again and compares.
+
+| `densify=` | source | compared | largest difference | not implemented, or different |
 |---|---|---|---|---|
 """
 TAIL = """
 Rasterizer and optimiser are compared elsewhere: every executor with the float64 reference (`tests/raster`), the
 learning rates and the schedule in `tests/pipeline`. `conf/train/` has presets of learning rates, with their sources.
 
-`tests/train/test_resolution.py` states DashGaussian's schedule of sizes again (`train.resolution_schedule`;
-YouyuChen0207/DashGaussian 4e3b560, `utils/schedule_utils.py`, `train_dash.py:75`, `:182`): the same size at every
-iteration. The differences: DashGaussian prunes before it grows, by opacity alone, and growth at the limit replaces the
-pruned Gaussians; clones and splits each take the whole allowance; the window over a spectrum of odd sides is a pixel
-off its mean. Here small pictures have 8 bits.
+`tests/train/test_resolution.py` restates DashGaussian's schedule of sizes (`train.resolution_schedule`;
+YouyuChen0207/DashGaussian 4e3b560, `utils/schedule_utils.py`, `train_dash.py:75`, `:182`): the size is the same at
+every iteration. The differences: DashGaussian prunes before it grows, by opacity only, and growth at the limit replaces
+the pruned Gaussians. Its clones and splits each take the whole allowance. Its window over a spectrum of odd sides is
+one pixel off the mean. In gsbench small pictures have 8 bits.
 """
 
 
