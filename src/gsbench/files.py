@@ -248,11 +248,11 @@ def _is_write_error(error: BaseException) -> bool:
 
 
 def _free(folder: Path) -> int:
-    place = folder
-    while not place.exists() and place != place.parent:
-        place = place.parent
+    existing = folder
+    while not existing.exists() and existing != existing.parent:
+        existing = existing.parent
     try:
-        usage = shutil.disk_usage(place)
+        usage = shutil.disk_usage(existing)
     except OSError:
         return NEARLY_NOTHING
     return usage.free if usage.total else NEARLY_NOTHING  # file systems without a size, such as /proc, are never full

@@ -212,8 +212,8 @@ def _named_fault(value: Any, place: str = "", depth: int = 0) -> str:
     if isinstance(value, dict) and (fault := _fault_of_keys(value)):
         return f"{place or 'it'} has {fault}"
     entries = value.items() if isinstance(value, dict) else enumerate(value)
-    found = (_named_fault(item, f"{place}.{key}" if place else str(key), depth + 1) for key, item in entries)
-    return next((fault for fault in found if fault), "")
+    faults = (_named_fault(item, f"{place}.{key}" if place else str(key), depth + 1) for key, item in entries)
+    return next((fault for fault in faults if fault), "")
 
 
 def _fault_of_leaf(item: Any) -> str:

@@ -62,8 +62,8 @@ def find_weights(spec: WeightsFile, folder: Path | None = None, download: bool =
 def find_all_weights(specs: Sequence[WeightsFile], folder: Path | None = None, download: bool = True) -> list[Path]:
     """Find several files as `find_weights` does; one error names all that are missing."""
     folders = _search_folders(folder)
-    found = {spec: _find_local(spec, folders) for spec in specs}
-    missing = [spec for spec, path in found.items() if path is None]
+    paths = {spec: _find_local(spec, folders) for spec in specs}
+    missing = [spec for spec, path in paths.items() if path is None]
     reasons = []
     for spec in missing:
         if not download:
@@ -72,13 +72,13 @@ def find_all_weights(specs: Sequence[WeightsFile], folder: Path | None = None, d
             reasons.append("it has no address to download from")
         else:
             try:
-                found[spec] = _download(spec, hub_cache())
+                paths[spec] = _download(spec, hub_cache())
             except (OSError, GsbenchError) as error:
                 if isinstance(error, MissingWeights):  # the downloaded file is damaged
                     raise
                 reasons.append(f"the download failed: {error}")
                 break  # without a network, each further download would fail as slowly
-    still_missing = [spec for spec in missing if found[spec] is None]
+    still_missing = [spec for spec in missing if paths[spec] is None]
     if still_missing:
         names = ", ".join(spec.names[0] for spec in still_missing)
         sources = ", ".join(spec.url or spec.source for spec in still_missing)
@@ -87,7 +87,7 @@ def find_all_weights(specs: Sequence[WeightsFile], folder: Path | None = None, d
             f"weights not found: {names} (looked in {places}; {reasons[0]}): get them from {sources}, put them into a "
             f"folder and set {WEIGHTS_VARIABLE} to it"
         )
-    return [path for spec in specs if (path := found[spec]) is not None]
+    return [path for spec in specs if (path := paths[spec]) is not None]
 
 
 def digests_of_unpinned(specs: Sequence[WeightsFile], folder: Path | None = None) -> list[str]:
@@ -96,15 +96,15 @@ def digests_of_unpinned(specs: Sequence[WeightsFile], folder: Path | None = None
     Such a file can be any file of the right shapes. Files in the torch hub cache were downloaded from the address.
     """
     users = [(place, sub_folders) for place, sub_folders in _search_folders(folder) if place != hub_cache()]
-    found = [_find_local(spec, users) for spec in specs if spec.sha256 is None]
-    return [file_sha256(path) for path in found if path is not None]
+    paths = [_find_local(spec, users) for spec in specs if spec.sha256 is None]
+    return [file_sha256(path) for path in paths if path is not None]
 
 
 def _find_local(spec: WeightsFile, folders: Sequence[tuple[Path, bool]]) -> Path | None:
     """The first file with the right checksum; raises ``MissingWeights`` if all files found have a wrong one."""
     faults = []
-    for place, sub_folders in folders:
-        for path in _candidates(place, spec.names, sub_folders):
+    for folder, sub_folders in folders:
+        for path in _candidates(folder, spec.names, sub_folders):
             fault = _checksum_fault(path, spec)
             if fault is None:
                 return path
@@ -163,20 +163,20 @@ def _search_folders(folder: Path | None) -> list[tuple[Path, bool]]:
     return folders
 
 
-def _candidates(place: Path, names: tuple[str, ...], sub_folders: bool) -> list[Path]:
-    direct = [place / name for name in names]
-    below = [path for name in names for path in sorted(place.rglob(name))] if sub_folders and place.is_dir() else []
-    found = [path for path in direct + below if path.is_file()]
-    return list(dict.fromkeys(found))
+def _candidates(folder: Path, names: tuple[str, ...], sub_folders: bool) -> list[Path]:
+    direct = [folder / name for name in names]
+    below = [path for name in names for path in sorted(folder.rglob(name))] if sub_folders and folder.is_dir() else []
+    files = [path for path in direct + below if path.is_file()]
+    return list(dict.fromkeys(files))
 
 
 def _checksum_fault(path: Path, spec: WeightsFile) -> str | None:
     if spec.sha256 is None:
         return None
-    found = file_sha256(path)
-    if found.startswith(spec.sha256.lower()):
+    sha256 = file_sha256(path)
+    if sha256.startswith(spec.sha256.lower()):
         return None
-    return f"weights file {path} has sha256 {found[:16]}…, expected {spec.sha256[:16]}…: wrong or truncated"
+    return f"weights file {path} has sha256 {sha256[:16]}…, expected {spec.sha256[:16]}…: wrong or truncated"
 
 
 def _download(spec: WeightsFile, folder: Path) -> Path:

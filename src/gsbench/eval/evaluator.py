@@ -112,7 +112,7 @@ class Evaluator:
                 value = metric.measure(image, target)
         except UnavailableError:
             raise
-        except SystemExit as error:
+        except SystemExit as error:  # would end gsbench without a message
             raise InputError(f"eval.extra.{key} ended the process (exit code {error.code}): it must return") from error
         except Exception as error:
             if key not in self.own:

@@ -168,10 +168,10 @@ class External:
     def executable(self) -> str:
         """The path of the program; raises InputError if this machine does not have it."""
         path = self.environment.get("PATH", os.environ.get("PATH"))
-        found = shutil.which(Path(self.program).expanduser(), path=path)
-        if found is None:
+        program_path = shutil.which(Path(self.program).expanduser(), path=path)
+        if program_path is None:
             raise InputError(
                 f"densify.command: this machine has no program {self.program!r}: install it (docs/other_trainers.md "
                 "says how), or give its path"
             )
-        return str(Path(found).absolute())
+        return str(Path(program_path).absolute())

@@ -210,35 +210,37 @@ def write_result(model: pycolmap.Reconstruction, report: InitReport, output_dir:
 
 def find_warnings(report: InitReport, model: pycolmap.Reconstruction) -> tuple[str, ...]:
     """List the reasons to doubt a model, one line each. A model can be wrong although all its images have poses."""
-    found = []
+    warnings = []
     if report.num_registered < REGISTERED_SHARE * report.num_images:
         missing = ", ".join(report.unregistered[:5]) + (" …" if len(report.unregistered) > 5 else "")
-        found.append(
+        warnings.append(
             f"only {report.num_registered} of {report.num_images} images have a pose (missing: {missing}): "
             "the other photos are not used; more overlap or texture would help"
         )
     if report.num_points < FEW_POINTS:
-        found.append(f"only {report.num_points} points: training starts from next to nothing")
+        warnings.append(f"only {report.num_points} points: training starts from next to nothing")
     error = report.mean_reprojection_error
     if error is not None and error > REPROJECTION_WARNING_PX:
-        found.append(f"mean reprojection error {error:.2f} px is large: the cameras or the matches are probably wrong")
+        warnings.append(
+            f"mean reprojection error {error:.2f} px is large: the cameras or the matches are probably wrong"
+        )
     poses = report.pose_errors
     if poses is not None:
         truth = "true" if poses.exact else "reference"
         if poses.rotation_mean_deg > ROTATION_WARNING_DEG:
-            found.append(
+            warnings.append(
                 f"the cameras are turned {poses.rotation_mean_deg:.1f} degrees against the {truth} ones on average: "
                 "the model is wrong although its images are placed (views at most 7.5 degrees apart are safe)"
             )
         if poses.center_rmse_relative is not None and poses.center_rmse_relative > CENTER_WARNING:
-            found.append(
+            warnings.append(
                 f"the cameras are {poses.center_rmse_relative:.1%} of the scene extent away from the {truth} ones"
             )
     for camera in model.cameras.values():
         view = 2 * math.degrees(math.atan(max(camera.width, camera.height) / (2 * camera.mean_focal_length())))
         if not FIELD_OF_VIEW_DEG[0] < view < FIELD_OF_VIEW_DEG[1]:
-            found.append(
+            warnings.append(
                 f"estimated focal length {camera.mean_focal_length():.0f} px (field of view {view:.0f} degrees) is "
                 "implausible: give init.focal_length in px"
             )
-    return tuple(found)
+    return tuple(warnings)

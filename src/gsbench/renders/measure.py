@@ -61,15 +61,15 @@ def measure_renders(options: argparse.Namespace, runs: Path) -> None:
 
 def _reference_images(options: argparse.Namespace, runs: Path) -> ReferenceImages:
     """The photographs; those of a scene come from the trials of the experiment in ``--as``, if it has any."""
-    others = [word for word in options.settings if not word.startswith(("eval", f"{PERMISSIONS}="))]
+    overrides = [word for word in options.settings if not word.startswith(("eval", f"{PERMISSIONS}="))]
     experiment = runs / (options.place or "").partition(":")[0]
-    if not others and options.place and not Path(options.truth).is_dir() and experiment.is_dir():
+    if not overrides and options.place and not Path(options.truth).is_dir() and experiment.is_dir():
         trials = [trial for trial in read_experiment(experiment).trials if not trial.from_renders]
         if same_scene := next((trial for trial in trials if trial.scene == options.truth), None):
             return reference_images_of(same_scene)
     truth = find_reference_images(options.truth, options.settings, runs)
-    if truth.init is not None and others:
-        raise InputError(f"{others[0]}: the settings of {truth.what} are as they are; only eval.… can be set here")
+    if truth.init is not None and overrides:
+        raise InputError(f"{overrides[0]}: the settings of {truth.what} are as they are; only eval.… can be set here")
     return truth
 
 

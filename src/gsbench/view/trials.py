@@ -62,20 +62,20 @@ def find_trial(address: str, runs: Path) -> TrialResult:
         raise InputError(f"{address!r} is neither a folder nor EXPERIMENT:SCENE:DENSIFY[:SEED]")
     name, scene, densify, *seed = parts
     experiment = load_experiment(runs, name)
-    found = [
+    matches = [
         trial
         for trial in experiment.trials
         if trial.scene == scene
         and densify in (trial.densify, f"{trial.init}-{trial.densify}")
         and (not seed or str(trial.seed) == seed[0])
     ]
-    if not found:
-        known = sorted({f"{name}:{t.scene}:{t.init}-{t.densify}:{t.seed}" for t in experiment.trials})
-        raise InputError(f"no complete trial {address}; there are {', '.join(known)}")
-    first = [trial for trial in found if trial.seed == found[0].seed]
+    if not matches:
+        addresses = sorted({f"{name}:{t.scene}:{t.init}-{t.densify}:{t.seed}" for t in experiment.trials})
+        raise InputError(f"no complete trial {address}; there are {', '.join(addresses)}")
+    first = [trial for trial in matches if trial.seed == matches[0].seed]
     if len(first) > 1:
         raise InputError(f"{address} names {len(first)} trials; give a folder: {', '.join(str(t.path) for t in first)}")
-    return found[0]
+    return matches[0]
 
 
 def _trial_in(folder: Path) -> TrialResult:

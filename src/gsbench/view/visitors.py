@@ -54,6 +54,7 @@ def refuse_other_pages() -> Iterator[None]:
         started.append(True)
         return serve(*words, process_request=process, **settings)
 
+    # viser has no parameter for a check of requests, so the function that it calls is replaced while it starts.
     with mock.patch(SERVE, guarded):
         yield
     if not started:
