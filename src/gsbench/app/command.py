@@ -153,7 +153,7 @@ def run_app(words: Sequence[str], multirun: bool, task: TrialTask) -> None:
 def list_trials(trials: Sequence[Trial]) -> list[Outcome]:
     """Print the trials with their states, and the folders that they will miss; run none."""
     if not need_no_check(trials):
-        check_parts(trials, here=False)
+        check_parts(trials, on_this_machine=False)
     lines = describe_plan(trials, trials[0].values["launch"]["parallel"])
     print("\n".join([*lines, *missing_folders(trials)]))
     return []

@@ -64,7 +64,7 @@ def _begin(trials: Sequence[Trial], unfinished: Sequence[Trial]) -> None:
     # A node of a cluster may have folders and devices that this machine lacks.
     if launcher != "slurm" and (missing := missing_folders(unfinished)):
         raise InputError("; ".join(missing))
-    check_parts(unfinished, here=launcher != "slurm")
+    check_parts(unfinished, on_this_machine=launcher != "slurm")
     if launcher != "slurm":
         check_trackers(unfinished)
     for line in borrowed_names(unfinished):
@@ -150,15 +150,16 @@ def missing_weights(trials: Sequence[Trial]) -> list[str]:
     ]
 
 
-def check_parts(trials: Sequence[Trial], here: bool) -> None:
+def check_parts(trials: Sequence[Trial], on_this_machine: bool) -> None:
     """Refuse what the parts of the trials do not take.
 
-    With ``here``, the trials will run on this machine, whose devices are known. Raises InputError naming the key.
+    With ``on_this_machine`` the trials will run here, so devices and programs are checked too. Raises InputError naming
+    the key.
     """
     from gsbench.pipeline.parts import Parts
 
     for trial in trials:
-        Parts(trial.values).check(here)
+        Parts(trial.values).check(on_this_machine)
 
 
 def check_trackers(trials: Sequence[Trial]) -> None:

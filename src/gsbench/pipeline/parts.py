@@ -155,18 +155,18 @@ class Parts:
         """The iterations before the last at which the test views are measured too."""
         return sorted({step for step in self.eval.at if step < self.train.iterations})
 
-    def check(self, here: bool) -> None:
+    def check(self, on_this_machine: bool) -> None:
         """Raise InputError, which names the key, for what is known to fail. Call it before any work.
 
-        With ``here`` the trial will run on this machine, so its devices and programs are checked too.
+        With ``on_this_machine`` the trial will run on this machine, so its devices and programs are checked too.
         """
         _ = self.initializer, self.trainer, self.metrics
         name, own = self.values["raster"]["name"], self.own_rasterizer
-        if here and self.program is not None:
+        if on_this_machine and self.program is not None:
             self.program.executable()
         if own is not None or name != AUTO:
             self._check_features(name if own is None else own.name)
-        if here:
+        if on_this_machine:
             device = self.device
             if own is None and name != AUTO:
                 resolve(name, device.type)

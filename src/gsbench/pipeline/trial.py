@@ -137,7 +137,7 @@ def _run(trial: Trial, folder: TrialFolder) -> TrialRecord:
     values = trial.values
     with _recorded_failures(values, folder):
         parts = Parts(values)
-        parts.check(here=True)
+        parts.check(on_this_machine=True)
         _ = parts.rasterizer  # raises now, not after hours of work, if it cannot run on this machine
         torch.set_num_threads(parts.threads)
 

@@ -84,14 +84,14 @@ def check_devices() -> Iterator[Finding]:
         else:
             cause = "this torch is a build for CPUs"
         yield Finding("note", "gpu", f"none ({cause}): raster=auto uses the CPU")
-    here = ["cpu", *(["cuda"] if usable else [])]
+    devices = ["cpu", *(["cuda"] if usable else [])]
     for executor in EXECUTORS:
-        on = [device for device in here if executor.obstacle(device) is None]
-        if on:
-            yield Finding("ok", "rasterizer", f"raster={executor.name} on {' and '.join(on)}: {executor.text}")
+        usable_on = [device for device in devices if executor.obstacle(device) is None]
+        if usable_on:
+            yield Finding("ok", "rasterizer", f"raster={executor.name} on {' and '.join(usable_on)}: {executor.text}")
         else:
-            yield Finding("note", "rasterizer", f"raster={executor.name} {executor.obstacle(here[-1])}")
-    chosen = " and ".join(f"{resolve('auto', device).name} on {device}" for device in here)
+            yield Finding("note", "rasterizer", f"raster={executor.name} {executor.obstacle(devices[-1])}")
+    chosen = " and ".join(f"{resolve('auto', device).name} on {device}" for device in devices)
     yield Finding("ok", "rasterizer", f"raster=auto is {chosen}")
     yield from check_triton()
 
@@ -130,6 +130,7 @@ def check_weights() -> Iterator[Finding]:
 
 
 def check_runs(runs: Path) -> Iterator[Finding]:
+    """Finding about the runs folder: whether it can be written to, and its free space."""
     place = next(folder for folder in (runs, *runs.absolute().parents) if folder.exists())
     try:
         with tempfile.TemporaryFile(dir=place):

@@ -16,7 +16,7 @@ from gsbench.runs.declaration import Question
 from gsbench.verbs.arguments import ArgumentParser
 from gsbench.words import counted
 
-MAX_DESIGNS = 5  # that are shown: combinations of scenes and seeds
+MAX_DESIGNS = 5  # combinations of scenes and seeds that are shown
 
 
 def main(argv: Sequence[str], runs: Path) -> int:
@@ -33,30 +33,30 @@ def main(argv: Sequence[str], runs: Path) -> int:
     parser.add_argument("--baseline", default=BASELINE, help=f"the densifier to compare with ({BASELINE})")
     options = parser.parse_args(argv)
     trials = with_variants(load_experiment(runs, options.experiment).trials)
-    shown = quantity(options.metric, trials)
-    if shown.cost:
+    metric = quantity(options.metric, trials)
+    if metric.cost:
         raise InputError(f"--metric {options.metric}: only metrics can be planned for, not counts and times")
-    difference = options.difference or shown.worthwhile
+    difference = options.difference or metric.worthwhile
     if difference is None:
-        raise InputError(f"--difference is needed: {shown.name} has no usual least difference that matters")
+        raise InputError(f"--difference is needed: {metric.name} has no usual least difference that matters")
     pairs = choose_pairs(sorted({trial.arm for trial in trials}), options.baseline)
     if not pairs:
         raise InputError(f"{options.experiment} has one arm, and planning needs pairs of trials of two")
-    for one, other in pairs:
-        own = [trial for trial in trials if trial.arm in (one, other)]
-        paired = find_pairs(own, Question(metric=shown.key, baseline=one, arm=other))
+    for baseline, arm in pairs:
+        compared = [trial for trial in trials if trial.arm in (baseline, arm)]
+        paired = find_pairs(compared, Question(metric=metric.key, baseline=baseline, arm=arm))
         if not paired.rows:
-            raise InputError(f"no trials of {one} and {other} can be paired in {shown.name}: {paired.left_out[0]}")
+            raise InputError(f"no trials of {baseline} and {arm} can be paired in {metric.name}: {paired.left_out[0]}")
         components = estimate_components([row.arm - row.baseline for row in paired.rows])
-        print("\n".join([f"{other} against {one}", *_lines(components, shown, difference)]))
+        print("\n".join([f"{arm} against {baseline}", *_lines(components, metric, difference)]))
     return 0
 
 
-def _lines(components: Components, shown: Quantity, difference: float) -> list[str]:
-    digits = f".{shown.decimals + 1}f"
+def _lines(components: Components, metric: Quantity, difference: float) -> list[str]:
+    digits = f".{metric.decimals + 1}f"
     between = "" if components.between is None else f", between scenes by {components.between:{digits}}"
     lines = [
-        f"  differences in {shown.name} vary between seeds by {components.within:{digits}}{between} "
+        f"  differences in {metric.name} vary between seeds by {components.within:{digits}}{between} "
         f"(from {counted(components.trials, 'pair')} on {counted(components.scenes, 'scene')})"
     ]
     for like_these in (False, True):
@@ -66,7 +66,7 @@ def _lines(components: Components, shown: Quantity, difference: float) -> list[s
             continue
         designs = designs_needed(difference, components, like_these)
         designs.sort(key=lambda design: (design.trials, design.scenes))
-        texts = [f"{one.scenes} × {one.seeds} ({one.trials} trials)" for one in designs[:MAX_DESIGNS]]
+        texts = [f"{design.scenes} × {design.seeds} ({design.trials} trials)" for design in designs[:MAX_DESIGNS]]
         lines.append(
             f"  to see {difference:g} on {group}, scenes × seeds: {', '.join(texts) or 'no number that can be run'}"
         )

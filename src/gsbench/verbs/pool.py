@@ -51,19 +51,19 @@ def pool_sources(
     """
     studies, notes, faults = [], list[str](), list[str]()
     seen: dict[str, Path] = {}
-    names_of = Counter(source.stem for source in sources)
+    stems = Counter(source.stem for source in sources)
     for source in sources:
         try:
-            found = read_studies(source, wanted, source.stem if names_of[source.stem] == 1 else str(source))
+            archive = read_studies(source, wanted, source.stem if stems[source.stem] == 1 else str(source))
         except InputError as error:
             faults.append(f"left out: {error}")
             continue
-        if twice := found.trials & seen.keys():
+        if twice := archive.trials & seen.keys():
             faults.append(f"left out: {source} has trials that {seen[min(twice)]} has, and they would count twice")
             continue
-        seen |= dict.fromkeys(found.trials, source)
-        notes += found.notes
-        for study in found.studies:
+        seen |= dict.fromkeys(archive.trials, source)
+        notes += archive.notes
+        for study in archive.studies:
             if protocol is not None and study.protocol != protocol:
                 notes.append(f"{study.name}: not asked for, it is by {study.protocol}")
             elif study.interval is None:
