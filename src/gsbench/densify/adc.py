@@ -66,7 +66,7 @@ class ADC(Budgeted):
     gradient: Literal["signed", "absolute"] = "signed"  # absolute: AbsGS, arXiv 2404.10484
     gradient_threshold: PositiveFloat = 2e-4
     threshold_inclusive: bool = True  # >= as 3DGS; False: > as gsplat
-    split_size: PositiveFloat = 0.01  # largest scale above it: split, else clone ("percent_dense")
+    split_size: PositiveFloat = 0.01  # a larger Gaussian is split, else cloned ("percent_dense" of 3DGS)
     split_children: Annotated[int, Interval(ge=2, le=MAX_CHILDREN)] = 2
     split_shrink: Annotated[float, Ge(1)] = 1.6  # children's scales are divided by it (0.8 x 2)
     revised_opacity: bool = False  # children of clones and splits share their parent's opacity (arXiv 2404.06109)
