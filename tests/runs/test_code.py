@@ -62,7 +62,7 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 def again() -> None:
     """As in another process."""
-    for cached in (code._released, code._state, code._noted):
+    for cached in (code._released, code._state, code._first_contents):
         cached.cache_clear()
 
 

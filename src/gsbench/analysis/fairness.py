@@ -22,7 +22,7 @@ from gsbench.analysis.quantities import COSTS, relative_change
 from gsbench.analysis.results import Arm, TrialResult, group_by, read_experiment
 from gsbench.analysis.table_formats import Column, Row, Table, TableEntry
 from gsbench.records import read_if_sound
-from gsbench.runs.experiments import Point, TuningRecord
+from gsbench.runs.experiments import SearchPoint, TuningRecord
 from gsbench.runs.layout import TUNING
 from gsbench.words import counted, listed
 
@@ -252,7 +252,7 @@ def _varied_settings(trials: Sequence[TrialResult], own: TrialResult) -> list[st
     ]
 
 
-def _has_settings(trial: TrialResult, point: Point | None) -> bool:
+def _has_settings(trial: TrialResult, point: SearchPoint | None) -> bool:
     """Return whether a trial has exactly the settings of a search point."""
     if point is None or not point.settings:
         return False

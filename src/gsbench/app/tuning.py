@@ -33,7 +33,7 @@ from gsbench.errors import GsbenchError, InputError
 from gsbench.eval.facts import known_keys
 from gsbench.files import checked_runs_folder, make_runs_folder, write_json
 from gsbench.runs.declaration import metric_and_question
-from gsbench.runs.experiments import Point, TuningRecord, make_home
+from gsbench.runs.experiments import SearchPoint, TuningRecord, make_home
 from gsbench.runs.keys import flatten
 from gsbench.runs.layout import TUNING
 from gsbench.settings import check_settings
@@ -100,7 +100,7 @@ class ArmSearch:
     jobs: Sequence[Sequence[str]]
     scenes: Sequence[str]
     first: Mapping[str, Any] | None
-    points: list[Point] = field(default_factory=list)
+    points: list[SearchPoint] = field(default_factory=list)
 
     @cached_property
     def study(self) -> Study:
@@ -130,14 +130,14 @@ class ArmSearch:
         record = trial.files.sound_record()
         return None if record is None else record.metrics.get(self.goal.metric)
 
-    def judge(self, proposal: Proposal, trials: Sequence[Trial]) -> Point:
+    def judge(self, proposal: Proposal, trials: Sequence[Trial]) -> SearchPoint:
         """Judge a point by the mean of its trials. It has failed if one of them lacks the metric."""
         from optuna.trial import TrialState
 
         values = [value for trial in trials if (value := self.value_of(trial)) is not None]
         mean = statistics.fmean(values) if len(values) == len(trials) else None
         self.study.tell(proposal, mean, state=TrialState.FAIL if mean is None else TrialState.COMPLETE)
-        point = Point(settings={key: _rounded(value) for key, value in proposal.params.items()}, value=mean)
+        point = SearchPoint(settings={key: _rounded(value) for key, value in proposal.params.items()}, value=mean)
         self.points.append(point)
         return point
 

@@ -21,7 +21,7 @@ from gsbench.launch.record import read_plan
 from gsbench.parsing import DamagedError
 from gsbench.records import Record, read_if_sound
 from gsbench.runs.experiments import trial_folders
-from gsbench.runs.keys import determining
+from gsbench.runs.keys import determining_settings
 from gsbench.runs.layout import CONFIG, FAILED, LOCK, RESULTS, SEED, SUBMITTED
 from gsbench.runs.trial_folder import State, TrialFolder
 from gsbench.system.locks import read_holder
@@ -89,7 +89,7 @@ def _same_settings(folder: Path, others: Sequence[TrialState]) -> TrialState | N
 
 def _settings(folder: Path) -> dict[str, Any] | None:
     try:
-        return determining(TrialFolder(folder).configuration())
+        return determining_settings(TrialFolder(folder).configuration())
     except InputError:
         return None
 

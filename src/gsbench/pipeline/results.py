@@ -15,7 +15,7 @@ from gsbench.runs.declaration import read_declarations
 from gsbench.runs.keys import EVALUATE, INIT, STAGES, TRAIN, config_hash, flatten, sha256_of
 from gsbench.runs.layout import EVENTS
 from gsbench.runs.made_of import version_of
-from gsbench.runs.store import Entry, read_manifest
+from gsbench.runs.store import StoredResult, read_manifest
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import (
     FROM_MODEL,
@@ -25,7 +25,7 @@ from gsbench.runs.trial_record import (
     Budget,
     Code,
     Declared,
-    Trainer,
+    ExternalTrainer,
     Training,
     TrialRecord,
     read_evaluation,
@@ -43,7 +43,7 @@ def results_of(
     capture: Capture,
     scene: Scene,
     raster: str,
-    entries: Mapping[str, Entry],
+    entries: Mapping[str, StoredResult],
     code: Mapping[str, str],
 ) -> TrialRecord:
     """The results of the trial with the configuration ``values``.
@@ -114,7 +114,7 @@ def results_of(
     return results if training.iterations else _without_training(results)
 
 
-def _trained_by_program(results: TrialRecord, training: Training, trainer: Trainer) -> TrialRecord:
+def _trained_by_program(results: TrialRecord, training: Training, trainer: ExternalTrainer) -> TrialRecord:
     """The results of a training by another program, which may have left only renders and no model."""
     unknown = {}
     if training.evaluated_from == FROM_RENDERS:

@@ -27,7 +27,7 @@ from gsbench.pipeline.steps.train import train_step
 from gsbench.runs import layout
 from gsbench.runs.keys import EVALUATE, GROUND_TRUTH, INIT, TRAIN, Stage, Step
 from gsbench.runs.layout import BUILDING, CONFIG, FAILED, LOG
-from gsbench.runs.store import Entry, Store
+from gsbench.runs.store import Store, StoredResult
 from gsbench.runs.trial_folder import Failure, TrialFolder
 from gsbench.runs.trial_record import TrialRecord
 from gsbench.scene.colmap_files import model_files
@@ -148,7 +148,7 @@ def _run(trial: Trial, folder: TrialFolder) -> TrialRecord:
         write_text(folder.path / CONFIG, trial.yaml)
         (folder.path / FAILED).unlink(missing_ok=True)
         trial_steps = TrialSteps(parts, store)
-        entries: dict[str, Entry] = {}
+        entries: dict[str, StoredResult] = {}
         code: dict[str, str] = {}
         for step in trial_steps.steps():
             if step.stage.name == TRAIN.name:
@@ -179,7 +179,7 @@ def source_files(capture: Capture, store: Store) -> list[Path]:
     return images + ([] if capture.model is None else [path.resolve() for path in model_files(capture.model)])
 
 
-def _publish(folder: Path, entries: Mapping[str, Entry]) -> list[Path]:
+def _publish(folder: Path, entries: Mapping[str, StoredResult]) -> list[Path]:
     """Link the steps' files into the trial's folder, or copy them; returns the new paths."""
     init, trained, evaluated = (entries[stage.name].path for stage in (INIT, TRAIN, EVALUATE))
     links = {folder / name: trained / name for name in PUBLISHED_TRAINING if (trained / name).exists()}

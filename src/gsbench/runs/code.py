@@ -1,8 +1,8 @@
-"""The code that made a result: gsbench's own by rooms, the user's by modules. Loads no torch.
+"""The code that made a result: gsbench's own by *rooms* (parts of the package), the user's by modules. Loads no torch.
 
-Where gsbench is as in a release (``released.json``), the versions of its stages stand for it, which are bumped by hand.
-In a checkout that differs, the key of a stage has the digests of the rooms that it uses as well. A user's modules are
-hashed whole: those that ``allow_targets`` names, since nothing else of the user's can be imported.
+If a room is as released (``released.json``), the versions of gsbench's stages, which are bumped by hand, stand for it.
+In a checkout that differs, the key of a stage also contains the digests of the differing rooms that it uses. A user's
+modules are hashed whole: those of configured classes and those in ``allow_targets``, since no others can be imported.
 """
 
 import ast
@@ -19,16 +19,16 @@ from typing import Any
 from gsbench.files import write_json
 from gsbench.parsing import DamagedError, read_json
 
-OWN = "gsbench."  # how the import paths of gsbench's own classes start
-SHOWN = 8  # characters of a digest that people see
+OWN = "gsbench."  # prefix of the import paths of gsbench's own classes
+SHOWN = 8  # characters of a digest in messages
 PACKAGE = Path(__file__).resolve().parents[1]
-RELEASED = "released.json"  # in the package: the digests of all rooms as they were released
-AS_RELEASED = "released"  # the state of a room that is
+RELEASED = "released.json"  # in the package: the digests of all rooms at the release
+AS_RELEASED = "released"  # the state of a room that equals the release
 DIGEST_CHARACTERS = 16
 
-# Folders and files of gsbench that make the numbers of each stage. What only says, shows, launches or reads has no
-# part, nor what makes objects of the settings, which are in the keys as they are. An edit of one densifier changes the
-# room of all: the price of a table that anybody can check.
+# The rooms of each stage: folders and files of gsbench that determine its numbers. Code that only reports, shows,
+# launches or reads is no room. Nor is code that makes objects from settings: keys contain the settings themselves.
+# An edit of one densifier changes the room of all densifiers; in return, the table is simple enough to check.
 MODEL = ("scene", "gaussians", "densify", "raster", "train", "events.py")
 LOSS = ("eval/ssim.py", "eval/images.py", "eval/pictures.py")
 ROOMS = {
@@ -38,53 +38,53 @@ ROOMS = {
     "ground_truth": ("scene", "pipeline/steps/scene.py"),
     "evaluate": (*MODEL, "eval", "weights.py", "pipeline/steps"),
 }
-VIEWS_ROOMS = ("scene",)  # of the prepared photographs beside the store
+VIEWS_ROOMS = ("scene",)  # rooms of the prepared photographs beside the store
 
-INSTALLED = frozenset({"site-packages", "dist-packages"})  # folders of packages that are known by their versions
+INSTALLED = frozenset({"site-packages", "dist-packages"})  # the version stands for a package in these folders
 CODE_SUFFIXES = frozenset({".py", ".so", ".pyd", ".c", ".cpp", ".cu", ".h", ".cuh"})
 
 # ---- gsbench's own code
 
 
 def states_of(rooms: Iterable[str]) -> dict[str, str]:
-    """``{"eval": state}``: the state of each room, which is a digest of its syntax, or ``released``."""
+    """``{"eval": state}``: the state of each room, ``released`` or else a digest of its syntax."""
     return {room: _state(room) for room in sorted(set(rooms))}
 
 
 def edited(states: Mapping[str, str]) -> dict[str, str]:
-    """The rooms among ``states`` that are not as released."""
+    """The states of rooms that differ from the release."""
     return {room: state for room, state in states.items() if state != AS_RELEASED}
 
 
 def changed_rooms(recorded: Mapping[str, str]) -> list[str]:
-    """The rooms whose state is no longer the recorded one."""
+    """The rooms whose state differs from the recorded one."""
     return [room for room, state in recorded.items() if _state(room) != state]
 
 
 def changed_since_asked(rooms: Iterable[str]) -> list[str]:
-    """The rooms whose files are other ones than when their state was first asked for."""
-    return [room for room in rooms if _contents(room) != _noted(room)]
+    """The rooms whose files have changed since this process first asked for their state."""
+    return [room for room in rooms if _contents(room) != _first_contents(room)]
 
 
 @cache
-def _noted(room: str) -> dict[str, bytes]:
-    """The files of a room as they were when this process first asked."""
+def _first_contents(room: str) -> dict[str, bytes]:
+    """The files of a room when this process first asked for them: later edits do not change what it runs."""
     return _contents(room)
 
 
 @cache
 def _state(room: str) -> str:
-    released, noted = _released().get(room) or {}, _noted(room)
-    if released.get("bytes") == _digest(noted):  # as nearly always where gsbench is installed: nothing is parsed
+    released, contents = _released().get(room) or {}, _first_contents(room)
+    if released.get("bytes") == _digest(contents):  # the usual case of an installed gsbench, without parsing
         return AS_RELEASED
-    digest = _digest({name: syntax_of(content) for name, content in noted.items()})
+    digest = _digest({name: syntax_of(content) for name, content in contents.items()})
     return AS_RELEASED if digest == released.get("syntax") else digest
 
 
 def _contents(room: str) -> dict[str, bytes]:
-    """The files of a room by their paths below the package."""
-    place = PACKAGE / room
-    files = [place] if place.suffix else sorted(place.rglob("*.py"))
+    """The content of a room's files by their paths below the package."""
+    path = PACKAGE / room
+    files = [path] if path.suffix else sorted(path.rglob("*.py"))
     return {file.relative_to(PACKAGE).as_posix(): file.read_bytes() for file in files if file.is_file()}
 
 
@@ -96,14 +96,14 @@ def _digest(contents: Mapping[str, bytes]) -> str:
 @cache
 def _released() -> dict[str, dict[str, str]]:
     try:
-        found: dict[str, dict[str, str]] = read_json(PACKAGE / RELEASED)
+        released: dict[str, dict[str, str]] = read_json(PACKAGE / RELEASED)
     except (FileNotFoundError, DamagedError):
         return {}
-    return found
+    return released
 
 
 def syntax_of(source: bytes) -> bytes:
-    """A Python file without comments, docstrings and layout; a file that is not Python as it is."""
+    """The syntax tree of a Python file without docstrings, as text; the source itself if it cannot be parsed."""
     try:
         tree = ast.parse(source)
     except (SyntaxError, ValueError, RecursionError):
@@ -121,69 +121,69 @@ def _is_text(body: Any) -> bool:
 
 
 def main() -> None:
-    """Write the digests of all rooms as those of a release (docs/releasing.md)."""
-    found = {}
+    """Write ``released.json`` with the digests of all rooms (docs/releasing.md)."""
+    digests = {}
     for room in sorted({room for rooms in ROOMS.values() for room in rooms}):
         contents = _contents(room)
         syntax = {name: syntax_of(content) for name, content in contents.items()}
-        found[room] = {"bytes": _digest(contents), "syntax": _digest(syntax)}
-    write_json(PACKAGE / RELEASED, found)
+        digests[room] = {"bytes": _digest(contents), "syntax": _digest(syntax)}
+    write_json(PACKAGE / RELEASED, digests)
 
 
 # ---- the user's code
 
-_as_imported: dict[str, tuple[ModuleSpec, str | None]] = {}  # what a module's files held when it was imported
+_digests_at_import: dict[str, tuple[ModuleSpec, str | None]] = {}  # a module's digest when it was first asked for
 
 
 def user_modules(values: Mapping[str, Any]) -> dict[str, str]:
-    """``{module: sha256}`` of the user's code behind a configuration: empty where all of its classes are gsbench's.
+    """``{module: sha256}`` of the user's code behind a configuration; {} if all of its classes are gsbench's.
 
-    That are the modules of its classes, and all that ``allow_targets`` names: one may import the other. What is
-    installed counts where a class is from it; else its version stands for it.
+    These are the modules of its classes, and the modules in ``allow_targets``, which the classes may import. An
+    installed module is included only if a class comes from it.
     """
-    named = {target.split(".")[0] for target in _targets(values) if not target.startswith(OWN)}
-    if not named:
+    of_classes = {target.split(".")[0] for target in _targets(values) if not target.startswith(OWN)}
+    if not of_classes:
         return {}
-    helpers = {name.split(".")[0] for name in values.get("allow_targets") or ()} - named
-    helpers = {name for name in helpers if (spec := _find(name)) is not None and not _is_installed(spec)}
-    digests = {name: module_digest(name) for name in sorted(named | helpers)}
+    helpers = {name.split(".")[0] for name in values.get("allow_targets") or ()} - of_classes
+    helpers = {name for name in helpers if (spec := _find_spec(name)) is not None and not _is_installed(spec)}
+    digests = {name: module_digest(name) for name in sorted(of_classes | helpers)}
     return {name: digest for name, digest in digests.items() if digest is not None}
 
 
 def module_digest(name: str, folder: str | None = None) -> str | None:
-    """The sha256 of a top-level module: of its file, or of all code in its package. None where it is not found.
+    """The sha256 of a top-level module: of its file, or of all code in its package. None if it is not found.
 
-    One that this process has imported counts as it was then: that is the code that runs. With ``folder``, it is looked
-    for as a program started there would find it, whatever this process has imported.
+    A module that this process has imported keeps its digest: that is the code that runs. With ``folder``, the module is
+    found as by a program that is started there, without regard to what this process has imported.
     """
     loaded = sys.modules.get(name) if folder is None else None
-    spec = _find(name, folder) if loaded is None else loaded.__spec__
+    spec = _find_spec(name, folder) if loaded is None else loaded.__spec__
     if spec is None:
         return None
     if loaded is None:
         return _digest_on_disk(spec)
-    known = _as_imported.get(name)
-    if known is None or known[0] is not spec:
-        known = _as_imported[name] = (spec, _digest_on_disk(spec))
-    return known[1]
+    cached = _digests_at_import.get(name)
+    if cached is None or cached[0] is not spec:
+        cached = _digests_at_import[name] = (spec, _digest_on_disk(spec))
+    return cached[1]
 
 
 def has_changed_since_import(name: str) -> bool:
-    """Return whether a module's files are no longer those that this process has imported, and therefore runs."""
+    """Return whether a module's files differ from the code that this process has imported and runs."""
     loaded = sys.modules.get(name)
     spec = None if loaded is None else loaded.__spec__
     return spec is not None and module_digest(name) != _digest_on_disk(spec)
 
 
 def unnamed_modules(before: Collection[str], named: Collection[str]) -> list[str]:
-    """The user's modules that were imported since ``before`` and are not ``named``: an edit there goes unnoticed."""
+    """The user's modules that were imported since ``before`` but are not ``named``: their edits change no key."""
     tops = {name.split(".")[0] for name in sys.modules.keys() - set(before)} - {*named, PACKAGE.name}
     specs = {top: getattr(sys.modules.get(top), "__spec__", None) for top in tops}
     return sorted(top for top, spec in specs.items() if spec is not None and not _is_installed(spec))
 
 
 def _targets(values: Any) -> Iterator[str]:
-    """The import paths of classes in a configuration, at any depth."""
+    """The import paths (``_target_``) in a configuration, at any depth."""
     if isinstance(values, Mapping):
         if isinstance(values.get("_target_"), str):
             yield values["_target_"]
@@ -194,9 +194,9 @@ def _targets(values: Any) -> Iterator[str]:
             yield from _targets(value)
 
 
-def _find(name: str, folder: str | None = None) -> ModuleSpec | None:
-    """A top-level module, as Python would find it; imports nothing."""
-    importlib.invalidate_caches()  # the files may be younger than what a finder remembers of their folder
+def _find_spec(name: str, folder: str | None = None) -> ModuleSpec | None:
+    """A top-level module as Python would find it, without importing it."""
+    importlib.invalidate_caches()  # a finder caches the content of folders, and files may be newer
     try:
         if folder is not None:
             return PathFinder.find_spec(name, [*sys.path, folder])
@@ -206,7 +206,7 @@ def _find(name: str, folder: str | None = None) -> ModuleSpec | None:
 
 
 def _digest_on_disk(spec: ModuleSpec) -> str | None:
-    """One hash of the code of a module: of one file the sha256 of what it holds, of several that of their list."""
+    """The sha256 of a module's code: of its content if it is one file, else of the list of its files' hashes."""
     folders = [Path(place) for place in spec.submodule_search_locations or ()]
     if not folders:
         file = Path(spec.origin or "")
@@ -221,12 +221,12 @@ def _digest_on_disk(spec: ModuleSpec) -> str | None:
 
 
 def _is_installed(spec: ModuleSpec) -> bool:
-    """Return whether a module is Python's own or of an installed package, which its version stands for."""
-    places = [spec.origin] if spec.has_location else list(spec.submodule_search_locations or [])
+    """Return whether a module is Python's own or of an installed package: their versions stand for them."""
+    paths = [spec.origin] if spec.has_location else list(spec.submodule_search_locations or [])
     library = [sysconfig.get_path(key) for key in ("stdlib", "platstdlib")]
     return all(
-        place is None or INSTALLED & set(Path(place).parts) or any(Path(place).is_relative_to(one) for one in library)
-        for place in places
+        path is None or INSTALLED & set(Path(path).parts) or any(Path(path).is_relative_to(one) for one in library)
+        for path in paths
     )
 
 

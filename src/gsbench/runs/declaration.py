@@ -1,9 +1,9 @@
-"""The record of what an experiment was declared to be about: ``<runs>/<experiment>/declared.jsonl``.
+"""The questions that were declared for an experiment before its trials ran: ``<runs>/<experiment>/declared.jsonl``.
 
-Every line is one `Declaration`, written when a command is given and before its trials run. ``eval.primary``, a file of
-claims and ``launch.stop_when_decided`` each become one. A trial's ``results.json`` repeats the metric that stood when
-it was run. `gsbench.analysis.judgement` judges by declarations, and `gsbench.analysis.declaration` says what came
-before and after them.
+Every line is a `Declaration`. A command writes it before its trials run, for ``eval.primary``, a file of claims or
+``launch.stop_when_decided``. A trial's ``results.json`` repeats the metric that was declared when it ran.
+`gsbench.analysis.judgement` answers the questions; `gsbench.analysis.declaration` finds trials that were measured
+before or added after a declaration.
 """
 
 import calendar
@@ -26,7 +26,7 @@ from gsbench.runs.trial_record import Declared
 log = logging.getLogger(__name__)
 
 INTERPOLATION, EXTRAPOLATION = "interpolation", "extrapolation"
-QUESTIONS = {"every_nth": INTERPOLATION, "sector": EXTRAPOLATION}  # what a split (scene.split) asks of a model
+QUESTIONS = {"every_nth": INTERPOLATION, "sector": EXTRAPOLATION}  # the question of each split (scene.split)
 AT = "@"  # psnr@extrapolation
 STAMP = "%Y-%m-%dT%H:%M:%SZ"  # UTC, as in the manifests of the store
 ERROR_RATE = 0.05
@@ -36,16 +36,15 @@ Planned = Mapping[str, tuple[int, ...]]  # seeds by scene, arm and hash of the c
 
 
 def trial_key(scene: str, arm: str, config_hash: str) -> str:
-    """The name that tells a trial from others of its experiment but for the seed: ``garden/sfm-adc/3fa9c1d2``."""
+    """The key that trials of an experiment share if they differ only in the seed: ``garden/sfm-adc/3fa9c1d2``."""
     return f"{scene}/{arm}/{config_hash}"
 
 
 @dataclass(frozen=True, order=True)
 class Arm:
-    """An arm of a comparison: an initialiser, a densifier, and the swept settings that tell it from others of the two.
+    """An arm of a comparison: an initialiser, a densifier, and the swept settings that distinguish it.
 
-    ``variant`` holds the items of a mapping from a setting to its value as text. A file of claims names its arms
-    itself; they have no ``init``.
+    ``variant`` holds (setting, value as text) pairs. The arms of a file of claims have its names and no ``init``.
     """
 
     __pydantic_config__ = STRICT
@@ -61,16 +60,18 @@ class Arm:
 
 @dataclass(frozen=True, kw_only=True)
 class Question(Record):
-    """A question: does ``arm`` differ from ``baseline`` in ``metric``, the way ``sign`` says, by ``least`` at least?
+    """A question: does ``arm`` differ from ``baseline`` in ``metric`` in the direction ``sign``, by at least ``least``?
 
-    ``sign`` is that of the claimed difference, arm minus baseline; 0 where it is claimed that there is none. ``least``
-    is the smallest difference that matters, in the metric's unit or (``relative``) as a part of the baseline's value;
-    None where nobody said. ``scenes`` gives for each scene the folders of both arms' trials within the experiment,
-    without the seed (`trial_key`); without it, the trials are those of the two arms, on all scenes. ``seeds`` are in
-    the order in which they are added; without them, all that both arms have count. A question without arms is about
-    every two arms that are compared, in the metric's own direction, ``about`` interpolation or extrapolation where it
-    says so. Of two ``versions`` of one trainer the code may differ, and the baseline's trials may be older than the
-    question.
+    - ``sign``: of the claimed difference, arm minus baseline; 0 if no difference is claimed.
+    - ``least``: the smallest difference that matters, in the metric's unit or (``relative``) as a fraction of the
+      baseline's value; None if it is not known.
+    - ``scenes``: for each scene, the keys (`trial_key`) of baseline's and arm's trials; if empty, the trials are those
+      of the two arms on all scenes.
+    - ``seeds``: in the order of adding them; if empty, all seeds that both arms have.
+    - ``baseline`` and ``arm`` are None in a question about all compared arms, in the metric's own direction.
+    - ``about``: "interpolation" or "extrapolation", "" for both.
+    - ``versions``: the arms are versions of one trainer, so their code may differ, and the baseline's trials may be
+      older than the question.
     """
 
     metric: str
@@ -88,17 +89,17 @@ class Question(Record):
 
     @property
     def planned(self) -> Planned:
-        """The trials that the question names."""
+        """The trials that the question names; {} without ``scenes``."""
         return {key: self.seeds for keys in self.scenes.values() for key in keys}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Declaration(Record):
-    """Questions that were asked at ``time`` (UTC), which share ``error_rate``, the chance that any answer is false.
+    """Questions that were declared at ``time`` (UTC). ``error_rate`` is the chance that any answer is false.
 
-    ``looks`` are numbers of seeds, rising: after each of them a question may be decided; none: all is judged once.
-    ``trials`` are all that were to be run where the questions name none; None: nobody knows. ``missing`` says by
-    question what of it could not be tested where it was declared, and why.
+    ``looks`` are the rising numbers of seeds at which a question may be decided; without looks, all seeds are judged
+    at once. ``trials`` are the planned trials if the questions name none; None if they are not recorded. ``missing``
+    says by question what could not be tested, and why.
     """
 
     time: str
@@ -124,45 +125,45 @@ class Declaration(Record):
 
     @property
     def of_claims(self) -> bool:
-        """Return whether a file of claims was declared, each question of which has a name."""
+        """Return whether it comes from a file of claims (or a gate): only their questions have names."""
         return any(question.name for question in self.questions)
 
     @property
     def primary(self) -> str:
-        """The metric that a sweep was declared to be about, as ``eval.primary`` names it."""
+        """The declared metric of a sweep, as in ``eval.primary``."""
         first = self.questions[0]
         return f"{first.metric}{AT}{first.about}" if first.about else first.metric
 
     @property
     def names_trials(self) -> bool:
-        """Return whether it is known which trials were to be run: not in what a trial repeats."""
+        """Return whether the planned trials are recorded. They are not in the part that a trial repeats."""
         return self.trials is not None or any(question.scenes for question in self.questions)
 
     @property
     def planned(self) -> Planned:
-        """All trials that were to be run."""
-        found: dict[str, tuple[int, ...]] = dict(self.trials or {})
+        """All planned trials."""
+        planned: dict[str, tuple[int, ...]] = dict(self.trials or {})
         for question in self.questions:
-            found = dict(merge_planned(found, question.planned))
-        return found
+            planned = dict(merge_planned(planned, question.planned))
+        return planned
 
     @property
     def hash(self) -> str:
-        """sha256 of all that decides about the answers: another one is another declaration."""
+        """sha256 of everything that affects the answers: different hashes are different declarations."""
         return sha256_of(replace(self, time="1970-01-01T00:00:00Z", missing={}).to_json())
 
     def summary(self) -> Declared:
-        """The part that a trial repeats."""
+        """The part that a trial's results.json repeats."""
         return Declared(metric=self.primary, time=self.time)
 
 
 def declared_now(**values: Any) -> Declaration:
-    """A declaration of this moment."""
+    """A declaration with the present time."""
     return Declaration(time=time.strftime(STAMP, time.gmtime()), **values)
 
 
 def metric_and_question(primary: str) -> tuple[str, str]:
-    """The metric that ``eval.primary`` names, and the question that it is about; "" for all that were asked.
+    """The metric and the question that ``eval.primary`` names; the question is "" for both.
 
     Examples:
         >>> metric_and_question("psnr@extrapolation")
@@ -175,15 +176,15 @@ def metric_and_question(primary: str) -> tuple[str, str]:
 
 
 def open_question(primary: str) -> Question:
-    """The question of ``eval.primary``: every two arms in one metric."""
+    """The question of ``eval.primary``, about all compared arms in one metric."""
     metric, about = metric_and_question(primary)
     return Question(metric=metric, sign=0, about=about)
 
 
 def read_declarations(folder: Path, repeated: Iterable[Declared | None] = ()) -> list[Declaration]:
-    """Read every declaration for the experiment in ``folder``, the oldest first.
+    """All declarations of the experiment in ``folder``, the oldest first.
 
-    Those that only results of its trials record are ``repeated``.
+    ``repeated`` are the declarations in its trials' results. They are added if the file lacks them.
     """
     path = folder / DECLARED
     try:
@@ -193,16 +194,16 @@ def read_declarations(folder: Path, repeated: Iterable[Declared | None] = ()) ->
     except DamagedError as error:
         log.warning("left out: %s", error)
         content = b""
-    found = [one for _, one in iterate_rows(content, Declaration, path) if one.questions]
-    known = {(one.primary, one.time) for one in found}
-    for one in dict.fromkeys((said.metric, said.time) for said in repeated if said is not None):
-        if one not in known and unix_time(one[1]) is not None:
-            found.append(Declaration(time=one[1], questions=(open_question(one[0]),)))
-    return sorted(found, key=lambda declaration: declaration.moment)
+    declarations = [one for _, one in iterate_rows(content, Declaration, path) if one.questions]
+    in_file = {(one.primary, one.time) for one in declarations}
+    for metric, when in dict.fromkeys((one.metric, one.time) for one in repeated if one is not None):
+        if (metric, when) not in in_file and unix_time(when) is not None:
+            declarations.append(Declaration(time=when, questions=(open_question(metric),)))
+    return sorted(declarations, key=lambda declaration: declaration.moment)
 
 
 def latest_declaration(declarations: Sequence[Declaration]) -> Declaration:
-    """The latest of ``declarations``, which are in the order of time, with the time from which on it stood."""
+    """The latest of ``declarations`` (in the order of time), with the time since which it has been in force."""
     first = len(declarations) - 1
     while first > 0 and declarations[first - 1].hash == declarations[-1].hash:
         first -= 1
@@ -210,18 +211,18 @@ def latest_declaration(declarations: Sequence[Declaration]) -> Declaration:
 
 
 def merge_planned(one: Planned, other: Planned) -> Planned:
-    """The trials of both."""
+    """The trials of both plans."""
     return {key: tuple(sorted({*one.get(key, ()), *other.get(key, ())})) for key in {**one, **other}}
 
 
 def record_text(declarations: Iterable[Declaration]) -> str:
     """The content of ``declared.jsonl``, in the order of time."""
-    entries = sorted(declarations, key=lambda entry: entry.moment)
-    return "".join(json.dumps(entry.to_json()) + "\n" for entry in entries)
+    ordered = sorted(declarations, key=lambda declaration: declaration.moment)
+    return "".join(json.dumps(declaration.to_json()) + "\n" for declaration in ordered)
 
 
 def unix_time(text: object) -> int | None:
-    """The moment that a stamp names; None for what is none."""
+    """The Unix time of a time stamp (`STAMP`); None if the text is not one."""
     try:
         return calendar.timegm(time.strptime(str(text), STAMP))
     except (ValueError, OverflowError):

@@ -1,4 +1,4 @@
-"""The experiments of a runs folder, by its folders alone; ``tuning.json`` in that of a search, which tunes an arm."""
+"""The experiments in a runs folder, and ``tuning.json``, the record of a search that tunes an arm."""
 
 import logging
 import os
@@ -19,50 +19,50 @@ def list_experiments(runs_dir: Path) -> list[str]:
     """The names of the experiments in a runs folder, sorted."""
     if not runs_dir.is_dir():
         return []
-    return sorted(Path(place).name for place in folders_in(runs_dir) if Path(place).name not in IN_RUNS)
+    return sorted(Path(folder).name for folder in folders_in(runs_dir) if Path(folder).name not in IN_RUNS)
 
 
 def experiment_home(runs_dir: Path, name: str) -> Path:
-    """The folder of the experiment ``name``; raises InputError naming those there are."""
-    known = list_experiments(runs_dir)
-    if name not in known:
-        raise InputError(f"no experiment {name!r} in {runs_dir}; there: {', '.join(known) or 'none yet'}")
+    """The folder of the experiment ``name``; for an unknown name raises InputError that lists the experiments."""
+    names = list_experiments(runs_dir)
+    if name not in names:
+        raise InputError(f"no experiment {name!r} in {runs_dir}; there: {', '.join(names) or 'none yet'}")
     return runs_dir / name
 
 
 def make_home(home: Path) -> None:
-    """Make the folder of an experiment; raises InputError where it is a link."""
+    """Make the folder of an experiment; raises InputError if it is a link."""
     require_no_links(home.parent, home)
     home.mkdir(parents=True, exist_ok=True)
 
 
 def trial_folders(home: Path) -> Iterator[str]:
-    """Every folder three levels below the experiment in ``home``, in no particular order."""
+    """The paths of all folders three levels below ``home`` (scene, arm, trial), in no particular order."""
     for scene in folders_in(home):
         for arm in folders_in(scene):
             yield from folders_in(arm)
 
 
-def folders_in(place: str | Path) -> list[str]:
-    """The folders in ``place`` without the hidden ones; no link is one."""
+def folders_in(folder: str | Path) -> list[str]:
+    """The paths of the folders in ``folder``, without links and hidden folders."""
     try:
-        with os.scandir(place) as entries:
+        with os.scandir(folder) as entries:
             return [
                 entry.path
                 for entry in entries
                 if entry.is_dir(follow_symlinks=False) and not entry.name.startswith(".")
             ]
     except OSError as error:
-        log.warning("left out: %s cannot be read (%s)", place, error.strerror)
+        log.warning("left out: %s cannot be read (%s)", folder, error.strerror)
         return []
 
 
-# ---- the search for the values of an arm
+# ---- the search for the settings of an arm
 
 
 @dataclass(frozen=True, kw_only=True)
-class Point(Record):
-    """A choice of values; ``value`` is the mean of the metric over its trials, None where one of them has none."""
+class SearchPoint(Record):
+    """A point of a search; ``value`` is the mean of the metric over its trials, None if one of them has no value."""
 
     settings: dict[str, Whole | Number]
     value: Number | None
@@ -70,11 +70,11 @@ class Point(Record):
 
 @dataclass(frozen=True, kw_only=True)
 class TuningRecord(Record):
-    """The search for the values of ``arm`` (INIT-DENSIFY) that the experiment ``sweep`` then trained.
+    """The search for the settings of ``arm`` (INIT-DENSIFY), which the experiment ``sweep`` then trains.
 
-    ``ranges`` are what was searched, as it was given, those in ``log`` on a logarithmic scale; ``wanted`` is the number
-    of points, each judged by trials of ``seeds`` on validation views of ``scenes``. ``as_it_is`` tells whether the
-    first point was the arm with its own values.
+    ``ranges`` are the searched ranges as given, those in ``log`` on a logarithmic scale. ``wanted`` is the number of
+    points, each judged by trials of ``seeds`` on validation views of ``scenes``. ``as_it_is`` says whether the first
+    point has the arm's own settings.
     """
 
     sweep: Text
@@ -87,7 +87,7 @@ class TuningRecord(Record):
     ranges: dict[str, str]
     log: list[str]
     as_it_is: bool
-    points: list[Point]
+    points: list[SearchPoint]
 
     def __post_init__(self) -> None:
         if len({frozenset(point.settings) for point in self.points if point.value is not None}) > 1:
@@ -97,8 +97,8 @@ class TuningRecord(Record):
             raise ValueError("a setting of a log scale is not above 0")
 
     @property
-    def best(self) -> Point | None:
-        """The point of the best value, the first of several; None where none has a value."""
+    def best(self) -> SearchPoint | None:
+        """The (first) point with the best value; None if no point has a value."""
         done = [point for point in self.points if point.value is not None]
         return max(done, key=lambda point: self.direction * (point.value or 0.0), default=None)
 

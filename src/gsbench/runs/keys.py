@@ -1,6 +1,6 @@
-"""Inputs that determine a result, and their hash: of a configuration, and of each step of a trial.
+"""Hashes of what determines a result: of a configuration, and of each step of a trial (its key).
 
-A step is a stage with its inputs; it knows its key without running. Loads neither Hydra nor torch.
+A step is a stage with its inputs. Its key is known before it runs. Loads neither Hydra nor torch.
 """
 
 import hashlib
@@ -13,21 +13,24 @@ from typing import Any
 
 from gsbench.runs.code import OWN, user_modules
 
-# Options of gsbench's own classes that cannot change a result; what they mean in a user's class, nobody knows.
+# Options that cannot change a result. This holds for gsbench's own classes; a user's class may use the names otherwise.
 WITHOUT_EFFECT = ("threads", "weights", "download", "time_limit_minutes")
-# Settings of a group that say how results will be read, or what may be varied, whatever they are.
+# Settings that only declare how results are read or what an ablation may turn off.
 DECLARED = {"eval": ("primary", "controls"), "densify": ("switches",)}
 NOT_HASHED = ("name", "seed", "device", "threads", "runs", "allow_targets", "tracking", "launch")
 
 
 def config_hash(values: dict[str, Any]) -> str:
-    """sha256 of what determines a result apart from the seed: not names, devices, folders, tracking or launchers."""
+    """sha256 of the settings and the user's code that determine a result, without the seed.
+
+    Names, devices, folders, tracking and launchers do not change it.
+    """
     modules = user_modules(values)
-    return sha256_of(determining(values) | ({"code": modules} if modules else {}))
+    return sha256_of(determining_settings(values) | ({"code": modules} if modules else {}))
 
 
-def determining(values: Mapping[str, Any]) -> dict[str, Any]:
-    """The settings among ``values`` that determine a result, apart from the seed and the code of a user's classes."""
+def determining_settings(values: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings among ``values`` that determine a result, without the seed."""
     kept = {key: value for key, value in values.items() if key not in NOT_HASHED}
     for key, group in kept.items():
         if isinstance(group, dict):
@@ -43,7 +46,7 @@ def sha256_of(values: Any) -> str:
 
 
 def flatten(mapping: Mapping[str, Any], keep_empty: bool = False) -> dict[str, Any]:
-    """Nested mappings as one with dotted keys; an empty one within is dropped, unless ``keep_empty``.
+    """Nested mappings as one mapping with dotted keys; empty inner mappings are dropped unless ``keep_empty``.
 
     Examples:
         >>> flatten({"a": {"b": 1, "c": {}}, "d": [2]})
@@ -52,7 +55,7 @@ def flatten(mapping: Mapping[str, Any], keep_empty: bool = False) -> dict[str, A
     flat: dict[str, Any] = {}
     for key, value in mapping.items():
         if isinstance(value, Mapping) and (value or not keep_empty):
-            flat |= {f"{key}.{name}": entry for name, entry in flatten(value, keep_empty).items()}
+            flat |= {f"{key}.{name}": inner for name, inner in flatten(value, keep_empty).items()}
         else:
             flat[str(key)] = value
     return flat
@@ -63,10 +66,10 @@ def flatten(mapping: Mapping[str, Any], keep_empty: bool = False) -> dict[str, A
 
 @dataclass(frozen=True)
 class Stage:
-    """A kind of work. Bump ``version`` by hand when its code changes what it computes.
+    """A stage of the pipeline, such as training. Bump ``version`` by hand when its code computes something else.
 
-    ``resumable`` stages find what a killed build left and go on from it; the others start in an empty folder. Files
-    that match ``scratch`` serve the build only: they are removed when the result is complete.
+    ``resumable`` stages continue from the files of a killed build; the others start in an empty folder. Files that
+    match ``scratch`` are needed only by the build, and removed when the result is complete.
     """
 
     name: str
@@ -75,17 +78,16 @@ class Stage:
     scratch: tuple[str, ...] = ()
 
     def key(self, inputs: dict[str, Any]) -> str:
-        """sha256 of canonical JSON of the stage and all that it reads, upstream keys included."""
+        """sha256 of the stage's name, its version and all of its inputs, which include upstream keys."""
         return sha256_of({"stage": self.name, "version": self.version, "inputs": inputs})
 
 
 @dataclass(frozen=True)
 class Step:
-    """One piece of a trial: ``build(folder)`` computes its result, which ``inputs`` determine (upstream keys among
-    them).
+    """One step of a trial: ``build(folder)`` computes its result, which ``inputs`` (with upstream keys) determine.
 
-    ``code`` are the rooms of gsbench that have a part in it, with their states (`gsbench.runs.code`). ``check``, called
-    when it is built, raises where other code may have built it than ``inputs`` say.
+    ``code`` has the states of the rooms that it uses (`gsbench.runs.code`). ``check`` is called after building; it
+    raises if other code than that in ``inputs`` may have built the result.
     """
 
     stage: Stage
@@ -100,7 +102,7 @@ class Step:
         return self.stage.key(self.inputs)
 
 
-# By name and version: bump a version when the code of a stage computes something else.
+# (name, version). Bump the version when the stage's code computes something else.
 CAPTURE = Stage("scene", 1)
 INIT = Stage("init", 1, resumable=True)
 TRAIN = Stage("train", 2, resumable=True, scratch=("checkpoint-*.pt",))

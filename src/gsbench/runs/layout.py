@@ -1,49 +1,49 @@
-"""The names of files and folders: in the runs folder, in the store and in a trial's. Spelled here and nowhere else.
+"""The names of all files and folders in the runs folder, the store and trials' folders.
 
-A trial lies in ``<runs>/<experiment>/<scene>/<init>-<densify>/<hash8>-seed<k>/``.
+A trial's folder is ``<runs>/<experiment>/<scene>/<init>-<densify>/<hash8>-seed<k>/``.
 """
 
 # in the runs folder, beside the experiments
-STORE = "store"  # results of stages by content
-ARTIFACTS, DATABASE = "mlartifacts", "mlflow.db"  # MLflow's mirror
-TENSORBOARD, WANDB = "tensorboard", "wandb"  # the mirrors of others
+STORE = "store"  # results of stages by key
+ARTIFACTS, DATABASE = "mlartifacts", "mlflow.db"  # MLflow's files
+TENSORBOARD, WANDB = "tensorboard", "wandb"  # other trackers' files
 IN_RUNS = (STORE, ARTIFACTS, DATABASE, TENSORBOARD, WANDB)
-JOBS = ".jobs"  # what the processes of launch=local and Slurm's jobs print, a folder for each experiment
+JOBS = ".jobs"  # output of the jobs of launch=local and launch=slurm, with a folder per experiment
 
 # in the store
-MANIFEST = "manifest.json"  # in every result of a stage: what made it
-VIEWS = "views"  # beside the stages: photographs undistorted and at their final size
+MANIFEST = "manifest.json"  # in every result: what made it
+VIEWS = "views"  # beside the stages: undistorted photographs of their final size
 
 # in the result of a stage
-TRAINING = "training.json"  # what a training took and gave
+TRAINING = "training.json"  # counts, time and memory of a training
 METRICS = "metrics.json"  # of an evaluation
 
 # in an experiment's folder
-PLAN = "plan.json"  # the trials that were asked for
-DECLARED = "declared.jsonl"  # the metrics that verdicts were declared to be about, and when
-TUNING = "tuning.json"  # of a search: what was searched for an arm of a sweep, and what was found
-SEED = "-seed"  # in the name of a trial's folder, between hash and seed
-TRIAL_GLOB = f"*/*/*{SEED}*"  # the trials that are there
+PLAN = "plan.json"  # all trials of the commands so far
+DECLARED = "declared.jsonl"  # declared questions, with their times
+TUNING = "tuning.json"  # of a search: its ranges and points
+SEED = "-seed"  # between hash and seed in the name of a trial's folder
+TRIAL_GLOB = f"*/*/*{SEED}*"  # all trials' folders
 
 # in a trial's folder
 CONFIG = "config.yaml"
 RESULTS = "results.json"  # written last: a trial that has it is complete
-FAILED = "failed.json"  # why it failed
+FAILED = "failed.json"  # the error of the last run
 LOG = "log.txt"
 LOCK = ".lock"
-SUBMITTED = ".submitted.json"  # the Slurm job that was given the trial
-BUILDING = "building.json"  # the stage that an unfinished trial is at, and where
+SUBMITTED = ".submitted.json"  # the trial's Slurm job
+BUILDING = "building.json"  # the present stage of an unfinished trial, and its folder
 INIT_REPORT = "init_report.json"
 PER_VIEW = "per_view.csv"
-FROM_PIXELS = "from_pixels.json"  # measures of pictures, in a trial that an archive brought without its pictures
+FROM_PIXELS = "from_pixels.json"  # measures of pictures, in a trial from an archive without pictures
 CURVES = "metrics.jsonl"  # of the training
-EVENTS = "events.jsonl"  # what every refinement did
+EVENTS = "events.jsonl"  # counts of every refinement by cause
 HISTOGRAMS = "volume_histograms.jsonl"
 POINT_CLOUD = "point_cloud.ply"
 TRAINER_LOG = "trainer.log"  # the output of another program that trained
-LINEAGE = "lineage.npz"  # for each Gaussian its parent, and the rule that made it
-RENDERS, GROUND_TRUTH = "renders", "ground_truth"  # a file for each test view
-MASKS = "masks"  # of the test views that ignore some pixels: black there
+LINEAGE = "lineage.npz"  # each Gaussian's parent, and the rule that made it
+RENDERS, GROUND_TRUTH = "renders", "ground_truth"  # a picture per test view
+MASKS = "masks"  # masks of test views: ignored pixels are black
 FIGURES = "figures"  # pictures for the report
-INITIAL_CLOUD = "initial_cloud.png"  # one of them
-ELLIPSOIDS = "ellipsoids.png"  # another
+INITIAL_CLOUD = "initial_cloud.png"  # in FIGURES
+ELLIPSOIDS = "ellipsoids.png"  # in FIGURES

@@ -1,6 +1,6 @@
-"""The inputs of a finished trial's results, as ``results.json`` says them, and whether they still hold.
+"""The recorded inputs of a finished trial (``made_of`` in ``results.json``), and what has changed since.
 
-A sweep that is given again recognises what is done by this, without reading photographs. Loads no torch.
+By these a repeated sweep recognises finished trials without reading photographs. Loads no torch.
 """
 
 import hashlib
@@ -23,22 +23,23 @@ from gsbench.runs.store import read_manifest
 from gsbench.runs.trial_record import TrialRecord
 
 MADE_OF = "made_of"  # the key in results.json
-READ_LATER = (PER_VIEW, CURVES, EVENTS, HISTOGRAMS)  # beside the results, by tables and reports
-PYCOLMAP = "pycolmap"  # the package whose version has a part in every cloud
-MOST_HASHED = 1 << 20  # bytes of a file whose content is compared as well, since a flipped bit keeps size and time
+READ_LATER = (PER_VIEW, CURVES, EVENTS, HISTOGRAMS)  # files that tables and reports read
+PYCOLMAP = "pycolmap"  # the package whose version affects every initial cloud
+# Files up to so many bytes are compared by content, since a flipped bit changes neither size nor time.
+MOST_HASHED = 1 << 20
 
 Stamp = tuple[int, ...]  # size in bytes, times of change in ns
 
-_digests: dict[Stamp, str] = {}  # by a file's device, number and state: what this process has read
+_digests: dict[Stamp, str] = {}  # sha256 of files that this process has read, by device, inode and stamp
 
 
 @dataclass(frozen=True, kw_only=True)
 class MadeOf(Record):
-    """The configuration with its hash, versions, and files with their stamps.
+    """The configuration (``settings``) and its hash (``config``), versions, and files with their stamps.
 
-    ``results`` is the hash of the rest of ``results.json``, ``sources`` are files of the user's and ``folders`` where
-    they lie, ``entries`` folders in the store, ``published`` files in the trial's folder, of which ``digests`` has the
-    sha256 of those that tables and reports read, and of small ones.
+    ``results`` is the hash of the rest of ``results.json``. ``sources`` are the user's files, ``folders`` their folders
+    with times of change. ``entries`` are the stages' results in the store. ``published`` are files in the trial's
+    folder; ``digests`` has the sha256 of those that tables and reports read, and of small ones.
     """
 
     results: str
@@ -58,7 +59,7 @@ class MadeOf(Record):
 
 
 @dataclass(frozen=True, kw_only=True)
-class OnDisk(Record):
+class ResultsFile(Record):
     """The part of ``results.json`` that this module reads."""
 
     made_of: MadeOf | None = field(default=None, repr=False)
@@ -72,10 +73,9 @@ def describe_inputs(
     entries: Mapping[str, Path],
     published: Iterable[Path],
 ) -> MadeOf:
-    """The record of what the results ``content`` of the trial in ``folder`` were made of; files are as they are now.
+    """The inputs of the results ``content`` of the trial in ``folder``, with the present state of files.
 
-    ``sources`` are the user's files, ``entries`` results of stages by name, ``published`` the files that the folder
-    shows.
+    ``sources`` are the user's files, ``entries`` results of stages by name, ``published`` files in the trial's folder.
     """
     sources = sorted(sources)
     names = {path.relative_to(folder).as_posix(): path for path in published}
@@ -85,7 +85,7 @@ def describe_inputs(
         stages={stage.name: stage.version for stage in STAGES},
         pycolmap=version_of(PYCOLMAP),
         sources={str(path): source_stamp_of(path) for path in sources},
-        # A folder's time of change tells of files that came or went.
+        # Adding or removing a file changes its folder's time.
         folders={str(path): path.stat().st_mtime_ns for path in sorted({path.parent for path in sources})},
         entries={name: str(path) for name, path in entries.items()},
         published={name: stamp_of(path) for name, path in names.items()},
@@ -94,10 +94,10 @@ def describe_inputs(
     )
 
 
-def changes(folder: Path, values: dict[str, Any], record: TrialRecord, made_of: MadeOf) -> Iterator[str]:
-    """Reasons why the complete trial in ``folder`` no longer holds, the quickest to find first.
+def find_changes(folder: Path, values: dict[str, Any], record: TrialRecord, made_of: MadeOf) -> Iterator[str]:
+    """Reasons why the complete trial in ``folder`` is out of date; those that are found quickly come first.
 
-    Files are compared by size and time of change, small ones that gsbench wrote also by their content.
+    Files are compared by size and time of change, small files of gsbench's also by content.
     """
     present = config_hash(values)
     if record.hashes.get("config") != present or made_of.config != present:
@@ -111,27 +111,27 @@ def changes(folder: Path, values: dict[str, Any], record: TrialRecord, made_of: 
         yield f"the code of gsbench changed in: {', '.join(rooms)}"
     if made_of.pycolmap != (installed := version_of(PYCOLMAP)):
         yield f"it was made with {PYCOLMAP} {made_of.pycolmap}, and {installed} is installed"
-    for place, stamp in made_of.sources.items():
-        yield from _change_of(Path(place), stamp, source_stamp_of)
-    for place, changed in made_of.folders.items():
-        if _changed_at(Path(place)) != changed:
-            yield f"files have come to {place}, or gone from there"
+    for source, stamp in made_of.sources.items():
+        yield from _change_of(Path(source), stamp, source_stamp_of)
+    for source_folder, changed in made_of.folders.items():
+        if _changed_at(Path(source_folder)) != changed:
+            yield f"files have come to {source_folder}, or gone from there"
     for name, stamp in made_of.published.items():
         yield from _change_of(folder / name, stamp, stamp_of)
         if name in made_of.digests and _digest(folder / name) != made_of.digests[name]:
             yield f"{folder / name} has changed"
-    for name, place in made_of.entries.items():
+    for name, entry in made_of.entries.items():
         try:
-            read_manifest(Path(place))
+            read_manifest(Path(entry))
         except ValueError as error:
             yield f"the result of its stage {name} in the store is damaged or gone ({error})"
 
 
 def content_hash(content: bytes) -> str:
-    """The hash of what ``results.json`` says but for what it was made of, whatever its spaces."""
-    whole = from_json(content)
-    whole.pop(MADE_OF, None)
-    return sha256_of(whole)
+    """The hash of the values in ``results.json`` without ``made_of``; white space does not matter."""
+    values = from_json(content)
+    values.pop(MADE_OF, None)
+    return sha256_of(values)
 
 
 def stamp_of(path: Path) -> Stamp:
@@ -141,17 +141,17 @@ def stamp_of(path: Path) -> Stamp:
 
 
 def source_stamp_of(path: Path) -> Stamp:
-    """Size and time of change, and when the system saw a change, which nobody can set back; raises OSError.
+    """Size, mtime and ctime of a user's file; raises OSError.
 
-    For what is the user's, which a program may have replaced and given the time of before. Our own files are links,
-    whose state changes with each further one.
+    A program may replace a file and restore its mtime, but not its ctime. The ctime of gsbench's own files is not used:
+    they are hard links, and each further link changes it.
     """
     state = os.stat(path)
     return state.st_size, state.st_mtime_ns, state.st_ctime_ns
 
 
 def version_of(package: str) -> str | None:
-    """The version of an installed package; None where there is none."""
+    """The version of an installed package; None if it is not installed."""
     try:
         return version(package)
     except PackageNotFoundError:
@@ -178,9 +178,9 @@ def _is_hashed(name: str, path: Path) -> bool:
 
 
 def _digest(path: Path) -> str | None:
-    """The sha256 of a file's content; None where it cannot be read.
+    """The sha256 of a file's content; None if it cannot be read.
 
-    Trials share photographs as links to one file, whose content is read once.
+    Trials share photographs as hard links to one file, so its content is read once.
     """
     try:
         state = os.stat(path)

@@ -1,8 +1,8 @@
-"""A content-addressed store of stage results: the same inputs are never computed twice.
+"""A store of stage results by the key of their inputs, so that nothing is computed twice.
 
-Layout: ``<root>/<stage>/<key>/`` holds a finished result, with ``manifest.json`` written last; ``.<key>.partial/`` is
-where it is built, and what a killed build leaves; ``.<key>.lock`` lets one process build while others wait, and stays
-(it is empty).
+``<root>/<stage>/<key>/`` is a finished result; its ``manifest.json`` is written last. ``.<key>.partial/`` is the folder
+in which it is built, and which a killed build leaves. While one process holds ``.<key>.lock`` (an empty file that is
+never removed) and builds, others wait.
 """
 
 import logging
@@ -35,12 +35,12 @@ from gsbench.system.locks import BusyError, hold
 
 log = logging.getLogger(__name__)
 
-LEFTOVER_AGE = 24 * 3600.0  # seconds: temporary files outside the locks are swept when older
+LEFTOVER_AGE = 24 * 3600.0  # seconds after which temporary folders that no lock guards are removed
 
 
 @dataclass(frozen=True, kw_only=True)
 class Output(Record):
-    """A file of a result as it was written; the time of change is in ns."""
+    """A file of a result as it was written."""
 
     size: Count
     mtime_ns: int
@@ -49,7 +49,7 @@ class Output(Record):
 
 @dataclass(frozen=True, kw_only=True)
 class Manifest(Record):
-    """``manifest.json`` of a finished result: what made it, and a checksum of every file."""
+    """``manifest.json`` of a finished result: its inputs, and a checksum of every file."""
 
     stage: str
     version: int
@@ -66,8 +66,8 @@ class Manifest(Record):
 
 
 @dataclass(frozen=True)
-class Entry:
-    """A finished result in the store."""
+class StoredResult:
+    """A finished result in the store; ``cached`` if it was not built now, ``seconds`` is the time of building it."""
 
     path: Path
     key: str
@@ -76,11 +76,11 @@ class Entry:
 
 
 class Store:
-    """The store below ``root``; ``on_build`` is told of each stage that is built, and of the folder where."""
+    """The store below ``root``; ``on_build`` is called with each stage that is built, and its partial folder."""
 
     def __init__(self, root: Path, on_build: Callable[[Stage, Path], None] = lambda stage, folder: None) -> None:
         self.root, self.on_build = root, on_build
-        self._verified: set[Path] = set()  # results whose checksums this process has compared or made
+        self._verified: set[Path] = set()  # results whose checksums this process has compared or computed
 
     def folder(self, stage: Stage, key: str) -> Path:
         """The folder of the finished result of ``stage`` under ``key``."""
@@ -91,31 +91,31 @@ class Store:
         return self.folder(step.stage, step.key)
 
     def partial(self, stage: Stage, key: str) -> Path:
-        """The folder in which the result of ``step`` is built."""
+        """The folder in which the result of ``stage`` under ``key`` is built."""
         return self.root / stage.name / f".{key}.partial"
 
-    def find(self, step: Step) -> Entry | None:
-        """The finished and sound result of ``step``, or None."""
+    def find(self, step: Step) -> StoredResult | None:
+        """The result of ``step`` if it is finished and sound, else None."""
         try:
             return self._read(self.path(step))
         except ValueError:
             return None
 
-    def get(self, step: Step) -> Entry:
-        """The result of ``step``, built unless it is there; published by an atomic rename.
+    def get(self, step: Step) -> StoredResult:
+        """The result of ``step``; it is built unless it exists, and published by an atomic rename.
 
-        A damaged result is named and built again. What is found may become the input of further steps, so its checksums
-        are compared once: a flipped bit keeps size and time of change. Raises DiskFullError, or InputError where the
-        store is read-only.
+        A damaged result is built again, with a warning. Raises DiskFullError, or InputError if the store is read-only.
         """
         final = self.path(step)
+        # An existing result may become the input of further steps, so its checksums are compared once in each process:
+        # a flipped bit changes neither size nor time of change.
         with suppress(ValueError):
             return self._read_verified(final)
         with storage_errors(self.root.parent):
             require_no_links(self.root.parent, self.partial(step.stage, step.key))
             final.parent.mkdir(parents=True, exist_ok=True)
             with hold(final.parent / f".{step.key}.lock", f"{step.stage.name} {step.key[:8]}"):
-                if os.path.lexists(final):
+                if os.path.lexists(final):  # another process may have built it while this one waited
                     try:
                         return self._read_verified(final)
                     except ValueError as error:
@@ -123,18 +123,18 @@ class Store:
                         _remove(final)
                 return self._build(step)
 
-    def _read_verified(self, path: Path) -> Entry:
-        entry = self._read(path, thorough=path not in self._verified)
+    def _read_verified(self, path: Path) -> StoredResult:
+        result = self._read(path, thorough=path not in self._verified)
         self._verified.add(path)
-        return entry
+        return result
 
-    def _read(self, path: Path, thorough: bool = False) -> Entry:
+    def _read(self, path: Path, thorough: bool = False) -> StoredResult:
         if path.is_symlink():
             raise ValueError("it is a link")
-        return Entry(path, path.name, read_manifest(path, thorough=thorough).seconds, cached=True)
+        return StoredResult(path, path.name, read_manifest(path, thorough=thorough).seconds, cached=True)
 
-    def _build(self, step: Step) -> Entry:
-        """Build or finish the partial folder and publish it; the caller holds the lock of the step's key."""
+    def _build(self, step: Step) -> StoredResult:
+        """Build or finish the partial folder, and publish it. The caller holds the lock of the step's key."""
         final, partial, stage = self.path(step), self.partial(step.stage, step.key), step.stage
         seconds = _finished_seconds(partial, step.key)
         if seconds is None:
@@ -156,26 +156,26 @@ class Store:
         os.replace(partial, final)
         sync_to_disk(final.parent)
         self._verified.add(final)
-        return Entry(final, step.key, seconds, cached=False)
+        return StoredResult(final, step.key, seconds, cached=False)
 
     def sweep(self, stages: Iterable[Stage]) -> None:
-        """Remove what killed processes left and nobody goes on with; what a living process holds is left alone."""
+        """Remove the remains of killed processes that no build would continue. Locked folders are left alone."""
         for stage in stages:
             for partial in (self.root / stage.name).glob(".*.partial"):
                 key = partial.name[1 : -len(".partial")]
                 if not stage.resumable or self.folder(stage, key).exists():
                     with suppress(BusyError, OSError), hold(partial.with_name(f".{key}.lock"), key, wait=False):
                         _remove(partial)
-            for doomed in (self.root / stage.name).glob(".*.removed"):
-                shutil.rmtree(doomed, ignore_errors=True)
-        for work in (self.root / VIEWS).glob(".*"):  # prepared images are published by a rename from such folders
+            for removed in (self.root / stage.name).glob(".*.removed"):
+                shutil.rmtree(removed, ignore_errors=True)
+        for work in (self.root / VIEWS).glob(".*"):  # photographs are prepared in such folders, which have no lock
             with suppress(OSError):
                 if work.is_dir() and time.time() - work.stat().st_mtime > LEFTOVER_AGE:
                     shutil.rmtree(work, ignore_errors=True)
 
 
 def write_manifest(folder: Path, step: Step, seconds: float) -> None:
-    """Record what made ``folder`` and a checksum of every file in it, after all of them are on the disk."""
+    """Write the manifest of ``folder`` with a checksum of every file, after all files are safely on the disk."""
     scratch = {path for pattern in step.stage.scratch for path in folder.rglob(pattern)}
     outputs = {}
     for path in sorted(folder.rglob("*")):
@@ -198,9 +198,10 @@ def write_manifest(folder: Path, step: Step, seconds: float) -> None:
 
 
 def read_manifest(folder: Path, key: str | None = None, thorough: bool = False) -> Manifest:
-    """The manifest of the result of ``key`` (else the folder's name); raises ValueError naming what is damaged.
+    """Read and check the manifest in ``folder``; ``key`` defaults to the folder's name.
 
-    A file whose size and time of change are as recorded counts as sound unless ``thorough``; others are read whole.
+    A file with the recorded size and time of change counts as sound, unless ``thorough``; other files are compared by
+    checksum. Raises ValueError that names what is damaged.
     """
     try:
         manifest = read_typed(folder / MANIFEST, Manifest)
@@ -231,7 +232,7 @@ def _is_sound(folder: Path, name: str, recorded: Output, thorough: bool) -> bool
 
 
 def _finished_seconds(partial: Path, key: str) -> float | None:
-    """The build's time, where ``partial`` was killed after its last file was written and only has to be published."""
+    """The build's time if it was killed between writing the manifest and publishing; None for any other build."""
     if not (partial / MANIFEST).exists():
         return None
     try:
@@ -241,8 +242,8 @@ def _finished_seconds(partial: Path, key: str) -> float | None:
 
 
 def _remove(folder: Path) -> None:
-    """Remove a folder so that a kill in between leaves nothing that looks like a result."""
-    doomed = folder.with_name(f".{folder.name.lstrip('.')}.removed")
-    shutil.rmtree(doomed, ignore_errors=True)
-    os.replace(folder, doomed)
-    shutil.rmtree(doomed, ignore_errors=True)
+    """Remove a folder. It is renamed first, so that a kill in between leaves nothing that looks like a result."""
+    removed = folder.with_name(f".{folder.name.lstrip('.')}.removed")
+    shutil.rmtree(removed, ignore_errors=True)
+    os.replace(folder, removed)
+    shutil.rmtree(removed, ignore_errors=True)

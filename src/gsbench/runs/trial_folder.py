@@ -1,6 +1,6 @@
-"""A trial's folder: where it lies, in which state it is, and all that is read from or written to its files.
+"""A trial's folder: its path, its state, and reading and writing its files.
 
-Nothing here follows a link (`gsbench.files.open_plain`): a runs folder may be somebody else's. Loads no torch.
+Nothing here follows a link (`gsbench.files.open_plain`): the runs folder may come from a stranger. Loads no torch.
 """
 
 from __future__ import annotations
@@ -35,7 +35,15 @@ from gsbench.runs.layout import (
     RESULTS,
     SEED,
 )
-from gsbench.runs.made_of import MADE_OF, READ_LATER, MadeOf, OnDisk, changes, content_hash, describe_inputs
+from gsbench.runs.made_of import (
+    MADE_OF,
+    READ_LATER,
+    MadeOf,
+    ResultsFile,
+    content_hash,
+    describe_inputs,
+    find_changes,
+)
 from gsbench.runs.trial_record import Histogram, Row, TrialRecord, UnfinishedError, read_rows, record_from
 from gsbench.settings import FolderName
 from gsbench.system.locks import is_held
@@ -43,19 +51,19 @@ from gsbench.system.locks import is_held
 State = Literal["done", "running", "failed", "partial", "damaged", "missing"]
 Rows = list[dict[str, bool | int | float]]
 
-TAIL_BYTES = 4096
+TAIL_BYTES = 4096  # of a growing log, enough for its last rows
 
 
 @dataclass(frozen=True, kw_only=True)
 class NamedGroup(Record):
-    """A group of the configuration, of which only the name must be there."""
+    """A group of the configuration that must have a name."""
 
     name: FolderName
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrackingSettings(Record):
-    """Settings of the group ``tracking`` that mirroring a trial later needs."""
+    """The settings of the group ``tracking`` that later mirroring of a trial needs."""
 
     uri: str | None
     flush_seconds: Amount
@@ -65,7 +73,7 @@ class TrackingSettings(Record):
 
 @dataclass(frozen=True, kw_only=True)
 class Configuration(Record):
-    """Keys that a trial's ``config.yaml`` must have to be used at all; `gsbench.config.schema` has the rest."""
+    """The keys that every usable ``config.yaml`` of a trial has; `gsbench.config.schema` checks the others."""
 
     name: FolderName
     seed: Count
@@ -78,7 +86,7 @@ class Configuration(Record):
 
 @dataclass(frozen=True, kw_only=True)
 class Failure(Record):
-    """``failed.json``: the kind of the error, its text, where it came from, and when (Unix time)."""
+    """``failed.json``: the error's type, its text, its traceback, and the Unix time."""
 
     error: str = ""
     message: str = ""
@@ -89,14 +97,14 @@ class Failure(Record):
 
     @property
     def reason(self) -> str:
-        """The first line of the text."""
+        """The first line of the message."""
         lines = (self.message or self.error).strip().splitlines()
         return one_line(lines[0]) if lines else "no reason was given"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Building(Record):
-    """``building.json``: the stage that an unfinished trial is at, and the folder where it is built."""
+    """``building.json``: the present stage of an unfinished trial, and the folder in which it is built."""
 
     stage: str = ""
     folder: str = ""
@@ -112,7 +120,7 @@ class TrialFolder:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._digests: Mapping[str, str] | None = None  # of the results that were read last
+        self._digests: Mapping[str, str] | None = None  # sha256 of files by name, from the results that were read last
 
     @classmethod
     def of(cls, values: Mapping[str, Any]) -> TrialFolder:
@@ -139,17 +147,17 @@ class TrialFolder:
 
     @property
     def lock(self) -> Path:
-        """The lock that the process which runs the trial holds."""
+        """The lock file of the process that runs the trial."""
         return self.path / LOCK
 
     @property
     def label(self) -> str:
-        """Scene, arm and seed, for people."""
+        """Scene, arm, seed and hash, for messages."""
         hash8, _, seed = self.path.name.partition(SEED)
         return f"{self.path.parent.parent.name}/{self.path.parent.name} seed {seed} ({hash8})"
 
     def require_no_links(self) -> None:
-        """Raise InputError where the folder, what is above it, or anything below it is a link, a pipe or a device."""
+        """Raise InputError if the folder, a folder above it, or anything in it is a link, a pipe or a device."""
         require_no_links(self.runs, self.path, below=True)
 
     # ---- state
@@ -178,11 +186,11 @@ class TrialFolder:
         return (self.path / FAILED).exists()
 
     def building(self) -> Building:
-        """The stage that the trial is at; an empty one where it is at none, or that cannot be read."""
+        """The present stage of the trial; empty if it has none, or if the file cannot be read."""
         return read_if_sound(self.path / BUILDING, Building) or Building()
 
     def stage_and_step(self) -> tuple[str, int]:
-        """The stage that the unfinished trial is at ("" if none has begun), and the last iteration that it logged."""
+        """The present stage of the unfinished trial ("" if none has begun), and the last logged iteration."""
         building = self.building()
         try:
             tail = read_tail(Path(building.folder, CURVES), TAIL_BYTES) if building.folder else b""
@@ -194,48 +202,47 @@ class TrialFolder:
     # ---- configuration
 
     def configuration(self) -> dict[str, Any]:
-        """The configuration that the trial wrote, which allows nothing to run; raises InputError where unreadable."""
+        """The configuration in ``config.yaml``, without its permissions; raises InputError if it cannot be used."""
         path = self.path / CONFIG
         try:
             values = read_yaml(path)
         except FileNotFoundError:
             raise InputError(f"{path} is not there: give the command of the trial again") from None
         typed(to_json(values), Configuration, path)
-        return values | {"allow_targets": []}  # permission comes from the one who types
+        return values | {"allow_targets": []}  # only the user who gives a command may allow code to run
 
     # ---- results
 
     def record(self) -> TrialRecord:
         """The content of ``results.json``.
 
-        Raises FileNotFoundError where there is none, and DamagedError where it is damaged, unfinished, or not as it was
-        written. Results that do not say what they were made of cannot be checked, and are believed.
+        Raises FileNotFoundError if there is none, and DamagedError if it is damaged, unfinished, or was changed after
+        it was written. Results without ``made_of`` cannot be checked for changes, and are accepted.
         """
         path = self.path / RESULTS
         content = read_bytes(path)
         record = record_from(content, path)
-        made_of = typed(content, OnDisk, path).made_of
+        made_of = typed(content, ResultsFile, path).made_of
         if made_of is not None and made_of.results != content_hash(content):
             raise DamagedError(path, f"was changed after it was written: `gsbench retry {self.home.name}` repairs it")
         self._digests = {} if made_of is None else made_of.digests
         return record
 
     def sound_record(self) -> TrialRecord | None:
-        """The same as `record`, but None where the trial has no results that can be relied on."""
+        """The same as `record`, but None if the trial has no sound results."""
         try:
             return self.record()
         except (FileNotFoundError, DamagedError):
             return None
 
     def made_of(self) -> MadeOf | None:
-        """The inputs of the results; None where they do not say. Raises as `record`, but checks nothing."""
-        return read_typed(self.path / RESULTS, OnDisk).made_of
+        """The inputs of the results, not checked for changes; None if they are not recorded. Raises as `record`."""
+        return read_typed(self.path / RESULTS, ResultsFile).made_of
 
     def settings(self) -> dict[str, Any]:
-        """The settings that the results were made by, else those of ``config.yaml``.
+        """The settings in ``results.json``, else those in ``config.yaml``: YAML takes some twenty times longer to read.
 
-        Those in ``results.json`` are some twenty times quicker to read than YAML. Raises FileNotFoundError and
-        DamagedError.
+        Raises FileNotFoundError and DamagedError.
         """
         try:
             made_of = self.made_of()
@@ -253,18 +260,18 @@ class TrialFolder:
     ) -> bool:
         """Write ``results.json``, after which the trial is complete.
 
-        ``sources`` are the user's files, ``entries`` results of stages by name, ``published`` the files that the folder
-        shows. True where equal results stood there already: what they were made of is written anew, and the file keeps
-        its time.
+        ``sources`` are the user's files, ``entries`` results of stages by name, ``published`` files in this folder.
+        Returns True if it already had equal results: then only ``made_of`` is renewed, and the file keeps its time.
         """
         path, content = self.path / RESULTS, record.to_json()
-        known = self.sound_record()
-        before = path.stat() if known is not None and known.to_json() == content else None
-        shown = sorted({*published, *(self.path / name for name in READ_LATER if (self.path / name).is_file())})
-        made_of = describe_inputs(self.path, values, content, sources, entries or {}, shown)
+        present = self.sound_record()
+        before = path.stat() if present is not None and present.to_json() == content else None
+        files = sorted({*published, *(self.path / name for name in READ_LATER if (self.path / name).is_file())})
+        made_of = describe_inputs(self.path, values, content, sources, entries or {}, files)
         with atomic(path) as temporary:
             temporary.write_text(json.dumps(content | {MADE_OF: made_of.to_json()}, indent=1, allow_nan=False) + "\n")
-            if before is not None:  # a verdict counts results that were there before it was declared
+            # Verdicts count results from before their declaration by this time, so equal results must not look newer.
+            if before is not None:
                 os.utime(temporary, ns=(before.st_atime_ns, before.st_mtime_ns))
         return before is not None
 
@@ -273,10 +280,10 @@ class TrialFolder:
         values: dict[str, Any],
         unavailable_now: Callable[[dict[str, Any]], Collection[str]] = lambda options: (),
     ) -> str:
-        """The reason to run or check the trial with the resolved configuration ``values``; "" where it is done.
+        """The reason to run or check the trial with the resolved configuration ``values``; "" if it is done.
 
-        It is done where nothing that it was made of has changed. A trial that lacks a metric for want of weights is
-        done only if ``unavailable_now``, called with the ``eval`` settings, says that it would lack it again.
+        It is done if none of its inputs has changed. If it lacks a metric whose weights or packages were missing, it is
+        done only if ``unavailable_now``, called with the ``eval`` settings, still contains that metric.
         """
         try:
             record, made_of = self.record(), self.made_of()
@@ -286,26 +293,25 @@ class TrialFolder:
             return f"{error.path.name} {error.reason}"
         if made_of is None:
             return f"{RESULTS} does not say what it was made of"
-        return next(changes(self.path, values, record, made_of), "") or _lacking(
-            record, unavailable_now, values["eval"]
-        )
+        change = next(find_changes(self.path, values, record, made_of), "")
+        return change or _now_available(record, unavailable_now, values["eval"])
 
     # ---- files beside the results
 
     def curves(self) -> Rows:
-        """The rows of ``metrics.jsonl``, each with an integer ``step``; [] where there is none.
+        """The rows of ``metrics.jsonl``, each with an integer ``step``; [] if there is no such file.
 
-        A file of a finished trial that is not as it was written is left out, as is what follows a damaged row, with a
-        warning.
+        With a warning, a finished trial's file that was changed after it was written is left out, and so are all rows
+        from a damaged one on.
         """
         return self.rows(CURVES)
 
     def events(self) -> Rows:
-        """The rows of ``events.jsonl``: what every refinement did; as `curves`."""
+        """The rows of ``events.jsonl`` with the counts of every refinement; read as `curves`."""
         return self.rows(EVENTS)
 
     def histograms(self) -> list[Histogram]:
-        """The rows of ``volume_histograms.jsonl``; as `curves`."""
+        """The rows of ``volume_histograms.jsonl``; read as `curves`."""
         return self.rows(HISTOGRAMS, Histogram)
 
     def rows(self, name: str, kind: Any = Row) -> list[Any]:
@@ -332,25 +338,26 @@ class TrialFolder:
         return sorted((self.path / kind).glob("*.png"))
 
     def _unchanged(self, name: str) -> bytes:
-        """The content of a file; raises as `read_bytes`, and DamagedError where it is not as it was written."""
+        """The content of a file; raises as `read_bytes`, and DamagedError if it was changed after it was written."""
         content = read_bytes(self.path / name)
         if self._digests is None:
             self.sound_record()
-        wanted = (self._digests or {}).get(name)
-        if wanted is not None and hashlib.sha256(content).hexdigest() != wanted:
+        recorded = (self._digests or {}).get(name)
+        if recorded is not None and hashlib.sha256(content).hexdigest() != recorded:
             raise DamagedError(
                 self.path / name, "was changed after it was written: delete it, and `gsbench retry` repairs the trial"
             )
         return content
 
 
-def _lacking(
+def _now_available(
     record: TrialRecord, unavailable_now: Callable[[dict[str, Any]], Collection[str]], options: dict[str, Any]
 ) -> str:
-    """The metrics that a trial lacks and that could be computed now, in words; "" where there are none."""
-    awaited = set(record.awaited)  # those that may still come, once their weights or packages are there
-    missing = sorted(awaited - set(unavailable_now(options))) if awaited else []
-    return f"it lacks {', '.join(missing)}, which can be computed now" if missing else ""
+    """Name the awaited metrics that can be computed by now; "" if there are none."""
+    if not record.awaited:  # asking loads torch
+        return ""
+    available = sorted(set(record.awaited) - set(unavailable_now(options)))
+    return f"it lacks {', '.join(available)}, which can be computed now" if available else ""
 
 
 def _number(text: str) -> float:

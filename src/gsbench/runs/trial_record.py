@@ -1,5 +1,5 @@
-"""Content of a trial's files: of ``results.json``, of the records that its stages leave in the store beside their
-files (``training.json``, ``metrics.json``), and of the JSON lines of a training. Writers fill these, readers get them.
+"""The types of a trial's files: ``results.json``, the records of stages in the store (``training.json``,
+``metrics.json``), and the JSON lines of a training. They are used for writing and for reading.
 """
 
 import logging
@@ -29,20 +29,20 @@ from gsbench.runs.layout import METRICS, TRAINING
 
 log = logging.getLogger(__name__)
 
-# ``evaluated_from`` of what gsbench did not train itself: the model was rendered here, or only renders are known.
+# ``evaluated_from`` of trials that gsbench did not train: it rendered another program's model, or has only renders.
 FROM_MODEL: Final = "model"
 FROM_RENDERS: Final = "renders"
-MADE_ELSEWHERE = "made by another program"  # how the reason of a quantity starts that nobody can know of such a trial
+MADE_ELSEWHERE = "made by another program"  # start of the reason why such a trial lacks a quantity
 RENDERS_ALONE = f"{MADE_ELSEWHERE}; only the renders are known"
 
-BY_LISTS = "list"  # of `split_text`
+BY_LISTS = "list"  # `split_text` of a split by lists of views
 
 Iteration = Annotated[str, Field(pattern=r"^\d{1,18}$")]  # as the key of an object
 
 
 @dataclass(frozen=True, kw_only=True)
 class Budget(Record):
-    """Limits on the growth of a trial: a cap on Gaussians, the rule that keeps it, a limit of time in s."""
+    """Limits on the growth of a trial: a maximum of Gaussians, the rule that keeps it, and a time limit in s."""
 
     max_gaussians: Count | None = None
     cap: str | None = None
@@ -51,17 +51,17 @@ class Budget(Record):
 
 @dataclass(frozen=True, kw_only=True)
 class Code(Record):
-    """The versions of the code: sha256 of the a user's modules, versions of gsbench's stages.
+    """The versions of the code: sha256 of a user's modules (``sources``), versions of gsbench's stages.
 
-    ``rooms`` are those of gsbench that had a part, with their states (`gsbench.runs.code`); ``commit`` is that of the
-    checkout that trained, ``edited`` says whether files that git follows had changed.
+    ``rooms`` has the states of the rooms that made the trial (`gsbench.runs.code`). ``commit`` is that of the checkout
+    that trained; ``edited`` says whether files that git tracks had changed.
     """
 
     sources: dict[str, str] = field(default_factory=dict)
     stages: dict[str, int] = field(default_factory=dict)
     rooms: dict[str, str] = field(default_factory=dict)
     commit: str | None = None
-    edited: bool | None = None  # None: without a checkout, or not to be told
+    edited: bool | None = None  # None without a checkout, or if git cannot tell
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,15 +85,15 @@ class Earlier(Record):
 
 @dataclass(frozen=True, kw_only=True)
 class Declared(Record):
-    """The metric that the verdict was declared to be about, and when (`gsbench.runs.declaration`)."""
+    """The metric that was declared for the verdict, and when (`gsbench.runs.declaration`)."""
 
     metric: str
     time: str
 
 
 @dataclass(frozen=True, kw_only=True)
-class Trainer(Record):
-    """The program that trained in gsbench's place: as it is called, its version, what it says of it, the command."""
+class ExternalTrainer(Record):
+    """The program that trained in gsbench's place: its name, its version, what it prints on that, and the command."""
 
     program: str
     version: str
@@ -103,10 +103,10 @@ class Trainer(Record):
 
 @dataclass(frozen=True, kw_only=True)
 class TrialRecord(Record):
-    """A finished trial. What nobody can know of it is None, or absent from the file where that is the default.
+    """A finished trial. A value that cannot be known is None; the file leaves out None if that is the default.
 
-    ``metrics`` are means over the test views, ``unavailable`` says why others are missing and ``awaited`` names those
-    of them that may still come; ``seconds`` are by stage, ``resolution`` is (width, height) in px.
+    ``metrics`` are means over the test views. ``unavailable`` says why other metrics are missing; ``awaited`` names
+    those of them that need only weights or packages. ``seconds`` are by stage; ``resolution`` is (width, height) in px.
     """
 
     status: Literal["complete"]
@@ -126,24 +126,24 @@ class TrialRecord(Record):
     peak_memory_mb: Amount | None
     hashes: dict[str, str]
     versions: dict[str, str]
-    evaluated_from: Literal["model", "renders"] | None = None  # what gsbench did not train itself
-    trained_by: Trainer | None = None
-    measured: str | None = None  # when the evaluation came into the store
+    evaluated_from: Literal["model", "renders"] | None = None  # None if gsbench trained it
+    trained_by: ExternalTrainer | None = None
+    measured: str | None = None  # time at which the evaluation was stored
     declared: Declared | None = None
     awaited: list[str] = field(default_factory=list)
     metric_facts: dict[str, MetricRecord] = field(default_factory=dict)
     metrics_at: dict[Iteration, Earlier] = field(default_factory=dict)
-    causes: dict[str, Count] = field(default_factory=dict)  # of the Gaussians that live at the end
+    causes: dict[str, Count] = field(default_factory=dict)  # Gaussians at the end, by the cause of their creation
     scene_extent: Amount | None = None  # world units
     budget: Budget | None = None
     train_views: Count | None = None
     test_views: Count | None = None
-    split: str = ""  # the views that are held out, as short text (`split_text`)
-    held_out: str = ""  # the same in a sentence
+    split: str = ""  # the rule that holds views out, as short text (`split_text`)
+    held_out: str = ""  # the same as a sentence
     resolution: tuple[Count, Count] | None = None
     events: dict[str, Count] = field(default_factory=dict)  # totals of the refinements, by cause
     init_report: dict[str, Any] = field(default_factory=dict)
-    renders: dict[str, str] = field(default_factory=dict)  # where the renders of another program came from
+    renders: dict[str, str] = field(default_factory=dict)  # origin of another program's renders
     code: Code = field(default_factory=Code)
     machine: dict[str, str] | None = None
 
@@ -155,24 +155,24 @@ class TrialRecord(Record):
 
 
 class UnfinishedError(DamagedError):
-    """A ``results.json`` that does not say that its trial is complete."""
+    """A ``results.json`` whose status is not "complete"."""
 
 
 def record_from(content: bytes, path: Path) -> TrialRecord:
-    """The record that the JSON of the file ``path`` is; raises DamagedError, and UnfinishedError."""
+    """Parse the ``content`` of the results file ``path``; raises DamagedError and UnfinishedError."""
     try:
         return adapter(TrialRecord).validate_json(content)
     except ValidationError as error:
-        of_status = next((fault for fault in error.errors() if fault["loc"] == ("status",)), None)
-        if of_status is not None:
-            said = "missing" if of_status["type"] == "missing" else reprlib.repr(of_status["input"])
-            raise UnfinishedError(path, f"is unfinished, its status is {said}") from None
+        status_fault = next((fault for fault in error.errors() if fault["loc"] == ("status",)), None)
+        if status_fault is not None:
+            status = "missing" if status_fault["type"] == "missing" else reprlib.repr(status_fault["input"])
+            raise UnfinishedError(path, f"is unfinished, its status is {status}") from None
         raise DamagedError(path, misfit(error)) from None
 
 
 @dataclass(frozen=True, kw_only=True)
 class Training(Record):
-    """Record of what a training took and gave; of another program's, ``trained_by`` and ``evaluated_from`` are set."""
+    """The counts, time and memory of a training. ``trained_by`` and ``evaluated_from`` are set if a program trained."""
 
     iterations: Count
     num_init_points: Count
@@ -182,20 +182,20 @@ class Training(Record):
     seconds: Amount
     peak_memory_mb: Amount | None
     machine: dict[str, str]
-    checkout: dict[str, Any] = field(default_factory=dict)  # the commit of gsbench's own, and whether it was edited
+    checkout: dict[str, Any] = field(default_factory=dict)  # gsbench's commit, and whether files were edited
     evaluated_from: Literal["model", "renders"] | None = None
-    trained_by: Trainer | None = None
+    trained_by: ExternalTrainer | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluation(Record):
-    """The means of the metrics, why others are missing, and which of those may still come."""
+    """The metrics of a trial; fields as in `TrialRecord`."""
 
     metrics: dict[str, Number]
     unavailable: dict[str, str]
     awaited: list[str]
     facts: dict[str, MetricRecord] = field(default_factory=dict)  # of a user's own metrics
-    at: dict[Iteration, Earlier] = field(default_factory=dict)  # by earlier iterations
+    at: dict[Iteration, Earlier] = field(default_factory=dict)  # by iteration
 
 
 def read_training(folder: Path) -> Training:
@@ -209,7 +209,7 @@ def read_evaluation(folder: Path) -> Evaluation:
 
 
 def split_text(config: Mapping[str, Any]) -> str:
-    """``every_nth``, ``sector 0 of 8`` or ``list``, and whether it is matched, or for validation."""
+    """``every_nth``, ``sector 0 of 8`` or ``list``; with ``, matched`` or ``, validation`` if it is."""
     text, sectors = str(config.get("scene.split")), config.get("scene.sectors")
     if text == "sector":
         text = f"sector {config.get('scene.sector')} of {sectors}"
@@ -222,8 +222,8 @@ def split_text(config: Mapping[str, Any]) -> str:
 
 # ---- the JSON lines of a training
 
-STEP = "step"  # the key of every row: the iteration
-Exponent = Annotated[float, Field(ge=-300, le=300)]  # ten to this power is a number
+STEP = "step"  # the key of the iteration in every row
+Exponent = Annotated[float, Field(ge=-300, le=300)]  # ten to this power is a finite number above 0
 
 
 def _with_step(row: dict[str, bool | int | float]) -> dict[str, bool | int | float]:
@@ -234,19 +234,19 @@ def _with_step(row: dict[str, bool | int | float]) -> dict[str, bool | int | flo
 
 
 Value = bool | Whole | Number
-Row = Annotated[dict[str, Value], AfterValidator(_with_step)]  # of ``metrics.jsonl`` and ``events.jsonl``
+Row = Annotated[dict[str, Value], AfterValidator(_with_step)]  # a row of ``metrics.jsonl`` or ``events.jsonl``
 
 
 @dataclass(frozen=True, kw_only=True)
-class Stepped(Record):
-    """A row of any of these files, of which the iteration is asked for."""
+class RowWithStep(Record):
+    """A row of any of these files; only its iteration is checked."""
 
     step: Count
 
 
 @dataclass(frozen=True, kw_only=True)
-class Histogram(Stepped):
-    """A row of ``volume_histograms.jsonl``: counts between edges, the logarithms to the base 10 of volumes."""
+class Histogram(RowWithStep):
+    """A row of ``volume_histograms.jsonl``: counts between edges, which are log10 of volumes."""
 
     log10_edges: list[Exponent]
     counts: list[Amount]
@@ -257,9 +257,10 @@ class Histogram(Stepped):
 
 
 def read_rows(path: Path, kind: Any = Row, read: Callable[[Path], bytes] = read_bytes) -> list[Any]:
-    """The rows of a file, each of type ``kind``; [] where there is none.
+    """The rows of a file, each of type ``kind``; [] if there is no such file.
 
-    ``read`` gives the content. What cannot be read, and what follows a damaged row, is left out, with a warning.
+    ``read`` reads the content. With a warning, a file that cannot be read is left out, and so are all rows from a
+    damaged one on.
     """
     try:
         content = read(path)
@@ -272,9 +273,9 @@ def read_rows(path: Path, kind: Any = Row, read: Callable[[Path], bytes] = read_
 
 
 def whole_lines(path: Path) -> list[tuple[str, int]]:
-    """The lines of ``metrics.jsonl`` or its like up to the first damaged one, each with its iteration."""
+    """The lines of a file such as ``metrics.jsonl`` up to the first damaged one, each with its iteration."""
     try:
         content = read_bytes(path)
     except FileNotFoundError:
         return []
-    return [(line, row.step) for line, row in iterate_rows(content, Stepped, path)]
+    return [(line, row.step) for line, row in iterate_rows(content, RowWithStep, path)]
