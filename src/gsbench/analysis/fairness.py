@@ -160,7 +160,7 @@ MEASURED: dict[str, Callable[[Sequence[TrialResult]], str]] = {
 
 
 def tuning_lines(trials: Sequence[TrialResult], pair: Sequence[Arm]) -> list[str]:
-    """For each arm of a pair: the searches for its settings, and the settings that were varied among these trials.
+    """List, for each arm of a pair, the searches for its settings, and the settings that these trials vary.
 
     These trials are measured on the test views, so varying settings among them is tuning on the verdict's own views.
     """

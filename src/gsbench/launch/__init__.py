@@ -1,1 +1,1 @@
-"""Trials as work: planning, and running them here, in processes or in Slurm."""
+"""Planning trials and running them: in this process, in other processes of this machine, or in Slurm."""

@@ -1,4 +1,4 @@
-"""A batch of trials: skip what is done, check the rest before any work, run it; how each ended."""
+"""A batch of trials: skip finished ones, check the others before any work, and run them."""
 
 import importlib.util
 import json
@@ -28,10 +28,12 @@ log = logging.getLogger(__name__)
 
 
 def run_batch(trials: Sequence[Trial]) -> list[Outcome]:
-    """Run what is not done among ``trials`` by the launcher that they name; how each ended."""
+    """Run the trials that are not done by their launcher, and return the outcomes of all."""
     runs, launcher = checked_runs_folder(trials[0].values["runs"]), trials[0].values["launch"]["name"]
     with storage_errors(runs), stop_on_signals():
-        if launcher != "slurm" and (missing := missing_weights(trials)):  # also where all is done and none is needed
+        if launcher != "slurm" and (
+            missing := missing_weights(trials)
+        ):  # a wrong folder is an error even if all is done
             raise InputError("; ".join(missing))
         outcomes, unfinished = _skip_finished(trials)
         _begin(trials, unfinished)
@@ -52,13 +54,13 @@ def _run(trials: Sequence[Trial], launcher: str) -> list[Outcome]:
 
 
 def begin_for_another_launcher(trials: Sequence[Trial]) -> None:
-    """Do all that precedes the first trial where another launcher will run them, perhaps several at once."""
+    """Check, plan and declare trials that another launcher (a Hydra plugin) will run, perhaps several at once."""
     with storage_errors(checked_runs_folder(trials[0].values["runs"])):
         _begin(trials, [trial for trial in trials if _why_not_done(trial)])
 
 
 def _begin(trials: Sequence[Trial], unfinished: Sequence[Trial]) -> None:
-    """Refuse what can be known to fail, then make the runs folder, tidy the store, write plan and declaration."""
+    """Refuse trials that are known to fail; then make the runs folder, tidy the store, write plan and declarations."""
     declared_metrics(trials)
     runs, launcher = checked_runs_folder(trials[0].values["runs"]), trials[0].values["launch"]["name"]
     # A node of a cluster may have folders and devices that this machine lacks.
@@ -82,12 +84,13 @@ def _begin(trials: Sequence[Trial], unfinished: Sequence[Trial]) -> None:
 
 
 def _skip_finished(trials: Sequence[Trial]) -> tuple[list[Outcome], list[Trial]]:
+    """The outcomes of finished trials, and the unfinished ones; each folder once, since a sweep may repeat a value."""
     outcomes: list[Outcome] = []
     unfinished: list[Trial] = []
     seen: set[Path] = set()
     for trial in trials:
         folder = trial.folder
-        if folder in seen:  # a sweep may list a value twice
+        if folder in seen:
             continue
         seen.add(folder)
         if not _why_not_done(trial):
@@ -108,27 +111,27 @@ def _unavailable_metrics(options: dict[str, Any]) -> frozenset[str]:
 
 @cache
 def _unavailable(options: str) -> frozenset[str]:
-    """The metrics that cannot be computed here and now; weights are looked for, and fetched, once for a sweep."""
+    """The metrics that cannot be computed now. The cache searches for (and downloads) weights once per sweep."""
     from gsbench.eval.options import EvalConfig
     from gsbench.pipeline.parts import make_evaluator
 
     return frozenset(make_evaluator(EvalConfig(**json.loads(options))).awaited)
 
 
-# ---- checks before any trial starts: wrong options of components, folders and devices that are not there
+# ---- checks before any trial starts: wrong options of components, missing folders and devices
 
 
 def missing_folders(trials: Sequence[Trial]) -> list[str]:
-    """A line for each folder of photographs, model or weights that trials name and that is not there, and the mend."""
+    """A line for each missing folder of photographs, model or weights that trials name, and how to get photographs."""
     from gsbench.datasets.catalog import how_to_get
     from gsbench.scene.readers import missing_folder, missing_model
 
-    given = [scene for scene in (trial.values["scene"] for trial in trials) if scene["kind"] != "courtyard"]
-    scenes = {(scene["name"], scene["path"]) for scene in given}
-    folders = [(name, Path(path).expanduser()) for name, path in sorted(scenes, key=str)]
+    scenes = [scene for scene in (trial.values["scene"] for trial in trials) if scene["kind"] != "courtyard"]
+    named_paths = {(scene["name"], scene["path"]) for scene in scenes}
+    folders = [(name, Path(path).expanduser()) for name, path in sorted(named_paths, key=str)]
     missing = [(name, folder) for name, folder in folders if not folder.is_dir()]
     lines = [missing_folder(name, folder) for name, folder in missing]
-    models = {(scene["name"], scene["path"], scene["sparse"]) for scene in given if scene["kind"] == "colmap"}
+    models = {(scene["name"], scene["path"], scene["sparse"]) for scene in scenes if scene["kind"] == "colmap"}
     for name, path, sparse in sorted(models, key=str):
         if (root := Path(path).expanduser()).is_dir() and (line := missing_model(name, root, sparse)):
             lines.append(line)
@@ -136,8 +139,8 @@ def missing_folders(trials: Sequence[Trial]) -> list[str]:
 
 
 def missing_weights(trials: Sequence[Trial]) -> list[str]:
-    """A line for each folder of weights that the trials name and that is not there."""
-    named = {
+    """A line for each missing folder of weights that the trials name."""
+    folders = {
         (group, str(folder))
         for group in ("eval", "init")
         for folder in (trial.values[group].get("weights") for trial in trials)
@@ -145,16 +148,15 @@ def missing_weights(trials: Sequence[Trial]) -> list[str]:
     }
     return [
         f"{group}.weights={folder}: no such folder; without it, weights are looked for where gsbench keeps them"
-        for group, folder in sorted(named)
+        for group, folder in sorted(folders)
         if not Path(folder).expanduser().is_dir()
     ]
 
 
 def check_parts(trials: Sequence[Trial], on_this_machine: bool) -> None:
-    """Refuse what the parts of the trials do not take.
+    """Raise InputError that names the key of a setting that a part of the trials refuses.
 
-    With ``on_this_machine`` the trials will run here, so devices and programs are checked too. Raises InputError naming
-    the key.
+    With ``on_this_machine`` the trials will run here, so devices and programs are checked too.
     """
     from gsbench.pipeline.parts import Parts
 
@@ -163,15 +165,15 @@ def check_parts(trials: Sequence[Trial], on_this_machine: bool) -> None:
 
 
 def check_trackers(trials: Sequence[Trial]) -> None:
-    """Raise InputError where a trial's tracker needs a package that is not installed."""
+    """Raise InputError if a trial's tracker needs a package that is not installed."""
     for sink in sorted({t.values["tracking"]["sink"] for t in trials if t.values["tracking"]["enabled"]}):
         if importlib.util.find_spec(sink) is None:
             raise InputError(f"tracking.sink={sink} needs a package: {install_command(sink)} (or pip install {sink})")
 
 
 def borrowed_names(trials: Sequence[Trial]) -> list[str]:
-    """A line for each class of the user's that would be shown under the name of one of gsbench's own."""
-    named = {
+    """A line for each of the user's classes whose name in tables would be that of a class of gsbench."""
+    classes = {
         (group, str(part.get("name")), str(part["_target_"]))
         for trial in trials
         for group, part in ((group, trial.values[group]) for group in ("densify", "init"))
@@ -180,15 +182,15 @@ def borrowed_names(trials: Sequence[Trial]) -> list[str]:
     return [
         f"{target} is shown as {name}, like gsbench's own: "
         f"give it a name, {group}.name={target.rpartition('.')[2].lower()}"
-        for group, name, target in sorted(named)
+        for group, name, target in sorted(classes)
         if name in options(group)
     ]
 
 
 def need_no_check(trials: Sequence[Trial]) -> bool:
-    """Return whether the trials take their components as they ship, whose options gsbench's own tests have checked.
+    """Return whether all components have their shipped options, which gsbench's own tests have checked.
 
-    A dry run then answers without loading torch.
+    Then a dry run need not load torch.
     """
     for word in {word for trial in trials for word in trial.overrides}:
         key, _, value = word.lstrip("+~").partition("=")

@@ -1,7 +1,7 @@
 """Trials as jobs of submitit, and running them in processes of this machine (`gsbench.launch.slurm`: in a cluster).
 
-A job runs one trial and returns its outcome. What counts as done is decided by the trial's files, never by what the
-scheduler says of the process.
+A job runs one trial and returns its outcome. Whether a trial is done is decided by its files alone, since a scheduler
+may report a process wrongly.
 """
 
 from __future__ import annotations
@@ -43,12 +43,12 @@ DAYS = 24 * 60  # minutes
 
 @dataclass
 class TrialJob:
-    """The callable that submitit runs; submitit asks ``checkpoint`` for what to requeue when time is up."""
+    """The callable that submitit runs. When its time is up, submitit requeues what ``checkpoint`` returns."""
 
     values: dict[str, Any]
     path: list[str]  # sys.path of the submitting process
-    own: dict[str, str]  # the user's modules that it may import, and where they lie
-    visible_gpus: str | None  # its CUDA_VISIBLE_DEVICES
+    own: dict[str, str]  # the user's modules that may be imported, with their paths
+    visible_gpus: str | None  # CUDA_VISIBLE_DEVICES of the submitting process
 
     def __call__(self) -> Outcome:
         sys.path[:] = [*self.path, *(entry for entry in sys.path if entry not in self.path)]
@@ -57,7 +57,8 @@ class TrialJob:
 
         set_up_logging()
         launch = self.values["launch"]
-        by_submitit = signal.getsignal(signal.SIGUSR2) if hasattr(signal, "SIGUSR2") else None
+        # submitit's own handler requeues the job; it is called below, after the trial has saved a checkpoint.
+        requeue = signal.getsignal(signal.SIGUSR2) if hasattr(signal, "SIGUSR2") else None
         try:
             with (
                 stop_on_signals(SIGNALS_WITHOUT_INTERRUPT if launch["name"] == "local" else SIGNALS),
@@ -69,18 +70,18 @@ class TrialJob:
                 assign_threads(self.values["threads"], launch["parallel"])
                 from gsbench.launch.serial import run_one
 
-                # Where the sweep's process runs here, it mirrors all of its trials.
+                # With launch=local, the sweep's own process mirrors all of its trials.
                 mirror = stack.enter_context(Mirror(idle=launch["name"] == "local"))
                 outcome = run_one(Trial(self.values, ()), mirror, wait=True)
                 if outcome.status == "failed":
-                    print(outcome.message, file=sys.stderr)  # where the trial's folder could not be told
+                    print(outcome.message, file=sys.stderr)  # for the job's log: the trial's folder may lack the reason
                 if launch["name"] == "slurm":
                     with suppress(OSError):
                         forget_submission(outcome.folder)
                 return outcome
         except Stopped as stop:
-            if stop.signum == getattr(signal, "SIGUSR2", None) and callable(by_submitit):
-                by_submitit(stop.signum, None)  # requeues this job and ends the process
+            if stop.signum == getattr(signal, "SIGUSR2", None) and callable(requeue):
+                requeue(stop.signum, None)  # ends the process
             sys.exit(stop.exit_code)
 
     def checkpoint(self) -> DelayedSubmission:
@@ -90,12 +91,12 @@ class TrialJob:
 
 
 def run_local(trials: Sequence[Trial], mirror: Mirror) -> list[Outcome]:
-    """Run the trials in processes of this machine, ``launch.parallel`` at once; returns when all have ended."""
+    """Run the trials in processes of this machine, ``launch.parallel`` at once; return when all have ended."""
     values = trials[0].values
     parallel, name = values["launch"]["parallel"], values["name"]
     import submitit
 
-    # Minutes may pass before the first trial ends, and trials write their own logs.
+    # Nothing else is printed until the first trial ends, since trials write to their own logs.
     log.info(
         "%s, %d at once; to see how far they are: gsbench status %s", counted(len(trials), "trial"), parallel, name
     )
@@ -105,11 +106,11 @@ def run_local(trials: Sequence[Trial], mirror: Mirror) -> list[Outcome]:
 
 
 def job_folder(values: dict[str, Any]) -> Path:
-    """The folder in which the jobs of an experiment write what they print; made if it is not there."""
+    """The folder for the output of an experiment's jobs; it is made if it does not exist."""
     runs = TrialFolder.of(values).runs
     folder = runs / JOBS / values["name"]
     require_no_links(runs, folder)
-    # For each job script submitit leaves a link, which nobody reads again; a link of anybody else's is refused.
+    # submitit leaves a link to each job script. Nobody reads it again, and `require_no_links` refuses folders with links.
     for link in folder.glob(".submission_file_*.sh"):
         if link.is_symlink():
             link.unlink(missing_ok=True)
@@ -119,13 +120,14 @@ def job_folder(values: dict[str, Any]) -> Path:
 
 
 def _run(trials: Sequence[Trial], executor: Executor, parallel: int, mirror: Mirror) -> list[Outcome]:
-    """At most ``parallel`` processes at once; a stopped parent stops them, a killed one leaves them to finish."""
+    """Run at most ``parallel`` processes at once. If this process is stopped it stops them; if killed, they go on."""
     waiting, running, outcomes = clouds_first(trials), dict[Path, "Job[Outcome]"](), list[Outcome]()
     try:
         while waiting or running:
             while waiting and len(running) < parallel:
                 trial = waiting.pop(0)
-                with interrupts_ignored():  # Ctrl-C comes to all processes; this one passes it on, below
+                # Ctrl-C reaches all processes of a terminal: jobs ignore it, and this process passes it on below.
+                with interrupts_ignored():
                     running[trial.folder] = executor.submit(job_of(trial))
                 mirror.follow(trial.folder, trial.values["tracking"])
             ended = [folder for folder, job in running.items() if job.done()]
@@ -138,27 +140,30 @@ def _run(trials: Sequence[Trial], executor: Executor, parallel: int, mirror: Mir
         for job in running.values():
             process = getattr(job, "_process", None)
             if process is not None and process.poll() is None:
-                process.send_signal(signal.SIGTERM)  # the controller passes it on; the trial saves a checkpoint
+                process.send_signal(signal.SIGTERM)  # submitit's controller passes it on; the trial saves a checkpoint
         raise
     return outcomes
 
 
 def clouds_first(trials: Sequence[Trial]) -> list[Trial]:
-    """The trials with one of each scene and initialiser first, so that the others need not wait for one cloud."""
-    first: dict[str, Trial] = {}
+    """The trials, reordered: one of each scene and initialiser comes first.
+
+    Trials with the same initial cloud wait for each other, so running them at once would leave processes idle.
+    """
+    by_cloud: dict[str, Trial] = {}
     for trial in trials:
-        first.setdefault(sha256_of([trial.values["scene"], trial.values["init"]]), trial)
-    begin = list(first.values())
-    return begin + [trial for trial in trials if all(trial is not other for other in begin)]
+        by_cloud.setdefault(sha256_of([trial.values["scene"], trial.values["init"]]), trial)
+    first = list(by_cloud.values())
+    return first + [trial for trial in trials if all(trial is not other for other in first)]
 
 
 def collect(job: Job[Outcome], folder: Path, trials: Sequence[Trial]) -> Outcome:
-    """The outcome of an ended job, by the trial's files; where they say nothing, by the last words of the job's log."""
+    """The outcome of an ended job, from the trial's files, or else from the end of the job's log."""
     values = next(trial.values for trial in trials if trial.folder == folder)
     files, log_file = TrialFolder(folder), job.paths.stderr
     record = files.sound_record()
-    lacking = () if record is None else record.awaited  # weights that a trial which has just ended did not find
-    reason = files.why_not_done(values, lambda options: lacking)
+    unavailable = () if record is None else record.awaited  # the trial has just ended, so they are still unavailable
+    reason = files.why_not_done(values, lambda options: unavailable)
     if record is not None and not reason:
         return outcome_of_results(folder, record)
     if files.has_failed():
@@ -166,13 +171,13 @@ def collect(job: Job[Outcome], folder: Path, trials: Sequence[Trial]) -> Outcome
         return Outcome(folder, "failed", f"{failure.reason}; log: {log_file}", failure.bad_input)
     if record is not None:
         return Outcome(folder, "failed", f"its results no longer hold ({reason}): give the command again")
-    said = f"; its last lines: {error_tail(log_file)}" if log_file.is_file() else ""
+    tail = f"; its last lines: {error_tail(log_file)}" if log_file.is_file() else ""
     return Outcome(
-        folder, "failed", f"the process ended without a result (killed, or out of memory){said}; log: {log_file}"
+        folder, "failed", f"the process ended without a result (killed, or out of memory){tail}; log: {log_file}"
     )
 
 
 def job_of(trial: Trial) -> TrialJob:
-    """The trial as a job of the environment that this process has."""
+    """The trial as a job with the environment of this process."""
     path = [entry for entry in sys.path if entry]
     return TrialJob(trial.values, path, allowed_modules(), os.environ.get("CUDA_VISIBLE_DEVICES"))

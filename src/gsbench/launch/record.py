@@ -1,7 +1,7 @@
-"""Records of a command, written before its trials run: the plan, and what is declared. Loads no torch.
+"""Plan and declarations, which a command writes before its trials run. Loads no torch.
 
-``<runs>/<experiment>/plan.json`` maps the folder of every trial that was ever asked for to the overrides that describe
-it, so that what is missing can be named; ``declared.jsonl`` is `gsbench.runs.declaration`'s.
+``<runs>/<experiment>/plan.json`` maps the folder of every trial of all commands to the overrides that describe it, so
+that missing trials can be listed. For ``declared.jsonl`` see `gsbench.runs.declaration`.
 """
 
 import logging
@@ -36,19 +36,19 @@ from gsbench.system.locks import hold
 log = logging.getLogger(__name__)
 
 PLAN_VERSION = 1
-LEVELS = 3  # scene, arm, trial
+LEVELS = 3  # folders of scene, arm and trial
 
 
 @dataclass(frozen=True, kw_only=True)
 class PlannedTrial(Record):
-    """A trial of the plan: its overrides, where the command was given, and when (Unix time)."""
+    """A planned trial: its overrides, the folder in which the command was given, and the Unix time."""
 
     overrides: tuple[str, ...]
     cwd: str
     time: Amount
 
 
-def _is_below(name: str) -> str:
+def _checked_folder(name: str) -> str:
     parts = name.split("/")
     if len(parts) != LEVELS or not all(map(is_folder_name, parts)):
         raise ValueError("it is not a folder of a trial")
@@ -57,16 +57,16 @@ def _is_below(name: str) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class PlanFile(Record):
-    """The whole file; ``trials`` are by their folders as seen from the experiment's."""
+    """``plan.json``; ``trials`` are by their folders within the experiment."""
 
     version: int
-    trials: dict[Annotated[str, AfterValidator(_is_below)], PlannedTrial]
+    trials: dict[Annotated[str, AfterValidator(_checked_folder)], PlannedTrial]
 
 
 def add_to_plan(trials: Sequence[Trial]) -> None:
-    """Write the trials into the plans of their experiments; those that were there stay.
+    """Add the trials to the plans of their experiments.
 
-    A trial that was read from its own record stays out: its plan would hold no words, which describe the defaults.
+    A trial without overrides, which was read from its own record, is not added: as a plan they would mean the defaults.
     """
     by_home: dict[Path, dict[Path, PlannedTrial]] = {}
     for trial in trials:
@@ -81,29 +81,28 @@ def add_to_plan(trials: Sequence[Trial]) -> None:
 
 def forget(home: Path, folders: Iterable[Path]) -> None:
     """Drop trials from the plan of the experiment in ``home``."""
-    doomed = set(folders)
+    dropped = set(folders)
     with hold(home / f".{PLAN}.lock", "the plan"):
-        _write_plan(home, {folder: trial for folder, trial in read_plan(home).items() if folder not in doomed})
+        _write_plan(home, {folder: trial for folder, trial in read_plan(home).items() if folder not in dropped})
 
 
 def remove(home: Path, folders: Iterable[Path]) -> None:
     """Delete the folders of trials and drop them from the plan of the experiment in ``home``.
 
-    What the stages computed stays in the store: where the old code comes back, its trials are only put together again.
+    The results of stages stay in the store: if the old code comes back, nothing is computed again.
     """
     folders = list(folders)
     for folder in folders:
         require_no_links(home.parent, folder)
-        (folder / RESULTS).unlink(missing_ok=True)  # first, so that no part of a trial is ever taken for all of it
+        (folder / RESULTS).unlink(missing_ok=True)  # first: a half-deleted trial must not look complete
         shutil.rmtree(folder)
     forget(home, folders)
 
 
 def read_plan(home: Path) -> dict[Path, PlannedTrial]:
-    """The planned trials of the experiment in ``home`` by their folders; none if it has no plan.
+    """The planned trials of the experiment in ``home`` by their folders; {} without a plan.
 
-    None either where it is damaged, which is said: trials of other commands are found by their folders, if they have
-    begun.
+    A damaged plan gives {} with a warning: trials that have begun are found by their folders anyway.
     """
     try:
         trials = read_typed(home / PLAN, PlanFile).trials
@@ -120,32 +119,32 @@ def _write_plan(home: Path, trials: dict[Path, PlannedTrial]) -> None:
     write_json(home / PLAN, PlanFile(version=PLAN_VERSION, trials=names).to_json())
 
 
-# ---- what is declared
+# ---- declarations
 
 
 def declared_metrics(trials: Sequence[Trial]) -> dict[Path, str | None]:
-    """The metric that each experiment's trials declare (``eval.primary``), by its folder; None where none does.
+    """The metric that each experiment's trials declare (``eval.primary``), by the experiment's folder, or None.
 
-    Raises InputError where trials of one experiment declare different ones.
+    Raises InputError if trials of one experiment declare different metrics.
     """
-    found: dict[Path, str | None] = {}
+    metrics: dict[Path, str | None] = {}
     for trial in trials:
         home = trial.files.home
-        metric, known = trial.values["eval"].get("primary"), found.get(home)
-        if metric and known and metric != known:
+        metric, before = trial.values["eval"].get("primary"), metrics.get(home)
+        if metric and before and metric != before:
             raise InputError(
-                f"trials of {home.name} declare eval.primary={known} and eval.primary={metric}: a verdict is about one "
-                "metric, so give one of them, or run two experiments (name=…)"
+                f"trials of {home.name} declare eval.primary={before} and eval.primary={metric}: a verdict is about "
+                "one metric, so give one of them, or run two experiments (name=…)"
             )
-        found[home] = known or metric
-    return found
+        metrics[home] = before or metric
+    return metrics
 
 
 def declare(trials: Sequence[Trial]) -> None:
-    """Add to each experiment's record what these trials declare, where it does not stand there yet.
+    """Add a declaration to each experiment's record, unless the latest one already covers these trials.
 
-    That is a metric (`declared_metrics`) and the trials themselves, whether they are done or not. A declaration is not
-    taken back by a command without one: the trials that such a command adds are added to it, with their time.
+    It has the metric (`declared_metrics`) and all trials, done or not. A command without a metric keeps the declared
+    one: the trials that it adds are declared with that metric, with their own time.
     """
     for home, given in declared_metrics(trials).items():
         seeds: dict[str, set[int]] = {}
@@ -155,8 +154,8 @@ def declare(trials: Sequence[Trial]) -> None:
         asked = {key: tuple(sorted(own)) for key, own in seeds.items()}
         make_home(home)
         with hold(home / f".{DECLARED}.lock", "the declarations"):
-            every = read_declarations(home)
-            latest = next((one for one in reversed(every) if not one.of_claims), None)
+            declarations = read_declarations(home)
+            latest = next((one for one in reversed(declarations) if not one.of_claims), None)
             metric = given or (None if latest is None else latest.primary)
             if metric is None:
                 continue
@@ -164,12 +163,12 @@ def declare(trials: Sequence[Trial]) -> None:
                 log.info("%s: %s stays declared, since %s", home.name, latest.primary, latest.when)
             before = {} if latest is None else latest.planned
             together = merge_planned(before, asked)
-            same = latest is not None and latest.primary == metric
-            if latest is not None and same and (together == before or not latest.names_trials):
+            same_metric = latest is not None and latest.primary == metric
+            if latest is not None and same_metric and (together == before or not latest.names_trials):
                 continue
             added = declared_now(questions=(open_question(metric),), trials=dict(together))
-            write_text(home / DECLARED, record_text([*every, added]))
-        if same:
+            write_text(home / DECLARED, record_text([*declarations, added]))
+        if same_metric:
             log.warning(
                 "%s: trials are added to those declared with %s; if there are results already, it no longer decides "
                 "the verdict alone",
@@ -186,20 +185,20 @@ def declare(trials: Sequence[Trial]) -> None:
 
 
 def declare_questions(home: Path, asked: Declaration) -> Declaration:
-    """Add questions that name their trials (a file of claims, a sweep in looks) to the record; the one that stands.
+    """Add questions that name their trials (of a file of claims, or of a sweep in looks) to the experiment's record.
 
-    One that is the latest of its kind there already stands with its time.
+    Returns the recorded declaration: if the latest one of its kind is equal, that one with its earlier time.
     """
     if not asked.questions:
         return asked
     make_home(home)
     with hold(home / f".{DECLARED}.lock", "the declarations"):
-        every = read_declarations(home)
-        known = [one for one in every if one.of_claims == asked.of_claims]
-        if known and known[-1].hash == asked.hash:
-            return known[-1]
-        write_text(home / DECLARED, record_text([*every, asked]))
-    if known:
+        declarations = read_declarations(home)
+        same_kind = [one for one in declarations if one.of_claims == asked.of_claims]
+        if same_kind and same_kind[-1].hash == asked.hash:
+            return same_kind[-1]
+        write_text(home / DECLARED, record_text([*declarations, asked]))
+    if same_kind:
         log.warning(
             "%s: other questions were declared before: trials that were measured under them count as looked at",
             home.name,

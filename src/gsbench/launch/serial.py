@@ -1,4 +1,4 @@
-"""One trial after the other, in this process; and how a trial ended, as plain values that travel between processes."""
+"""Running trials one after the other in this process, and the outcome of a trial as picklable values."""
 
 import logging
 from collections.abc import Sequence
@@ -22,9 +22,10 @@ Status = Literal["done", "failed", "queued"]
 
 @dataclass(frozen=True)
 class Outcome:
-    """``message`` is why a trial failed, or its metrics; ``bad_input``: the user's files or settings are the cause.
+    """How a trial ended: ``message`` has its metrics, or why it failed.
 
-    One that is queued was left to Slurm, in the job that ``message`` names, and may be running by now.
+    ``bad_input`` says that the user's files or settings are the cause. A "queued" trial was left to Slurm, in the job
+    that ``message`` names; it may be running by now.
     """
 
     folder: Path
@@ -38,7 +39,7 @@ class Outcome:
 
 
 def outcome_of_results(folder: Path, results: TrialRecord) -> Outcome:
-    """The outcome of a trial that is complete."""
+    """The outcome of a complete trial."""
     metrics = "  ".join(f"{key} {value:.4g}" for key, value in results.metrics.items())
     return Outcome(folder, "done", metrics)
 
@@ -52,7 +53,7 @@ def outcome_of_error(folder: Path, error: Exception) -> Outcome:
 
 
 def run_serial(trials: Sequence[Trial], mirror: Mirror) -> list[Outcome]:
-    """Run the trials; one that another process is at comes last, so that two sweeps share the work."""
+    """Run the trials. A trial that another process is running comes last, so that two sweeps share the work."""
     outcomes: list[Outcome] = []
     busy: list[Trial] = []
     for number, trial in enumerate(trials, 1):
@@ -67,7 +68,10 @@ def run_serial(trials: Sequence[Trial], mirror: Mirror) -> list[Outcome]:
 
 
 def run_one(trial: Trial, mirror: Mirror, wait: bool) -> Outcome:
-    """Run one trial, and have it mirrored; only BusyError, a full disk and what ends the program is raised."""
+    """Run and mirror one trial.
+
+    Errors become its outcome, except BusyError, DiskFullError, and exceptions that end the program.
+    """
     mirror.follow(trial.folder, trial.values["tracking"])
     try:
         from gsbench.pipeline.trial import run_trial  # here, because a sweep that is done needs no torch

@@ -1,4 +1,4 @@
-"""Trials as tasks of a Slurm array job: submitted once, then waited for, or left to Slurm (``launch.wait=false``)."""
+"""Trials as tasks of a Slurm array job: submitted once, then awaited, or left to Slurm (``launch.wait=false``)."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-SUBMIT_LOCK = ".submit.lock"  # in the folder of the jobs' output: two commands at once submit a trial once
+SUBMIT_LOCK = ".submit.lock"  # in the folder of the jobs' output, so that two commands do not submit a trial twice
 SECONDS_BETWEEN_QUEUE_CHECKS = 20.0
-CHECKS_UNTIL_LOST = 2  # a job that the queue does not know so often in a row, and that left no result, is lost
+CHECKS_UNTIL_LOST = 2  # a job without a result is lost if it is missing in the queue so many times in a row
 
 
 def run_slurm(trials: Sequence[Trial]) -> list[Outcome]:
-    """Run the trials in Slurm, those that an earlier command left there included.
+    """Run the trials in Slurm; those that an earlier command submitted are awaited, not submitted again.
 
-    Returns when all have ended; with ``launch.wait=false`` as soon as Slurm has them, as outcomes of status "queued".
+    Returns when all have ended; with ``launch.wait=false``, after submitting, with outcomes of status "queued".
     """
     values = trials[0].values
     executor = make_executor(values["launch"], job_folder(values))
@@ -58,7 +58,7 @@ def run_slurm(trials: Sequence[Trial]) -> list[Outcome]:
 
 
 def make_executor(launch: dict[str, Any], folder: Path) -> SlurmExecutor:
-    """The submitit executor for the settings ``launch``. Raises InputError where Slurm is missing."""
+    """The submitit executor for the settings ``launch``; raises InputError if Slurm is missing."""
     import submitit
 
     try:
@@ -84,43 +84,44 @@ def make_executor(launch: dict[str, Any], folder: Path) -> SlurmExecutor:
 
 
 def _submit(trials: Sequence[Trial], executor: SlurmExecutor) -> dict[Path, Job[Outcome]]:
-    """The job of each trial by the trial's folder: one that is in the queue already, else a task of a new array job."""
+    """The job of each trial by the trial's folder: its job in the queue, or else a task of a new array job."""
     import submitit
 
-    homes = [trial.folder for trial in trials]
-    queue = ask_queue(homes)
+    folders = [trial.folder for trial in trials]
+    queue = ask_queue(folders)
     if queue is None:
         raise InputError("Slurm does not list its jobs (squeue failed), so nothing was submitted: try again later")
     jobs: dict[Path, Job[Outcome]] = {}
-    fresh: dict[Path, Trial] = {}
-    for home, trial in zip(homes, trials, strict=True):
-        known = read_submission(home)
-        if known and known.job in queue:
-            jobs[home] = submitit.SlurmJob(executor.folder, known.job)
+    to_submit: dict[Path, Trial] = {}
+    for folder, trial in zip(folders, trials, strict=True):
+        submission = read_submission(folder)
+        if submission and submission.job in queue:
+            jobs[folder] = submitit.SlurmJob(executor.folder, submission.job)
         else:
-            fresh[home] = trial
-    if fresh:
+            to_submit[folder] = trial
+    if to_submit:
         try:
-            submitted = executor.submit_array([job_of(trial) for trial in fresh.values()])
+            submitted = executor.submit_array([job_of(trial) for trial in to_submit.values()])
         except Exception as error:
             raise InputError(f"Slurm refused the job: {' '.join(str(error).split())[:300]}") from error
-        for home, job in zip(fresh, submitted, strict=True):
-            record_submission(home, job.job_id, job.paths.stderr)
-            jobs[home] = job
+        for folder, job in zip(to_submit, submitted, strict=True):
+            record_submission(folder, job.job_id, job.paths.stderr)
+            jobs[folder] = job
     return jobs
 
 
 def _wait(jobs: dict[Path, Job[Outcome]], trials: Sequence[Trial]) -> list[Outcome]:
     outcomes: list[Outcome] = []
-    users = {known.user or current_user() for folder in jobs if (known := read_submission(folder))} | {current_user()}
-    unseen = dict.fromkeys(jobs, 0)
+    submissions = filter(None, map(read_submission, jobs))
+    users = {submission.user or current_user() for submission in submissions} | {current_user()}
+    unseen = dict.fromkeys(jobs, 0)  # successive checks in which the queue did not list the job
     checked = time.monotonic()
     while jobs:
         ended = [folder for folder, job in jobs.items() if job.paths.result_pickle.exists()]
         if time.monotonic() - checked > SECONDS_BETWEEN_QUEUE_CHECKS:
             checked = time.monotonic()
             queue = read_queue(users)
-            if queue is not None:  # a scheduler that is down for a while has lost nothing
+            if queue is not None:  # while the scheduler does not answer, no job counts as lost
                 for folder, job in jobs.items():
                     unseen[folder] = 0 if job.job_id in queue else unseen[folder] + 1
             ended += [folder for folder in jobs if unseen[folder] >= CHECKS_UNTIL_LOST and folder not in ended]

@@ -1,6 +1,6 @@
-"""The state of an experiment's trials: from their folders, and of those that Slurm was given also from its queue.
+"""The states of an experiment's trials: from their folders, and for submitted trials also from Slurm's queue.
 
-A note in a trial's folder says which job it was given to. Loads no torch.
+A file in a trial's folder names its Slurm job. Loads no torch.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ from gsbench.system.locks import read_holder
 
 @dataclass(frozen=True)
 class TrialState:
-    """A trial's state with what people want to know of it: since when (Unix time), and a note.
+    """A trial's state, since when it has it (Unix time), and a note.
 
-    A trial is ``queued`` where Slurm has it and it has not begun. One that is done is ``superseded`` where the code
-    that made it is no longer the present one, one that failed where later code has taken its place.
+    A ``queued`` trial waits in Slurm's queue. A finished trial is ``superseded`` if its code is no longer the present
+    code; a failed one if a trial of later code has the same settings.
     """
 
     folder: Path
@@ -42,46 +42,46 @@ class TrialState:
 
     @property
     def label(self) -> str:
-        """Scene, arm and seed, for people."""
+        """Scene, arm, seed and hash, for messages."""
         return TrialFolder(self.folder).label
 
 
 def states_of_experiment(home: Path) -> list[TrialState]:
-    """The state of every trial of the experiment in ``home``, planned or found there."""
+    """The states of all trials of the experiment in ``home``, planned or with a folder."""
     planned = {folder: trial.time for folder, trial in read_plan(home).items()}
-    found = {path for path in map(Path, trial_folders(home)) if SEED in path.name and (path / CONFIG).exists()}
-    folders = sorted({*planned, *found})
+    begun = {path for path in map(Path, trial_folders(home)) if SEED in path.name and (path / CONFIG).exists()}
+    folders = sorted({*planned, *begun})
     queue = ask_queue(folders)
-    return _without_mended([_state(folder, planned.get(folder), queue) for folder in folders])
+    return _mark_superseded([_state(folder, planned.get(folder), queue) for folder in folders])
 
 
-def _without_mended(trials: Sequence[TrialState]) -> list[TrialState]:
-    """The states; a trial that failed or stopped is superseded where one of the same settings has got further.
+def _mark_superseded(trials: Sequence[TrialState]) -> list[TrialState]:
+    """The states, in which failed and stopped trials are superseded if a trial of the same settings got further.
 
-    Such trials differ in a user's class alone, which was mended meanwhile.
+    Such trials differ only in the code of a user's class, which was repaired in between.
     """
-    others: dict[tuple[Path, str], list[TrialState]] = {}
+    further: dict[tuple[Path, str], list[TrialState]] = {}
     for trial in trials:
         if trial.state in ("done", "running", "queued"):
-            others.setdefault(_twins(trial.folder), []).append(trial)
-    return [
-        replace(
-            trial, state="superseded", note=f"{found.folder.name} is {found.state}, made by later code: {trial.note}"
-        )
-        if trial.state in ("failed", "partial")
-        and (found := _same_settings(trial.folder, others.get(_twins(trial.folder), [])))
-        else trial
-        for trial in trials
-    ]
+            further.setdefault(_arm_and_seed(trial.folder), []).append(trial)
+    states = []
+    for trial in trials:
+        if trial.state in ("failed", "partial"):
+            later = _with_same_settings(trial.folder, further.get(_arm_and_seed(trial.folder), []))
+            if later is not None:
+                note = f"{later.folder.name} is {later.state}, made by later code: {trial.note}"
+                trial = replace(trial, state="superseded", note=note)
+        states.append(trial)
+    return states
 
 
-def _twins(folder: Path) -> tuple[Path, str]:
-    """Folder and end of the name that trials of one arm and seed share."""
+def _arm_and_seed(folder: Path) -> tuple[Path, str]:
+    """The arm's folder, and the seed in the name of a trial's folder."""
     return folder.parent, folder.name.partition("-")[2]
 
 
-def _same_settings(folder: Path, others: Sequence[TrialState]) -> TrialState | None:
-    """The one of ``others`` whose configuration is that of the trial in ``folder``."""
+def _with_same_settings(folder: Path, others: Sequence[TrialState]) -> TrialState | None:
+    """The first of ``others`` that has the settings of the trial in ``folder``."""
     if not others or (own := _settings(folder)) is None:
         return None
     return next((other for other in others if _settings(other.folder) == own), None)
@@ -95,29 +95,29 @@ def _settings(folder: Path) -> dict[str, Any] | None:
 
 
 def _state(folder: Path, planned: float | None, queue: Queue | None) -> TrialState:
-    """The state of the trial in ``folder``; ``planned`` is when it was asked for."""
+    """The state of the trial in ``folder``; ``planned`` is the time of its plan."""
     state = TrialFolder(folder).state()
     if state == "done":
         return TrialState(folder, state, _changed(folder / RESULTS), "")
     if state == "running":
         holder = read_holder(folder / LOCK)
-        since, where = (None, "process ? on ?") if holder is None else (holder.since, holder.description)
-        return TrialState(folder, state, since, f"{_reached(folder)} {where}".strip())
+        since, process = (None, "process ? on ?") if holder is None else (holder.since, holder.description)
+        return TrialState(folder, state, since, f"{_progress(folder)} {process}".strip())
     if state == "damaged":
         return TrialState(folder, state, _changed(folder / RESULTS), _damage(folder))
     submission = read_submission(folder)
     lost = ""
     if submission:
-        if found := state_in_queue(folder, queue):
+        if in_queue := state_in_queue(folder, queue):
             job = queue.get(submission.job) if queue is not None else None
             words = job.words if job else "Slurm does not answer"
-            note = f"{_reached(folder)} Slurm job {submission.job}, {words}".strip()
-            return TrialState(folder, found, _changed(folder / SUBMITTED), note)
+            note = f"{_progress(folder)} Slurm job {submission.job}, {words}".strip()
+            return TrialState(folder, in_queue, _changed(folder / SUBMITTED), note)
         lost = f"; Slurm job {submission.job} has ended, log: {submission.log}"
     if state == "failed":
         return TrialState(folder, state, _changed(folder / FAILED), TrialFolder(folder).failure().reason)
     if state == "partial":
-        return TrialState(folder, state, _changed(folder / CONFIG), f"stopped {_reached(folder)}".strip() + lost)
+        return TrialState(folder, state, _changed(folder / CONFIG), f"stopped {_progress(folder)}".strip() + lost)
     return TrialState(folder, state, planned, "never started" + lost)
 
 
@@ -129,7 +129,8 @@ def _damage(folder: Path) -> str:
     return ""
 
 
-def _reached(folder: Path) -> str:
+def _progress(folder: Path) -> str:
+    """``in train at iteration 7000``; "" if no stage has begun."""
     stage, step = TrialFolder(folder).stage_and_step()
     return f"in {stage}" + (f" at iteration {step}" if stage == "train" and step else "") if stage else ""
 
@@ -149,7 +150,7 @@ WAITING = ("PENDING", "CONFIGURING", "REQUEUED", "REQUEUE_HOLD", "REQUEUE_FED", 
 
 @dataclass(frozen=True, kw_only=True)
 class Submission(Record):
-    """``.submitted.json``: the job that a trial was given to, its log, whose job it is."""
+    """``.submitted.json``: a trial's Slurm job, its log, and its user."""
 
     job: Annotated[str, Field(pattern=r"^[\w.\[\]%-]+$")]
     log: str = "unknown"
@@ -158,19 +159,19 @@ class Submission(Record):
 
 @dataclass(frozen=True)
 class QueuedJob:
-    """A job or array task in the queue: its state in Slurm's words, and why it waits."""
+    """A job or array task in the queue: its state as Slurm names it, and the reason why it waits."""
 
     state: str
     reason: str
 
     @property
     def waits(self) -> bool:
-        """Return whether the job has not begun, or not begun again."""
+        """Return whether the job waits to start, for the first time or again."""
         return self.state in WAITING
 
     @property
     def words(self) -> str:
-        """The state for people: ``pending (Resources)``."""
+        """The state in words: ``pending (Resources)``."""
         return self.state.lower() + (f" ({self.reason})" if self.reason not in ("", "None") else "")
 
 
@@ -178,13 +179,13 @@ Queue = Mapping[str, QueuedJob]
 
 
 def record_submission(folder: Path, job: str, log: Path) -> None:
-    """Note in the trial's ``folder`` that Slurm was given it as ``job``."""
+    """Record in the trial's ``folder`` that it was submitted as ``job``."""
     folder.mkdir(parents=True, exist_ok=True)
     write_json(folder / SUBMITTED, Submission(job=job, log=str(log), user=current_user()).to_json())
 
 
 def read_submission(folder: Path) -> Submission | None:
-    """The job that was last given the trial in ``folder``; None if there is none, or it has ended by itself."""
+    """The last job of the trial in ``folder``; None if it was never submitted, or if the job has ended normally."""
     return read_if_sound(folder / SUBMITTED, Submission)
 
 
@@ -194,15 +195,15 @@ def forget_submission(folder: Path) -> None:
 
 
 def ask_queue(folders: Iterable[Path]) -> Queue | None:
-    """The queue, of those users whose jobs were given trials in ``folders``; None where Slurm does not answer."""
-    submissions = [found for folder in folders if (found := read_submission(folder))]
+    """The queue of all users who submitted trials in ``folders``; None if Slurm does not answer."""
+    submissions = list(filter(None, map(read_submission, folders)))
     return read_queue({submission.user or current_user() for submission in submissions}) if submissions else {}
 
 
 def state_in_queue(folder: Path, queue: Queue | None) -> Literal["queued", "running"] | None:
-    """The state of a trial that no process holds and that is not done, if Slurm has it; else None.
+    """The state in Slurm of an unfinished trial that no process holds; None if it is not in Slurm.
 
-    Where Slurm does not answer (``queue`` is None), it is believed to have what it was given.
+    If Slurm does not answer (``queue`` is None), a submitted trial is assumed to be queued.
     """
     submission = read_submission(folder)
     if submission is None or (queue is not None and submission.job not in queue):
@@ -211,7 +212,7 @@ def state_in_queue(folder: Path, queue: Queue | None) -> Literal["queued", "runn
 
 
 def read_queue(users: Iterable[str]) -> Queue | None:
-    """The jobs and array tasks of ``users`` by id; None where there is no Slurm, or it does not answer."""
+    """The jobs and array tasks of ``users`` by id; None if there is no Slurm, or if it does not answer."""
     command = ["squeue", f"--user={','.join(sorted(users))}", "--noheader", "--array", "--format=%i|%T|%r"]
     try:
         listing = subprocess.run(command, capture_output=True, text=True, timeout=SECONDS_TO_ANSWER, check=True)
@@ -222,8 +223,8 @@ def read_queue(users: Iterable[str]) -> Queue | None:
 
 
 def current_user() -> str:
-    """The user's name; the number where the system knows no name."""
+    """The user's name, or the user id if there is no name, as in some containers."""
     try:
         return getpass.getuser()
-    except (KeyError, OSError):  # a container's nameless user
+    except (KeyError, OSError):
         return str(os.getuid())
