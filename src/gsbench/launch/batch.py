@@ -31,9 +31,8 @@ def run_batch(trials: Sequence[Trial]) -> list[Outcome]:
     """Run the trials that are not done by their launcher, and return the outcomes of all."""
     runs, launcher = checked_runs_folder(trials[0].values["runs"]), trials[0].values["launch"]["name"]
     with storage_errors(runs), stop_on_signals():
-        if launcher != "slurm" and (
-            missing := missing_weights(trials)
-        ):  # a wrong folder is an error even if all is done
+        # A wrong folder of weights is an error even if all trials are done.
+        if launcher != "slurm" and (missing := missing_weights(trials)):
             raise InputError("; ".join(missing))
         outcomes, unfinished = _skip_finished(trials)
         _begin(trials, unfinished)

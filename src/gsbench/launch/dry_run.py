@@ -20,7 +20,7 @@ from gsbench.runs.trial_folder import TrialFolder
 from gsbench.words import counted, readable_time
 
 STATES = ("done", "partial", "missing", "running", "queued", "failed", "damaged")  # in the order of a summary
-# Which of scene, init and densify a finished trial must share with the estimated one; the most similar first.
+# The fields (scene, init, densify) that a finished trial must share with the estimated one; the most similar first.
 SHARED = ((True, True, True), (True, False, True), (True, False, False), (False, False, True), (False, False, False))
 SIZE_SETTINGS = ("name", "path", "width", "height", "downscale", "max_size")  # of a scene: they determine its pixels
 

@@ -22,7 +22,7 @@ Status = Literal["done", "failed", "queued"]
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a trial ended: ``message`` has its metrics, or why it failed.
+    """The end of a trial: ``message`` has its metrics, or why it failed.
 
     ``bad_input`` says that the user's files or settings are the cause. A "queued" trial was left to Slurm, in the job
     that ``message`` names; it may be running by now.
