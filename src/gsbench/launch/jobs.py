@@ -110,7 +110,7 @@ def job_folder(values: dict[str, Any]) -> Path:
     runs = TrialFolder.of(values).runs
     folder = runs / JOBS / values["name"]
     require_no_links(runs, folder)
-    # submitit leaves a link to each job script. Nobody reads it again, and `require_no_links` refuses folders with links.
+    # submitit leaves a link to each job script. Nobody reads it again, and `require_no_links` below would refuse it.
     for link in folder.glob(".submission_file_*.sh"):
         if link.is_symlink():
             link.unlink(missing_ok=True)
