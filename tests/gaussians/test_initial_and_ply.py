@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from plyfile import PlyData
+from plyfile import PlyData, PlyElement
 
 from gsbench.errors import InputError
 from gsbench.gaussians.initial import gaussians_from_cloud
@@ -46,6 +46,18 @@ def test_ply_round_trip_is_exact(tmp_path: Path) -> None:
     back = read_ply(tmp_path / "a.ply")
     for a, b in zip(gaussians.tensors().values(), back.tensors().values(), strict=True):
         assert torch.equal(a, b)
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_an_element_without_rows_is_no_damage(tmp_path: Path, text: bool) -> None:
+    """As programs that know meshes write them: no faces."""
+    gaussians = random_gaussians(3, dtype=torch.float32)
+    write_ply(gaussians, tmp_path / "a.ply")
+    vertex = PlyData.read(str(tmp_path / "a.ply"))["vertex"]
+    faces = PlyElement.describe(np.empty(0, dtype=[("a", "i4"), ("b", "i4"), ("c", "i4")]), "face")
+    PlyData([vertex, faces], text=text).write(str(tmp_path / "b.ply"))
+    for a, b in zip(gaussians.tensors().values(), read_ply(tmp_path / "b.ply").tensors().values(), strict=True):
+        assert torch.allclose(a, b)
 
 
 def test_ply_layout_is_the_standard_one(tmp_path: Path) -> None:
