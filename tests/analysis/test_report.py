@@ -8,6 +8,7 @@ import re
 import xml.etree.ElementTree as ElementTree
 from html.parser import HTMLParser
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,12 +19,13 @@ from gsbench.analysis.images import choose_views, texture_energy
 from gsbench.analysis.pairing import pair_trials
 from gsbench.analysis.report.build import build_report, trial_figures
 from gsbench.analysis.report.charts import Axis, ForestRow, forest_plot, line_chart
-from gsbench.analysis.report.sections import _threshold, histogram, log10_volumes, mean_by_step
+from gsbench.analysis.report.sections import _logged_histograms, _threshold, histogram, log10_volumes, mean_by_step
 from gsbench.analysis.results import Experiment, load_experiment
 from gsbench.analysis.statistics import Interval
 from gsbench.analysis.verdicts import by_scene_lines, headline, judge_pairs
 from gsbench.errors import InputError
 from gsbench.runs.declaration import Arm
+from gsbench.runs.trial_record import Histogram
 from gsbench.verbs import report
 from tests.analysis.synthetic import Plan, write_arms, write_runs
 
@@ -183,6 +185,23 @@ def test_volumes_are_those_of_the_ellipsoids(experiment: Experiment) -> None:
     shares = histogram(np.append(found, -np.inf))
     assert sum(share for _, share in shares) == pytest.approx(1)
     assert sum(share for volume, share in shares if volume > 1e-4) == pytest.approx(np.mean(found >= -4))
+
+
+def test_logged_histograms_are_shares_of_all_trials_together() -> None:
+    """Ten Gaussians of one trial and thirty of another; the second alone has an iteration 8."""
+    edges = [-4.0, -3.0, -1.0, 0.0]
+    rows = [
+        [Histogram(step=4, log10_edges=edges, counts=[4, 0, 6])],
+        [
+            Histogram(step=4, log10_edges=edges, counts=[6, 0, 24]),
+            Histogram(step=8, log10_edges=edges, counts=[0, 5, 0]),
+        ],
+    ]
+    trials = [SimpleNamespace(folder=SimpleNamespace(histograms=lambda own=own: own)) for own in rows]
+    found = _logged_histograms(trials)  # type: ignore[arg-type]
+    assert list(found) == [4, 8]
+    assert np.array(found[4]) == pytest.approx(np.array([[10**-3.5, 0.25], [10**-0.5, 0.75]]))
+    assert np.array(found[8]) == pytest.approx(np.array([[10**-2.0, 1.0]]))
 
 
 def test_the_share_above_the_threshold_is_said(experiment: Experiment, page: str) -> None:

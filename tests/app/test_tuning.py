@@ -261,6 +261,7 @@ def test_an_interval_searches_one_arm(runs: Path, monkeypatch: pytest.MonkeyPatc
     part = search_summary(runs / "fair-tune-random-volumetric")
     assert part is not None
     assert "no test view was looked at" in part[0]
+    assert "failed" not in part[0]
     assert "<svg" in part[1]
     best = chosen(runs, "volumetric")["densify.volume_threshold"]
     assert {trial.values["densify"]["volume_threshold"] for trial in fake.judged()} == {best}

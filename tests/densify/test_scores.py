@@ -185,6 +185,14 @@ def taming_scores(trainable: TrainableGaussians, gradient: np.ndarray) -> np.nda
     return total + 1e-6
 
 
+def test_the_taming_score_of_each_gaussian() -> None:
+    densifier = Taming(max_gaussians=COUNT)
+    trainable, gradient = started(densifier, 0)
+    densifier.score(at(600, trainable, torch.Generator()))
+    scores = densifier.statistics["score"].detach()
+    np.testing.assert_allclose(scores, taming_scores(trainable, gradient), rtol=1e-4)
+
+
 @pytest.mark.parametrize("seed", range(2))
 def test_taming_round(seed: int) -> None:
     """Scores, shares and draws; the other rules against the restatement of ADC."""

@@ -16,6 +16,7 @@ from gsbench.init.base import PointCloud
 from gsbench.init.points import GREY, read_points, seen_colors
 from gsbench.scene.images import read_image
 from gsbench.scene.types import Capture
+from tests.init.test_report import CENTERS, model_of
 
 RNG = np.random.default_rng(0)
 XYZ = RNG.uniform(-2, 2, (40, 3)).astype(np.float32).astype(np.float64)
@@ -92,6 +93,21 @@ def test_black_is_a_colour_and_what_no_camera_sees_is_grey(
     monkeypatch.setattr("gsbench.init.points.seen_colors", lambda *_: seen)
     cloud = Points(path=tmp_path / "scan.xyz").cloud(courtyard, pycolmap.Reconstruction())
     np.testing.assert_array_equal(cloud.colors, [[0, 0, 0], [GREY] * 3, [0, 9, 255]])
+
+
+def test_of_the_references_own_points_none_is_left(courtyard: Capture, tmp_path: Path):
+    save(tmp_path / "scan.xyz", np.tile([0.0, 0.0, 5.0], (4, 1)) + np.arange(4)[:, None] / 10)
+    model = model_of(CENTERS)
+    own = {tuple(point.xyz) for point in model.points3D.values()}
+    options = Points(path=tmp_path / "scan.xyz")
+    cloud = PointCloud(XYZ[:4], np.array(RGB[:4], dtype=np.uint8))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Points, "cloud", lambda *_: cloud)
+        assert options.set_points(model, courtyard, tmp_path) is None
+    placed = {tuple(point.xyz) for point in model.points3D.values()}
+    assert placed == {tuple(point) for point in XYZ[:4]}
+    assert not placed & own
+    assert not any(len(image.points2D) for image in model.images.values())
 
 
 def test_a_cloud_is_thinned_and_placed(courtyard: Capture, tmp_path: Path):

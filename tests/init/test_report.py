@@ -201,11 +201,14 @@ def test_above_is_along_the_normal_of_a_ring_of_cameras():
     assert np.linalg.det(axes) == pytest.approx(1.0)
 
 
-def test_above_for_cameras_that_look_down():
-    centers = np.array([[x, y, 10.0] for x in range(4) for y in range(4)])
-    down = np.diag([1.0, -1.0, -1.0])  # world to camera: looks along -z, the image's top is +y
-    axes = view_from_above(centers, np.tile(down, (16, 1, 1)), np.zeros((5, 3)))
-    np.testing.assert_allclose(axes[2], [0, 0, 1], atol=1e-9)
+@pytest.mark.parametrize("points", [1, 5])
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_above_for_cameras_that_look_down(points: int, side: float):
+    """What is above is the side of the points on which the cameras stand."""
+    centers = np.array([[x, y, 10.0 * side] for x in range(4) for y in range(4)])
+    down = np.diag([side, -1.0, -side])  # world to camera: looks along -z or z, the image's top is +y
+    axes = view_from_above(centers, np.tile(down, (16, 1, 1)), np.zeros((points, 3)))
+    np.testing.assert_allclose(axes[2], [0, 0, side], atol=1e-9)
 
 
 def test_picture_shows_points_in_their_colours(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

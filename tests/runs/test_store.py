@@ -48,6 +48,17 @@ def test_second_request_is_not_built(store: Store) -> None:
     assert second.seconds == first.seconds
 
 
+def test_what_other_code_may_have_built_is_not_kept(store: Store) -> None:
+    def changed() -> None:
+        raise InputError("the code was edited meanwhile")
+
+    with pytest.raises(InputError, match="edited meanwhile"):
+        store.get(Step(LETTERS, {"x": 1}, write_letters, check=changed))
+    assert store.find(Step(LETTERS, {"x": 1}, refuse)) is None
+    assert not store.get(Step(LETTERS, {"x": 1}, write_letters)).cached
+    assert store.get(Step(LETTERS, {"x": 1}, refuse, check=changed)).cached  # nothing was built now
+
+
 def test_every_input_and_the_version_make_another_key(store: Store) -> None:
     keys = {
         LETTERS.key({"x": 1}),
