@@ -18,7 +18,7 @@ from gsbench.analysis.differences import (
     short_version,
 )
 from gsbench.analysis.pairing import pair_trials
-from gsbench.analysis.quantities import COSTS, relative_change
+from gsbench.analysis.quantities import COSTS, Reader, relative_change
 from gsbench.analysis.results import Arm, TrialResult, group_by, read_experiment
 from gsbench.analysis.table_formats import Column, Row, Table, TableEntry
 from gsbench.records import read_if_sound
@@ -34,8 +34,6 @@ EQUAL_COUNTS = 0.02  # relative difference up to which counts are equal; densify
 MAX_VALUES = 8  # shown points of a search
 NOTHING = "No tuning is recorded: each arm ran with one choice of settings. What was tried elsewhere is not known."
 VIEWS = "validation views"  # every search judges its points on them
-
-Reader = Callable[[TrialResult], float | None]
 
 
 def caveats(trials: Sequence[TrialResult], first: Arm, second: Arm) -> str:

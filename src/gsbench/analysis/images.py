@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
-from gsbench.analysis.results import TrialResult
+from gsbench.analysis.results import TrialPair, TrialResult
 from gsbench.errors import InputError
 from gsbench.records import Number, Record, read_if_sound
 from gsbench.runs.layout import FROM_PIXELS, GROUND_TRUTH, MASKS, RENDERS
@@ -26,7 +26,6 @@ FULL_COLOUR = 32.0  # 8-bit levels: difference of error that has the strongest c
 
 Array = NDArray[np.float64]
 Pixels = NDArray[np.uint8]  # [H, W, 3]
-TrialPair = tuple[TrialResult, TrialResult]
 
 
 def texture_energy(image: Pixels) -> Array:

@@ -10,9 +10,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gsbench.analysis.pairing import Pairs, TrialPair, find_pairs
+from gsbench.analysis.pairing import Pairs, find_pairs
 from gsbench.analysis.quantities import Quantity, asked_quantity
-from gsbench.analysis.results import TrialResult, group_by
+from gsbench.analysis.results import TrialPair, TrialResult, group_by
 from gsbench.analysis.statistics import (
     TOO_SMALL,
     UNDECIDED,

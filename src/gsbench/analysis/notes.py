@@ -36,14 +36,14 @@ def trials_notes(experiment: Experiment, trials: Sequence[TrialResult]) -> list[
 def origin_notes(trials: Sequence[TrialResult]) -> list[str]:
     """Lines on the arms that gsbench did not train: who did, and whether a model or renders were measured."""
     notes = []
-    others = [trial for trial in trials if trial.program or trial.made_elsewhere]
-    for here, measured, what in ORIGINS:
-        own = [t for t in others if bool(t.program) == here and t.record.evaluated_from == measured]
+    not_ours = [trial for trial in trials if trial.program or trial.made_elsewhere]
+    for trained_here, measured, what in ORIGINS:
+        own = [t for t in not_ours if bool(t.program) == trained_here and t.record.evaluated_from == measured]
         versions = sorted({(f"{trial.init}-{trial.densify}", trial.trainer_version) for trial in own})
-        arms = ", ".join(f"{arm} (version {version})" if here else arm for arm, version in versions)
+        arms = ", ".join(f"{arm} (version {version})" if trained_here else arm for arm, version in versions)
         limits = (
             "its time is that of the whole program, and it sets its own budget"
-            if here
+            if trained_here
             else "its conditions are not known"
         )
         notes += [f"{what} ({limits}): {arms}."] if own else []

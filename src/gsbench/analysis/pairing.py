@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from gsbench.analysis.cells import check_averageable
 from gsbench.analysis.differences import differing_conditions
 from gsbench.analysis.quantities import asked_quantity, value_of
-from gsbench.analysis.results import TrialResult, group_by
+from gsbench.analysis.results import TrialPair, TrialResult, group_by
 from gsbench.errors import InputError
 from gsbench.runs.declaration import Arm, Question
 from gsbench.words import counted, some_of
@@ -27,7 +27,6 @@ BASELINE = "adc"
 CONTROLS = "eval.controls."
 
 Array = NDArray[np.float64]
-TrialPair = tuple[TrialResult, TrialResult]  # a trial of the baseline and one of the arm
 
 
 @dataclass(frozen=True)

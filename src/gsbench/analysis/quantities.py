@@ -131,8 +131,8 @@ def quantity(name: str, trials: Iterable[TrialResult]) -> Quantity:
     if key == "peak_memory_mb":
         return _scaled(key, key, "MB", 1.0, 0)
     if key not in COSTS:
-        known = [*metric_keys(trials, known_keys()), *COSTS]
-        raise InputError(f"unknown metric {name!r}; choose among {', '.join(known)}")
+        names = [*metric_keys(trials, known_keys()), *COSTS]
+        raise InputError(f"unknown metric {name!r}; choose among {', '.join(names)}")
     largest = max((COSTS[key][1](trial) or 0.0 for trial in trials), default=0.0)
     if key in COUNTS:
         return _scaled(key, key, "M", MILLION, 2) if largest >= MILLION else _scaled(key, key, "k", THOUSAND, 1)

@@ -223,6 +223,9 @@ class TrialResult:
         return is_steered or budget.seconds is not None or events.get("blocked_by_cap") != 0
 
 
+TrialPair = tuple[TrialResult, TrialResult]  # a trial of the baseline and one of the arm
+
+
 @dataclass(frozen=True)
 class Experiment:
     """The usable trials of an experiment, and a line for each trial folder that cannot be used."""

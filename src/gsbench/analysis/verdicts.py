@@ -175,8 +175,8 @@ def _by_word(verdicts: Sequence[Verdict]) -> str:
 
 def _known_sign(verdict: Verdict) -> str:
     """``, though better`` if the difference is too small to matter but its sign is known; else ""."""
-    known = verdict.outcome == TOO_SMALL and verdict.interval is not None and verdict.interval.excludes_zero()
-    if not known or verdict.mean is None or not verdict.question.sign:
+    has_sign = verdict.outcome == TOO_SMALL and verdict.interval is not None and verdict.interval.excludes_zero()
+    if not has_sign or verdict.mean is None or not verdict.question.sign:
         return ""
     return f", though {'better' if verdict.mean * verdict.question.sign > 0 else 'worse'}"
 

@@ -52,9 +52,9 @@ class ClaimVerdict:
         if verdict.untestable:
             return verdict.untestable
         if verdict.outcome == TOO_SMALL or (verdict.outcome == SUPPORTED and not claim.sign):
-            sign = verdict.mean is not None and verdict.interval is not None and verdict.interval.excludes_zero()
-            known = f"; it is {'higher' if (verdict.mean or 0) > 0 else 'lower'}" if sign else ""
-            return f"any effect is smaller than the least that matters ({least}){known}"
+            has_sign = verdict.mean is not None and verdict.interval is not None and verdict.interval.excludes_zero()
+            side = f"; it is {'higher' if (verdict.mean or 0) > 0 else 'lower'}" if has_sign else ""
+            return f"any effect is smaller than the least that matters ({least}){side}"
         if verdict.outcome == SUPPORTED:
             return f"it is {claim.direction}{self._by_least()}"
         if verdict.outcome == "refuted":

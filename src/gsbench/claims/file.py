@@ -103,8 +103,8 @@ class ClaimsFile:
     name: Name
     paper: Sentence
     seeds: Annotated[int, Ge(FIRST_LOOK)]
-    scenes: dict[str, Any]  # settings by scene; as for arms
-    arms: dict[str, Any]
+    scenes: dict[str, Any]  # the settings of each scene
+    arms: dict[str, Any]  # the settings of each arm
     claims: list[Claim]
     settings: Settings = field(default_factory=dict)
     error_rate: Annotated[float, Interval(gt=0, le=MOST_ALPHA)] = ALPHA

@@ -56,9 +56,9 @@ def declare_gate(
     InputError, one line, for a metric that cannot be judged, and for too few seeds.
     """
     own = values["eval"].get("extra") or {}
-    known = (*known_keys(), *COSTS, *own)
-    if metric not in known:
-        raise InputError(f"--metric {metric}: there is no such metric{closest(metric, known)}")
+    metrics = (*known_keys(), *COSTS, *own)
+    if metric not in metrics:
+        raise InputError(f"--metric {metric}: there is no such metric{closest(metric, metrics)}")
     sign, usual = -1, None  # less is better of counts and times
     if metric not in COSTS:
         facts = facts_for(metric, values)

@@ -97,8 +97,8 @@ def forest_plot(title: str, rows: Sequence[ForestRow], x_label: str, better: int
     """Differences with intervals, one per row, and a line at 0; ``better`` is the sign of an improvement."""
     if not rows:
         return ""
-    known = [row.interval for row in rows if row.interval is not None]
-    ends = [0.0, *(row.mean for row in rows), *(end for one in known for end in (one.low, one.high))]
+    intervals = [row.interval for row in rows if row.interval is not None]
+    ends = [0.0, *(row.mean for row in rows), *(end for one in intervals for end in (one.low, one.high))]
     words = [
         f"{row.label} {short_number(row.mean)}"
         + (f", interval {short_number(row.interval.low)} to {short_number(row.interval.high)}" if row.interval else "")
