@@ -139,10 +139,10 @@ def test_a_rasterizer_of_ones_own_goes_by_a_name_of_its_own(own_module: None, na
         words = ["scene=courtyard", "device=cpu", f"densify={densify}", "allow_targets=[own_classes]"]
         parts = Parts(compose_one(words).values | {"raster": values | {"name": given}})
         if sound and densify == "adc":
-            parts.check(here=True)
+            parts.check(on_this_machine=True)
         elif sound:
             with pytest.raises(InputError, match="raster=named does not give them"):
-                parts.check(here=False)
+                parts.check(on_this_machine=False)
     assert build_own_rasterizer({"name": "cpu"}, []) is None
     assert build_rasterizer({"name": "reference"}, [], torch.device("cpu")).name == "reference"
 
