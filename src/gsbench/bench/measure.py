@@ -205,7 +205,7 @@ def _compare(
         }
         row |= {key: _median([sample[key] for sample in parts[raster]]) for key in parts[raster][0]}
         row |= {
-            "step_ratio": _median([own["step_ms"] / first["step_ms"] for own, first in pairs]),
+            "step_ratio": _median([sample["step_ms"] / first["step_ms"] for sample, first in pairs]),
             "steps_per_second": _median(speeds[raster]),
             "fps": _median(frames[raster]),
             "threads": stepper.threads,

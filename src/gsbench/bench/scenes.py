@@ -108,9 +108,9 @@ def frontal_camera(width: int, height: int) -> Camera:
 
 def camera_before(scene: Gaussians, width: int, height: int) -> Camera:
     """A camera that looks along z at the middle of ``scene`` from twice the median distance of its Gaussians."""
-    middle: Tensor = scene.means.median(0).values  # [3]
-    distance = (scene.means - middle).norm(dim=-1).median().item()
-    return _along_z(width, height, -middle.double().numpy() + np.array([0.0, 0.0, 2 * distance]))
+    center: Tensor = scene.means.median(0).values  # [3]
+    distance = (scene.means - center).norm(dim=-1).median().item()
+    return _along_z(width, height, -center.double().numpy() + np.array([0.0, 0.0, 2 * distance]))
 
 
 def _along_z(width: int, height: int, translation: np.ndarray) -> Camera:

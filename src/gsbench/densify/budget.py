@@ -60,12 +60,12 @@ def admit(candidates: Tensor, score: Tensor, gain: int, allowed: int | None) -> 
     count = int(candidates.sum())
     if allowed is None or count * gain <= allowed:
         return candidates, 0
-    places = allowed // gain if gain > 0 else count
+    num_admitted = allowed // gain if gain > 0 else count
     index = candidates.nonzero().squeeze(-1)  # [C]
-    best = index[torch.sort(score[index], descending=True, stable=True).indices[:places]]
+    best = index[torch.sort(score[index], descending=True, stable=True).indices[:num_admitted]]
     admitted = torch.zeros_like(candidates)
     admitted[best] = True
-    return admitted, count - places
+    return admitted, count - num_admitted
 
 
 def find_factor(count: Callable[[float], int], target: int, low: float, high: float) -> float:

@@ -56,13 +56,13 @@ class FastGS(AbsGS):
     def score(self, refinement: Refinement) -> None:
         """Compute the count and the pruning score of every Gaussian."""
         values, views = refinement.gaussians.values, self.context.training_views
-        chosen = draw_views(views, self.score_views, refinement.rng)
+        indices = draw_views(views, self.score_views, refinement.rng)
         total, weighted = torch.zeros_like(values.opacity_logits), torch.zeros_like(values.opacity_logits)
-        for index in chosen:
+        for index in indices:
             counts, loss = self.bad_pixels(index, values, refinement.step)
             total += counts
             weighted += loss * counts
-        self.statistics["count"] = (total / len(chosen)).floor().float()
+        self.statistics["count"] = (total / len(indices)).floor().float()
         self.statistics["score"] = to_unit_range(weighted).float()
 
     def bad_pixels(self, index: int, gaussians: Gaussians, step: int) -> tuple[Tensor, Tensor]:
@@ -80,7 +80,7 @@ class FastGS(AbsGS):
         """Remove some of the faint and huge Gaussians, more likely those with high scores."""
         values, score = refinement.gaussians.values, self.statistics["score"]
         faint, huge = self.faint(values.opacity_logits), self.huge(refinement.step, values.log_scales)
-        # Only Gaussians from before the round have a score. They come first; split parents are gone from among them.
+        # Only Gaussians from before the round have a score. They come first, without the removed split parents.
         split_parents = refinement.event.split_gradient // (self.split_children - 1)
         scored = torch.arange(len(score), device=score.device) < refinement.event.before - split_parents
         drawn = draw(scored, 1 / (MIN_DIVISOR + 1 - score), int((faint | huge).sum()) // 2, refinement.rng)

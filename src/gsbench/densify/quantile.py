@@ -28,10 +28,10 @@ class QuantileADC(ADC):
     def candidates(self, refinement: Refinement) -> tuple[Tensor, Tensor]:
         _, large = super().candidates(refinement)
         mean = self.mean_gradient()
-        places = int(self.growth_rate / self.strictness * len(mean)) // max(1, self.split_children - 1)
-        chosen = torch.zeros_like(large)
-        chosen[mean.sort(descending=True, stable=True).indices[:places]] = True
-        return chosen & (mean > 0), large
+        count = int(self.growth_rate / self.strictness * len(mean)) // max(1, self.split_children - 1)
+        largest = torch.zeros_like(large)
+        largest[mean.sort(descending=True, stable=True).indices[:count]] = True
+        return largest & (mean > 0), large
 
     def forecast(self, refinement: Refinement) -> int:
         # The opacity threshold is a quantile over all Gaussians after growth, so each child needs its own entry.

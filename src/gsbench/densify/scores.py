@@ -110,7 +110,7 @@ def _normalized(values: Tensor, average: Callable[[Tensor], Tensor]) -> Tensor:
 
 def edge_scores(
     views: TrainingViews,
-    chosen: Sequence[int],
+    indices: Sequence[int],
     gaussians: Gaussians,
     step: int,
     normalize: Callable[[Tensor], Tensor],
@@ -118,14 +118,14 @@ def edge_scores(
     """Scores [N] by the edges in photographs that each Gaussian covers.
 
     In a view the score is the sum over pixels of (edge strength) alpha T, passed through ``normalize``; the result is
-    the mean over the views ``chosen``.
+    the mean over the views ``indices``.
     """
     total = torch.zeros_like(gaussians.opacity_logits)
-    for index in chosen:
+    for index in indices:
         edges = edge_map(views.image(index)).to(total.dtype).unsqueeze(-1)  # [H, W, 1]
         sums, _ = blended_sums(views, index, gaussians, step, edges.expand(-1, -1, 3).contiguous())
         total += normalize(sums[:, 0])
-    return total / len(chosen)
+    return total / len(indices)
 
 
 def draw(candidates: Tensor, scores: Tensor, count: int, rng: torch.Generator) -> Tensor:

@@ -79,9 +79,9 @@ class SteepGS(ADC):
         seen = self.statistics["visible_count"][index].clamp_min(1)  # [S]
         mean = self.statistics["splitting_sum"][index].double() / seen[:, None, None]  # [S, 3, 3]
         values, vectors = torch.linalg.eigh(mean)  # in rising order
-        least = vectors[..., 0]
-        largest = least.gather(-1, least.abs().argmax(-1, keepdim=True))  # [S, 1]
-        return values[:, 0] * self.context.extent**2, least * largest.sign()
+        directions = vectors[..., 0]
+        largest = directions.gather(-1, directions.abs().argmax(-1, keepdim=True))  # [S, 1]
+        return values[:, 0] * self.context.extent**2, directions * largest.sign()
 
     def saddles(self, refinement: Refinement) -> Saddles:
         """The candidates of ADC whose split lowers the loss."""

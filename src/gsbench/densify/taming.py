@@ -90,11 +90,11 @@ class Taming(ADC):
         _, large = self.candidates(refinement)
         count, allowed = int(candidates.sum()), self.allowance(refinement)
         assert allowed is not None  # every cap of this class has a limit
-        places = min(allowed // gain, count)
+        num_drawn = min(allowed // gain, count)
         drawn = torch.zeros_like(candidates)
-        for kind in (candidates & ~large, candidates & large):
-            share = places * int(kind.sum()) // max(count, 1)
-            drawn |= draw(kind, self.statistics["score"], share, refinement.rng)
+        for group in (candidates & ~large, candidates & large):
+            share = num_drawn * int(group.sum()) // max(count, 1)
+            drawn |= draw(group, self.statistics["score"], share, refinement.rng)
         return drawn, count - int(drawn.sum())
 
     def prune(self, refinement: Refinement) -> None:

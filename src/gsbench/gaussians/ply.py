@@ -112,8 +112,8 @@ def read_ply(path: Path, device: torch.device | str = "cpu") -> Gaussians:
             f"it has {len(rest)}" + (f", with {min(present_rest - set(rest))}" if present_rest != set(rest) else "")
         )
     if missing or len(vertices) == 0:
-        odd = ", ".join(missing) or "all, since it is empty"
-        raise InputError(f"{path}: not a 3DGS PLY; missing or odd properties: {odd}")
+        listed = ", ".join(missing) or "all, since it is empty"
+        raise InputError(f"{path}: not a 3DGS PLY; missing or odd properties: {listed}")
     for name in (*required, *rest):
         if vertices[name].dtype.kind not in "fiu" or not np.isfinite(vertices[name]).all():
             raise InputError(f"{path}: {name} is not a finite number everywhere: export the model again")

@@ -26,8 +26,8 @@ def create_rasterizer(name: str, device: torch.device, threads: int | None = Non
     ``cpu``."""
     executor = resolve(name, device.type)
     module, _, attribute = executor.target.rpartition(".")
-    kind = getattr(importlib.import_module(module), attribute)
-    rasterizer: Rasterizer = kind(threads=threads) if executor.takes_threads else kind()
+    rasterizer_class = getattr(importlib.import_module(module), attribute)
+    rasterizer: Rasterizer = rasterizer_class(threads=threads) if executor.takes_threads else rasterizer_class()
     return rasterizer
 
 

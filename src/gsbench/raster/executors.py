@@ -53,8 +53,8 @@ class Executor:
         """The reason why it cannot run here on a device of this type, and the remedy; None if it can run."""
         if not self.runs_on(device_type):
             needed = " or ".join(self.devices)
-            others = ", ".join(other.name for other in EXECUTORS if other.runs_on(device_type))
-            return f"runs on device={needed}, not on {device_type}; choose from {others}, or set device={needed}"
+            alternatives = ", ".join(other.name for other in EXECUTORS if other.runs_on(device_type))
+            return f"runs on device={needed}, not on {device_type}; choose from {alternatives}, or set device={needed}"
         if not self.is_installed:
             return f"needs {self.package}: {self.install}"
         return self.too_old()

@@ -228,9 +228,9 @@ def _square_radii(conics: Tensor, seen: Tensor, constants: RasterConstants) -> T
     """ceil(3 sqrt(lambda_max)) px, for covariances with the inverses ``conics`` [1, N, 3]; 0 if not ``seen``."""
     a, b, c = conics.double().unbind(-1)  # the inverse of the covariance: yy, -xy, xx over its determinant
     determinant = 1 / (a * c - b * b)
-    middle = 0.5 * (a + c) * determinant
-    root = (middle * middle - determinant).clamp_min(constants.eigenvalue_floor).sqrt()
-    radii = (constants.sigma_extent * (middle + root).sqrt()).ceil().nan_to_num(0, 0, 0).clamp(0, MAX_RADIUS)
+    half_trace = 0.5 * (a + c) * determinant
+    root = (half_trace * half_trace - determinant).clamp_min(constants.eigenvalue_floor).sqrt()
+    radii = (constants.sigma_extent * (half_trace + root).sqrt()).ceil().nan_to_num(0, 0, 0).clamp(0, MAX_RADIUS)
     return torch.where(seen, radii, 0.0).to(torch.int32)
 
 

@@ -20,11 +20,11 @@ DISTRIBUTION = "gsbench-3dgs"  # the name on the package index, where "gsbench" 
 
 def install_command(extra: str = "") -> str:
     """The shell command that installs gsbench with an extra such as ``view``, from the place it was installed from."""
-    wanted = f"[{extra}]" if extra else ""
+    extras = f"[{extra}]" if extra else ""
     root = checkout()
     if root is None:
-        return f"pip install '{installed_from() or DISTRIBUTION}{wanted}'"
-    return f"pip install -e '{'.' if root == Path.cwd() else root}{wanted}'"
+        return f"pip install '{installed_from() or DISTRIBUTION}{extras}'"
+    return f"pip install -e '{'.' if root == Path.cwd() else root}{extras}'"
 
 
 def installed_from() -> Path | None:
@@ -92,8 +92,8 @@ def checkout_of(folder: Path, tracked: str | None = None) -> Checkout | None:
 @cache
 def own_checkout() -> dict[str, Any]:
     """The commit of gsbench's own checkout, and whether tracked files had changed; empty if it is no checkout."""
-    found = checkout_of(Path(__file__).parent, Path(__file__).name)
-    return {} if found is None else {"commit": found.commit, "edited": found.edited}
+    state = checkout_of(Path(__file__).parent, Path(__file__).name)
+    return {} if state is None else {"commit": state.commit, "edited": state.edited}
 
 
 def _has_filters(folder: Path) -> bool:

@@ -43,8 +43,8 @@ def cache_base() -> Path:
     If neither is writable, it is a private temporary folder, and the next process compiles again.
     """
     home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
-    given = os.environ.get("NUMBA_CACHE_DIR")
-    for base in [*([Path(given)] if given else []), Path(home) / "gsbench" / "numba"]:
+    configured = os.environ.get("NUMBA_CACHE_DIR")
+    for base in [*([Path(configured)] if configured else []), Path(home) / "gsbench" / "numba"]:
         try:
             base.mkdir(parents=True, exist_ok=True)
         except OSError:
@@ -64,8 +64,8 @@ def cache_folder(package: Path = PACKAGE) -> Path:
     """
     digest = hashlib.sha256("\n".join((numba.__version__, *numba_target())).encode())
     for source in SOURCES:
-        place = package / source
-        for path in sorted(place.rglob("*.py")) if place.is_dir() else [place]:
+        root = package / source
+        for path in sorted(root.rglob("*.py")) if root.is_dir() else [root]:
             digest.update(hashlib.sha256(path.read_bytes()).digest())
     return cache_base() / digest.hexdigest()[:DIGEST_CHARACTERS]
 

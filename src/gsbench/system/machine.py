@@ -99,10 +99,10 @@ def _windows_name() -> str:
 
 def load_numba() -> Any:
     """Import numba. Raises InputError if one of its environment variables would make the import fail."""
-    for name, least in NUMBA_MINIMA.items():
-        value = os.environ.get(name, str(least))
-        if not value.isascii() or not value.isdigit() or int(value) < least:
-            raise InputError(f"{name}={value}: numba needs a whole number from {least} on: set another, or unset it")
+    for name, minimum in NUMBA_MINIMA.items():
+        value = os.environ.get(name, str(minimum))
+        if not value.isascii() or not value.isdigit() or int(value) < minimum:
+            raise InputError(f"{name}={value}: numba needs a whole number from {minimum} on: set another, or unset it")
     # numba reads `.numba_config.yaml` in the current folder, where a stranger's capture may be: import it elsewhere.
     with contextlib.chdir(Path(__file__).parent):
         import numba
@@ -134,8 +134,8 @@ def kernel_target() -> str:
 def x86_level(features: set[str]) -> str:
     """The highest x86-64 micro-architecture level whose features (LLVM names) are all in ``features``."""
     level = "x86-64-v1"
-    for name, wanted in X86_LEVELS.items():
-        if not features.issuperset(wanted):
+    for name, required in X86_LEVELS.items():
+        if not features.issuperset(required):
             break
         level = name
     return level

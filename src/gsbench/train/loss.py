@@ -60,10 +60,10 @@ class PhotometricLoss:
             )
         if image.dtype != torch.float32:
             return torch_photometric_loss(image, target, self.ssim_weight)
-        kind = image.device.type
-        if kind not in self._compiled:
-            self._compiled[kind] = self._compile(kind)
-        return self._compiled[kind](image, target)
+        device_type = image.device.type
+        if device_type not in self._compiled:
+            self._compiled[device_type] = self._compile(device_type)
+        return self._compiled[device_type](image, target)
 
     def _compile(self, device_type: str) -> Loss:
         """Return the loss for a type of device. Imports only the packages that it needs."""

@@ -160,7 +160,7 @@ def _project(
         visible = visible & (dot(m0, m0) + dot(m1, m1) < MAX_VARIANCE)
         xx, xy, yy, a = spread(m0, m1)
         half = (xx - yy) * HALF
-        # The discriminant middle^2 - det, written as a sum of squares.
+        # The discriminant (trace / 2)^2 - det, written as a sum of squares.
         largest = (xx + yy) * HALF + square_root(maximum(half * half + xy * xy, EIGENVALUE_FLOOR))
         radius = minimum(ceil(square_root(largest) * SIGMA_EXTENT), MAX_RADIUS)
         first_x, past_x = _tile_range(column - radius, column + radius, v.tiles_x)

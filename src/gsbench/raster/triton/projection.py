@@ -136,7 +136,7 @@ def project(
     visible &= (tl.abs(column) < MAX_CENTER) & (tl.abs(row) < MAX_CENTER) & (dot(m0, m0) + dot(m1, m1) < MAX_VARIANCE)
     xx, xy, yy, a = spread(m0, m1)
     half = (xx - yy) * 0.5
-    # The discriminant middle^2 - det, written as a sum of squares.
+    # The discriminant (trace / 2)^2 - det, written as a sum of squares.
     largest = (xx + yy) * 0.5 + tl.sqrt(tl.maximum(half * half + xy * xy, EIGENVALUE_FLOOR))
     radius = tl.minimum(tl.ceil(tl.sqrt(largest) * SIGMA_EXTENT), MAX_RADIUS)
     first_x, past_x = _tile_range(column - radius, column + radius, v.tiles_x, TILE)
