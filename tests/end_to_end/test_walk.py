@@ -83,14 +83,14 @@ def test_from_the_yaml_to_the_split(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         monkeypatch.setattr(owner, name, watched)
 
     compositions = 0
-    look_at = compose.look_at  # at what Hydra has composed: for the command line, and for each job
+    enforce_permissions = compose.enforce_permissions  # for the command line, and for each job
 
     def counted(*given: Any) -> Any:
         nonlocal compositions
         compositions += 1
-        return look_at(*given)
+        return enforce_permissions(*given)
 
-    monkeypatch.setattr(compose, "look_at", counted)
+    monkeypatch.setattr(compose, "enforce_permissions", counted)
     watch(settings, "_converted", lambda value, field, cls, key: key == KEY)
     watch(Volumetric, "split_by_volume")
     watch(TrainableGaussians, "edit", lambda *given: calls["split_by_volume"] > 0)

@@ -232,7 +232,7 @@ def look(runs: Path, places: dict[str, Path]) -> int:
 
     attempt(tables)
     attempt(lambda: explain_cell(f"{EXPERIMENT}:courtyard:psnr:adc", runs))
-    attempt(lambda: "\n".join(lines_of(states_of_experiment(home), everything=True)).encode())
+    attempt(lambda: "\n".join(lines_of(states_of_experiment(home), with_done=True)).encode())
     attempt(lambda: read_plan(home))
     attempt(lambda: FinishedTrials(runs).estimate(values_of(runs, "adc", 0, 0.03)))
     attempt(lambda: read_declarations(home))
