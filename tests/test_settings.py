@@ -17,7 +17,7 @@ from pydantic import PositiveFloat, PositiveInt
 from gsbench.densify import ADC, MCMC, Volumetric
 from gsbench.errors import InputError
 from gsbench.init import Dim, Random, Sfm
-from gsbench.settings import check_settings, checked, describe
+from gsbench.settings import check_settings, check_values, describe
 
 if TYPE_CHECKING:
     from decimal import Decimal
@@ -68,30 +68,30 @@ class Options:
 )
 def test_words_for_what_is_not_allowed(name: str, given: Any, words: str) -> None:
     with pytest.raises(InputError) as error:
-        checked(Options, {name: given}, "options")
+        check_values(Options, {name: given}, "options")
     assert str(error.value) == words
 
 
 def test_values_are_converted_to_their_type() -> None:
     given = {"count": 1e3, "rate": 2, "color": [0, 1, 2], "label": 7, "flag": "yes", "folder": "a"}
-    result = checked(Options, given, "options")
+    result = check_values(Options, given, "options")
     assert result == {"count": 1000, "rate": 2.0, "color": (0, 1, 2), "label": "7", "flag": True, "folder": Path("a")}
     assert [type(result[name]) for name in ("count", "rate", "label")] == [int, float, str]
 
 
 def test_the_authors_default_may_be_what_no_user_may_give() -> None:
-    assert checked(Options, {"farthest": math.inf}, "options") == {"farthest": math.inf}
+    assert check_values(Options, {"farthest": math.inf}, "options") == {"farthest": math.inf}
     with pytest.raises(InputError, match="farthest must be a number, got -inf"):
-        checked(Options, {"farthest": -math.inf}, "options")
+        check_values(Options, {"farthest": -math.inf}, "options")
 
 
 def test_unknown_keys_name_the_nearest() -> None:
     with pytest.raises(
         InputError, match=r"^options\.cuont is not a setting; did you mean count\? \(there are: count, "
     ):
-        checked(Options, {"cuont": 1}, "options")
+        check_values(Options, {"cuont": 1}, "options")
     with pytest.raises(InputError, match=r"options\.state is not a setting"):
-        checked(Options, {"state": 1}, "options")
+        check_values(Options, {"state": 1}, "options")
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ import pytest
 import torch
 
 from gsbench.errors import InputError
-from gsbench.weights import MissingWeights, WeightsFile, find_all_weights, find_weights, load_state
+from gsbench.weights import MissingWeightsError, WeightsFile, find_all_weights, find_weights, load_state
 from tests.datasets.server import Manners, Server, serve
 
 STATE = {"a.weight": torch.arange(6.0).reshape(2, 3), "a.bias": torch.zeros(2)}
@@ -53,7 +53,7 @@ def test_wrong_checksum_is_refused_and_a_right_copy_elsewhere_taken(tmp_path: Pa
     folder = tmp_path / "mine"
     folder.mkdir()
     (folder / "net.pth").write_bytes(b"truncat")
-    with pytest.raises(MissingWeights, match=r"net.pth has sha256 .* wrong or truncated; replace it"):
+    with pytest.raises(MissingWeightsError, match=r"net.pth has sha256 .* wrong or truncated; replace it"):
         find_weights(spec(b"truncated", digits=digits), folder)
     empty_caches.mkdir(parents=True)
     (empty_caches / "net.pth").write_bytes(b"truncated")
@@ -61,7 +61,7 @@ def test_wrong_checksum_is_refused_and_a_right_copy_elsewhere_taken(tmp_path: Pa
 
 
 def test_missing_files_are_named_together_with_places_and_sources(tmp_path: Path):
-    with pytest.raises(MissingWeights) as caught:
+    with pytest.raises(MissingWeightsError) as caught:
         find_all_weights([spec(), spec(name="second.pth")], tmp_path, download=False)
     message = str(caught.value)
     for part in ("net.pth, second.pth", str(tmp_path), "GSBENCH_WEIGHTS", "example.org", "switched off"):
@@ -139,14 +139,14 @@ def test_download_that_ends_early_or_is_damaged_leaves_nothing(
     server: Server, empty_caches: Path, content: bytes, manners: Manners, said: str
 ):
     server.manners = manners
-    with pytest.raises(MissingWeights, match=said):
+    with pytest.raises(MissingWeightsError, match=said):
         find_weights(spec(b"good", served(server, content)))
     assert list(empty_caches.iterdir()) == []
 
 
 def test_without_a_network_the_answer_comes_at_once():
     """One attempt, and no waiting for another."""
-    with pytest.raises(MissingWeights, match=r"the download failed: .*1 failures in a row .*refused"):
+    with pytest.raises(MissingWeightsError, match=r"the download failed: .*1 failures in a row .*refused"):
         find_weights(spec(url="http://127.0.0.1:9/net.pth"))
 
 
@@ -165,9 +165,9 @@ def test_state_round_trip(tmp_path: Path, name: str):
 def test_state_within_a_checkpoint(tmp_path: Path):
     torch.save({"epoch": 3, "extractor": STATE}, tmp_path / "net.pth")
     assert load_state(tmp_path / "net.pth", entry="extractor").keys() == STATE.keys()
-    with pytest.raises(MissingWeights, match="no entry 'model'"):
+    with pytest.raises(MissingWeightsError, match="no entry 'model'"):
         load_state(tmp_path / "net.pth", entry="model")
-    with pytest.raises(MissingWeights, match="something other than tensors"):
+    with pytest.raises(MissingWeightsError, match="something other than tensors"):
         load_state(tmp_path / "net.pth")
 
 
@@ -188,7 +188,7 @@ def test_code_in_a_file_is_not_run(tmp_path: Path, how: str):
         torch.save({"a": Malicious(trace)}, tmp_path / "net.pth")
     else:
         (tmp_path / "net.pth").write_bytes(pickle.dumps({"a": Malicious(trace)}))
-    with pytest.raises(MissingWeights, match="cannot be read as plain tensors"):
+    with pytest.raises(MissingWeightsError, match="cannot be read as plain tensors"):
         load_state(tmp_path / "net.pth")
     assert not trace.exists()
 
@@ -204,6 +204,6 @@ def test_truncated_and_foreign_files(tmp_path: Path, name: str, content: bytes |
             torch.save(STATE, path)
         content = path.read_bytes()[: path.stat().st_size // 2]
     path.write_bytes(content)
-    with pytest.raises(MissingWeights, match="cannot be read as plain tensors") as caught:
+    with pytest.raises(MissingWeightsError, match="cannot be read as plain tensors") as caught:
         load_state(path)
     assert "\n" not in str(caught.value)

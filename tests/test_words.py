@@ -18,7 +18,7 @@ from gsbench.app.command import compose_trials
 from gsbench.config.schema import GROUP_SCHEMAS
 from gsbench.errors import InputError
 from gsbench.runs.keys import config_hash
-from gsbench.settings import checked, option_fields
+from gsbench.settings import check_values, option_fields
 
 REFUSED = {  # command line: a part of the line that refuses it
     # words that nothing reads
@@ -312,13 +312,13 @@ VALUES: st.SearchStrategy[Any] = st.recursive(
 def test_any_value_of_any_setting(key: tuple[str, str], value: Any) -> None:
     group, name = key
     try:
-        once = checked(GROUP_SCHEMAS[group], {name: value}, group)
+        once = check_values(GROUP_SCHEMAS[group], {name: value}, group)
     except InputError as error:
         refusal = str(error)
         assert refusal.startswith(f"{group}.{name} ")
         assert len(refusal.splitlines()) == 1
         return
-    assert checked(GROUP_SCHEMAS[group], once, group) == once
+    assert check_values(GROUP_SCHEMAS[group], once, group) == once
 
 
 # ---- what was valid keeps its identity: a changed hash is a trial that is computed anew

@@ -20,7 +20,7 @@ try:
     from gsbench.logs import printable_output, set_up_logging
     from gsbench.system.own_modules import SAFE_PATH
     from gsbench.verbs import VERBS
-    from gsbench.words import closest
+    from gsbench.words import did_you_mean
 except KeyboardInterrupt:
     print("gsbench: stopped before it began", file=sys.stderr)
     sys.exit(INTERRUPTED)
@@ -96,8 +96,8 @@ def _verb(name: str, argv: list[str]) -> int:
         from gsbench.config.command_words import hint_for
 
         raise InputError(
-            f"{name!r} is neither a verb nor a setting like key=value{hint_for(name) or closest(name, list(VERBS))} "
-            f"(verbs: {', '.join(VERBS)})"
+            f"{name!r} is neither a verb nor a setting like key=value"
+            f"{hint_for(name) or did_you_mean(name, list(VERBS))} (verbs: {', '.join(VERBS)})"
         )
     main_function: Callable[[list[str], Path], int] = importlib.import_module(f"gsbench.verbs.{name}").main
     runs = runs_dir()

@@ -52,7 +52,7 @@ def _is_default(record: Record, field: Any) -> bool:
 
 def read_typed(path: Path, kind: type[T]) -> T:
     """The JSON file as an object of ``kind``; raises as `read_bytes` does, and DamagedError naming the first misfit."""
-    return typed(read_bytes(path), kind, path)
+    return parse_typed(read_bytes(path), kind, path)
 
 
 def read_if_sound(path: Path, kind: type[T]) -> T | None:
@@ -63,7 +63,7 @@ def read_if_sound(path: Path, kind: type[T]) -> T | None:
         return None
 
 
-def typed(content: bytes, kind: type[T], path: Path) -> T:
+def parse_typed(content: bytes, kind: type[T], path: Path) -> T:
     """Parse the JSON ``content`` of the file ``path`` as an object of ``kind``; raises DamagedError for a misfit.
 
     The parser refuses more than 200 levels and integers of more than 4,300 digits.
@@ -73,7 +73,7 @@ def typed(content: bytes, kind: type[T], path: Path) -> T:
         result: T = adapter(reader).validate_json(content)
         return result
     except ValidationError as error:
-        raise DamagedError(path, misfit(error)) from None
+        raise DamagedError(path, describe_misfit(error)) from None
 
 
 @cache
@@ -82,7 +82,7 @@ def adapter(kind: Any) -> TypeAdapter[Any]:
     return TypeAdapter(kind) if is_dataclass(kind) else TypeAdapter(kind, config=STRICT)
 
 
-def misfit(error: ValidationError) -> str:
+def describe_misfit(error: ValidationError) -> str:
     """Describe the first fault: ``is damaged: metrics.psnr is '27' (input should be a valid number)``."""
     first: ErrorDetails = error.errors(include_url=False)[0]
     key, kind = ".".join(str(part) for part in first["loc"]), first["type"]
@@ -104,7 +104,7 @@ def iterate_rows(content: bytes, kind: type[T], path: Path) -> Iterator[tuple[st
     lines = content.splitlines(keepends=True)
     # Parsing all lines at once is faster. Only if that fails are they parsed one by one.
     try:
-        rows = typed(b"[" + b",".join(lines) + b"]", list[kind], path)  # type: ignore[valid-type]
+        rows = parse_typed(b"[" + b",".join(lines) + b"]", list[kind], path)  # type: ignore[valid-type]
     except DamagedError:
         rows = []
     if len(rows) == len(lines):  # otherwise a line holds several values
@@ -112,7 +112,7 @@ def iterate_rows(content: bytes, kind: type[T], path: Path) -> Iterator[tuple[st
         return
     for number, line in enumerate(lines, 1):
         try:
-            row = typed(line, kind, path)
+            row = parse_typed(line, kind, path)
         except DamagedError as error:
             if line.endswith(b"\n") or number < len(lines):
                 log.warning("left out: %s from line %d on, which %s", path, number, error.reason)

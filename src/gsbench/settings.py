@@ -20,7 +20,7 @@ from annotated_types import DocInfo, GroupedMetadata, Interval, Predicate, doc
 from pydantic import ConfigDict, PydanticUserError, TypeAdapter, ValidationError
 
 from gsbench.errors import InputError
-from gsbench.words import closest, is_path
+from gsbench.words import did_you_mean, is_path
 
 PathName = Annotated[str, Predicate(is_path), doc("a path")]
 AnyPath = Annotated[str | Path, Predicate(lambda path: is_path(str(path))), doc("a path")]
@@ -70,11 +70,11 @@ def check_settings(settings: Any, group: str) -> None:
     Raises InputError that names ``group`` and the field, the allowed values, and the given value.
     """
     given = {field.name: getattr(settings, field.name) for field in option_fields(type(settings))}
-    for name, value in checked(type(settings), given, group).items():
+    for name, value in check_values(type(settings), given, group).items():
         object.__setattr__(settings, name, value)  # the dataclass may be frozen
 
 
-def checked(cls: type, values: Mapping[str, Any], group: str) -> dict[str, Any]:
+def check_values(cls: type, values: Mapping[str, Any], group: str) -> dict[str, Any]:
     """``values``, options of the dataclass ``cls``, converted to the types of its annotations.
 
     Raises InputError for the first unknown or forbidden option. Its message starts with the name of ``group`` and a
@@ -94,7 +94,7 @@ def unknown_setting(key: str, name: str, known: Iterable[str]) -> str:
     """The message for a ``key`` whose last part ``name`` is not among the ``known`` settings."""
     known = list(known)
     existing = f"there are: {', '.join(known)}" if known else "there are no settings"
-    return f"{key} is not a setting{closest(name, known)} ({existing})"
+    return f"{key} is not a setting{did_you_mean(name, known)} ({existing})"
 
 
 def option_fields(cls: type) -> list[dataclasses.Field[Any]]:

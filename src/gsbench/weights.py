@@ -30,7 +30,7 @@ ONE_TRY = downloads.RetryPolicy(timeout=10.0, tries=1)  # without a network, the
 SAFETENSORS_SUFFIX = ".safetensors"
 
 
-class MissingWeights(InputError):  # noqa: N818  it says what is the matter
+class MissingWeightsError(InputError):
     """Raised for a weights file that is not found and cannot be downloaded, or that is not the expected one."""
 
 
@@ -53,8 +53,8 @@ class WeightsFile:
 def find_weights(spec: WeightsFile, folder: Path | None = None, download: bool = True) -> Path:
     """The path of a checked copy of ``spec``, which is downloaded into the torch hub cache if it is not found.
 
-    Raises ``InputError`` if ``folder`` does not exist, and ``MissingWeights`` if every file found has a wrong checksum,
-    or if none is found and none can be downloaded.
+    Raises ``InputError`` if ``folder`` does not exist, and ``MissingWeightsError`` if every file found has a wrong
+    checksum, or if none is found and none can be downloaded.
     """
     return find_all_weights([spec], folder, download)[0]
 
@@ -74,7 +74,7 @@ def find_all_weights(specs: Sequence[WeightsFile], folder: Path | None = None, d
             try:
                 paths[spec] = _download(spec, hub_cache())
             except (OSError, GsbenchError) as error:
-                if isinstance(error, MissingWeights):  # the downloaded file is damaged
+                if isinstance(error, MissingWeightsError):  # the downloaded file is damaged
                     raise
                 reasons.append(f"the download failed: {error}")
                 break  # without a network, each further download would fail as slowly
@@ -83,7 +83,7 @@ def find_all_weights(specs: Sequence[WeightsFile], folder: Path | None = None, d
         names = ", ".join(spec.names[0] for spec in still_missing)
         sources = ", ".join(spec.url or spec.source for spec in still_missing)
         places = ", ".join(str(place) for place, _ in folders)
-        raise MissingWeights(
+        raise MissingWeightsError(
             f"weights not found: {names} (looked in {places}; {reasons[0]}): get them from {sources}, put them into a "
             f"folder and set {WEIGHTS_VARIABLE} to it"
         )
@@ -101,7 +101,7 @@ def digests_of_unpinned(specs: Sequence[WeightsFile], folder: Path | None = None
 
 
 def _find_local(spec: WeightsFile, folders: Sequence[tuple[Path, bool]]) -> Path | None:
-    """The first file with the right checksum; raises ``MissingWeights`` if all files found have a wrong one."""
+    """The first file with the right checksum; raises ``MissingWeightsError`` if all files found have a wrong one."""
     faults = []
     for folder, sub_folders in folders:
         for path in _candidates(folder, spec.names, sub_folders):
@@ -110,14 +110,14 @@ def _find_local(spec: WeightsFile, folders: Sequence[tuple[Path, bool]]) -> Path
                 return path
             faults.append(fault)
     if faults:
-        raise MissingWeights(f"{faults[0]}; replace it with the file from {spec.url or spec.source}")
+        raise MissingWeightsError(f"{faults[0]}; replace it with the file from {spec.url or spec.source}")
     return None
 
 
 def load_state(path: Path, entry: str | None = None) -> dict[str, Tensor]:
     """The tensors in ``path`` (.safetensors, or a PyTorch file read with ``weights_only``), on the CPU, by name.
 
-    ``entry`` is the key of the tensors in a PyTorch file that holds more. Raises ``MissingWeights`` if the file is
+    ``entry`` is the key of the tensors in a PyTorch file that holds more. Raises ``MissingWeightsError`` if the file is
     truncated, is not a weights file, or holds anything but tensors.
     """
     import torch
@@ -194,11 +194,11 @@ def _download(spec: WeightsFile, folder: Path) -> Path:
 
         sha256 = downloads.download(spec.url, temporary, ONE_TRY, advance)
         if not sha256.startswith((spec.sha256 or "").lower()):
-            raise MissingWeights(
+            raise MissingWeightsError(
                 f"the download of {target.name} from {spec.url} is damaged: try again (its sha256 is {sha256[:16]}…)"
             )
     return target
 
 
-def _unreadable(path: Path, why: str) -> MissingWeights:
-    return MissingWeights(f"weights file {path} cannot be read as plain tensors ({why}): replace it")
+def _unreadable(path: Path, why: str) -> MissingWeightsError:
+    return MissingWeightsError(f"weights file {path} cannot be read as plain tensors ({why}): replace it")

@@ -42,7 +42,7 @@ def true_minus(number: str) -> str:
     return number.replace("-", "−")
 
 
-def closest(word: str, choices: Iterable[str]) -> str:
+def did_you_mean(word: str, choices: Iterable[str]) -> str:
     """'; did you mean X?' if a choice is similar to ``word``, else ''."""
     choices = list(choices)
     near = difflib.get_close_matches(word, choices, n=1) or difflib.get_close_matches(word.lower(), choices, n=1)

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from gsbench.errors import InputError
 from gsbench.eval.lpips import BACKBONES, Lpips, load_lpips
-from gsbench.weights import MissingWeights, load_state
+from gsbench.weights import MissingWeightsError, load_state
 
 State = dict[str, Tensor]
 
@@ -149,7 +149,7 @@ def test_weights_of_another_network_are_refused() -> None:
 def test_missing_weights_name_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("GSBENCH_WEIGHTS", raising=False)
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
-    with pytest.raises(MissingWeights, match=r"vgg16-397923af\.pth"):
+    with pytest.raises(MissingWeightsError, match=r"vgg16-397923af\.pth"):
         load_lpips("vgg", tmp_path, download=False)
 
 

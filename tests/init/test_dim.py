@@ -29,7 +29,7 @@ from gsbench.init.networks.extractors import (
 from gsbench.init.networks.features import Features, FeatureStore
 from gsbench.logs import no_progress
 from gsbench.scene.types import Capture
-from gsbench.weights import MissingWeights, load_state
+from gsbench.weights import MissingWeightsError, load_state
 from tests.scene.courtyard.surfaces import surface_distance
 
 CPU = torch.device("cpu")
@@ -272,28 +272,28 @@ def test_detection_settings_are_the_extractors_own_unless_given(
 
 class TestErrors:
     def test_missing_weights_are_named_before_any_work(self, courtyard: Capture, tmp_path: Path):
-        with pytest.raises(MissingWeights, match=r"superpoint.safetensors, superpoint_lightglue_v0-1_arxiv-pth"):
+        with pytest.raises(MissingWeightsError, match=r"superpoint.safetensors, superpoint_lightglue_v0-1_arxiv-pth"):
             Dim(download=False).run(courtyard, tmp_path / "out")
         assert not (tmp_path / "out").exists()
 
     def test_wrong_checksum(self, courtyard: Capture, tmp_path: Path):
         (tmp_path / "aliked-n16.pth").write_bytes(b"not ALIKED")
-        with pytest.raises(MissingWeights, match=r"aliked-n16.pth has sha256 .* expected 5be8704840ed662d"):
+        with pytest.raises(MissingWeightsError, match=r"aliked-n16.pth has sha256 .* expected 5be8704840ed662d"):
             Dim(extractor="aliked", weights=tmp_path, download=False).run(courtyard, tmp_path / "out")
 
     def test_weights_of_another_network(self, tmp_path: Path):
         torch.save({"conv.weight": torch.zeros(3)}, tmp_path / "foreign.pth")
         settings = superpoint(tmp_path).feature_settings()
-        with pytest.raises(MissingWeights, match="is for another network"):
+        with pytest.raises(MissingWeightsError, match="is for another network"):
             build_matcher(settings, tmp_path / "foreign.pth", CPU)
-        with pytest.raises(MissingWeights, match="is for another network"):
+        with pytest.raises(MissingWeightsError, match="is for another network"):
             build_extractor(Dim(extractor="aliked").feature_settings(), tmp_path / "foreign.pth", CPU)
 
     def test_weights_of_another_shape(self, untrained_weights: Path, tmp_path: Path):
         state = torch.load(untrained_weights / "superpoint_lightglue.pth", weights_only=True)
         state["log_assignment.0.final_proj.weight"] = torch.zeros(3, 3)
         torch.save(state, tmp_path / "bad.pth")
-        with pytest.raises(MissingWeights, match="other shapes"):
+        with pytest.raises(MissingWeightsError, match="other shapes"):
             build_matcher(superpoint(tmp_path).feature_settings(), tmp_path / "bad.pth", CPU)
 
     @pytest.mark.slow

@@ -16,7 +16,7 @@ from gsbench.analysis.results import Arm, Experiment, TrialResult, group_by
 from gsbench.analysis.table_formats import Column, Row, Table, TableEntry
 from gsbench.analysis.tables import build_table
 from gsbench.errors import InputError
-from gsbench.words import closest, signed
+from gsbench.words import did_you_mean, signed
 
 OWN = "_own"  # suffix of an experiment that repeats a table with each initialiser's own poses and gauge
 STAND_FOR = {"dim_paper": "dim"}  # our initialiser -> the paper's initialiser that it repeats
@@ -113,7 +113,7 @@ def load_published(name: str) -> Published:
     """The numbers of the paper ``name``; for an unknown name raises InputError that lists the known ones."""
     names = published_names()
     if name not in names:
-        raise InputError(f"no published numbers {name!r}{closest(name, names)} (there are: {', '.join(names)})")
+        raise InputError(f"no published numbers {name!r}{did_you_mean(name, names)} (there are: {', '.join(names)})")
     content = _read(f"published/{name}.yaml")
     quantities = tuple(content["quantities"])
     printed = {

@@ -38,7 +38,7 @@ from gsbench.runs.keys import flatten
 from gsbench.runs.layout import TUNING
 from gsbench.settings import check_settings
 from gsbench.system.install import install_command
-from gsbench.words import closest, counted, listed
+from gsbench.words import counted, did_you_mean, listed
 
 if TYPE_CHECKING:
     from optuna import Study
@@ -309,7 +309,7 @@ def _goal(tune: TuneSettings, trials: Sequence[Trial]) -> Goal:
     metric = tune.metric or primary or DEFAULT_METRIC
     known = (*known_keys(), *(values["eval"].get("extra") or ()))
     if metric not in known:
-        raise InputError(f"{PLACE}.metric={metric}: there is no such metric{closest(metric, known)}")
+        raise InputError(f"{PLACE}.metric={metric}: there is no such metric{did_you_mean(metric, known)}")
     sign = facts_for(metric, values).direction
     if not sign:
         raise InputError(f"{PLACE}.metric={metric}: whether more or less of it is better is not known")

@@ -15,8 +15,8 @@ from gsbench.analysis.results import TrialResult
 from gsbench.analysis.verdicts import WORDS
 from gsbench.errors import InputError
 from gsbench.runs.declaration import Arm, Declaration, Question
-from gsbench.settings import Switch, checked
-from gsbench.words import closest, listed
+from gsbench.settings import Switch, check_values
+from gsbench.words import did_you_mean, listed
 
 MAX_SWITCHES = 8
 _ABSENT = object()  # differs from any value
@@ -39,7 +39,7 @@ def declared_switches(own: Mapping[str, Switch], values: Mapping[str, Any]) -> d
         where = f"densify.switches.{name}"
         if not isinstance(entry, Mapping) or "off" not in entry:
             raise InputError(f"{where} must be {{off: {{KEY: VALUE}}}}, got {entry!r}")
-        switches[str(name)] = Switch(**checked(Switch, dict(entry), where))
+        switches[str(name)] = Switch(**check_values(Switch, dict(entry), where))
     return {
         name: switch
         for name, switch in switches.items()
@@ -55,7 +55,7 @@ def choose_switches(declared: Mapping[str, Switch], names: Sequence[str], densif
     for name in names:
         if name not in declared:
             raise InputError(
-                f"{name!r} is not a switch of densify={densify}{closest(name, declared)} (there are "
+                f"{name!r} is not a switch of densify={densify}{did_you_mean(name, declared)} (there are "
                 f"{', '.join(declared) or 'none'})"
             )
     if not declared:

@@ -35,8 +35,8 @@ from gsbench.config.trust import PERMISSIONS
 from gsbench.errors import InputError
 from gsbench.parsing import read_yaml, resolved
 from gsbench.runs.declaration import Arm, Question
-from gsbench.settings import checked
-from gsbench.words import closest
+from gsbench.settings import check_values
+from gsbench.words import did_you_mean
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,60}")
 KEY = re.compile(r"[+]?\w+([./]\w+)*")  # of a setting
@@ -161,7 +161,7 @@ def parse_claims(content: object) -> ClaimsFile:
         raise InputError("it must be a mapping with name, paper, seeds, scenes, arms and claims")
     entries: dict[str, Any] = {str(key): value for key, value in content.items()}
     listed = entries.pop("claims", None)
-    values = checked(ClaimsFile, entries, "")
+    values = check_values(ClaimsFile, entries, "")
     _require(ClaimsFile, {*values, "claims"}, "")
     scenes = _named_settings(values["scenes"], "scenes", "scene")
     arms = _named_settings(values["arms"], "arms", "densify")
@@ -195,7 +195,7 @@ def _claim(entry: object, number: int) -> Claim:
     where = f"claims[{number}]"
     if not isinstance(entry, dict):
         raise InputError(f"{where} must be a mapping with id, says, where, …, got {entry!r}")
-    values = checked(Claim, {str(key): value for key, value in entry.items()}, where)
+    values = check_values(Claim, {str(key): value for key, value in entry.items()}, where)
     _require(Claim, values, where)
     return Claim(**values)
 
@@ -242,7 +242,7 @@ def _check_claim(claim: Claim, file: ClaimsFile) -> None:
     for role, arm in (("baseline", claim.baseline), ("arm", claim.arm)):
         if arm not in file.arms:
             raise InputError(
-                f"{where}: {role} {arm!r} is none of the arms{closest(arm, file.arms)} "
+                f"{where}: {role} {arm!r} is none of the arms{did_you_mean(arm, file.arms)} "
                 f"(there are {', '.join(file.arms)})"
             )
     if claim.baseline == claim.arm:
@@ -250,7 +250,7 @@ def _check_claim(claim: Claim, file: ClaimsFile) -> None:
     for scene in claim.scenes:
         if scene not in file.scenes:
             raise InputError(
-                f"{where}: {scene!r} is none of the scenes{closest(scene, file.scenes)} "
+                f"{where}: {scene!r} is none of the scenes{did_you_mean(scene, file.scenes)} "
                 f"(there are {', '.join(file.scenes)})"
             )
     if len(set(claim.scenes)) < len(claim.scenes):
@@ -268,8 +268,8 @@ def _check_metric(claim: Claim, file: ClaimsFile) -> None:
     own = f"eval.extra.{claim.metric}."
     if claim.metric not in names and not any(key.lstrip("+").startswith(own) for key in file.settings):
         raise InputError(
-            f"{where}: {claim.metric!r} is not a metric{closest(claim.metric, names)} (choose {', '.join(names)}; one "
-            f"of your own by settings: {{{own}_target_: mine.MyMetric}})"
+            f"{where}: {claim.metric!r} is not a metric{did_you_mean(claim.metric, names)} (choose {', '.join(names)}; "
+            f"one of your own by settings: {{{own}_target_: mine.MyMetric}})"
         )
     effect = claim.effect
     if asked_quantity(claim.metric).cost and not effect.relative:

@@ -19,7 +19,7 @@ from gsbench.claims.stopping import facts_for
 from gsbench.errors import InputError
 from gsbench.eval.facts import known_keys
 from gsbench.runs.declaration import ERROR_RATE, Declaration, Question, declared_now, trial_key
-from gsbench.words import closest, counted, listed
+from gsbench.words import counted, did_you_mean, listed
 
 BASELINE, NEW = "baseline", "new"  # replace the configuration hash in trials' keys, since versions may share settings
 PASSED, WORSE, NOT_DECIDED = "passed", "worse", "undecided"
@@ -58,7 +58,7 @@ def declare_gate(
     own = values["eval"].get("extra") or {}
     metrics = (*known_keys(), *COSTS, *own)
     if metric not in metrics:
-        raise InputError(f"--metric {metric}: there is no such metric{closest(metric, metrics)}")
+        raise InputError(f"--metric {metric}: there is no such metric{did_you_mean(metric, metrics)}")
     sign, usual = -1, None  # less is better of counts and times
     if metric not in COSTS:
         facts = facts_for(metric, values)

@@ -16,7 +16,7 @@ from gsbench.config.trust import PACKAGE, PERMISSIONS, is_allowed, permission_ad
 from gsbench.errors import InputError
 from gsbench.runs.keys import DECLARED, NOT_HASHED, WITHOUT_EFFECT
 from gsbench.system.install import conf_dir
-from gsbench.words import closest
+from gsbench.words import did_you_mean
 
 GROUPS = ("scene", "init", "densify", "raster", "train", "eval", "tracking", "launch", "experiment")
 EXTERNAL_FOLDER = "external"  # subfolder of a group for other programs; glob(*) does not list it
@@ -42,7 +42,9 @@ def parse(argv: Sequence[str]) -> tuple[list[str], bool, bool]:
         elif word.startswith("-"):
             group = word.lstrip("-").partition("=")[0]
             near = (
-                f"; a setting has no dashes: {group}=…" if group.partition(".")[0] in GROUPS else closest(word, OPTIONS)
+                f"; a setting has no dashes: {group}=…"
+                if group.partition(".")[0] in GROUPS
+                else did_you_mean(word, OPTIONS)
             )
             raise InputError(
                 f"{word} is not an option{near} "

@@ -33,7 +33,7 @@ from gsbench.config.trust import PERMISSIONS, check_composed, check_permissions
 from gsbench.errors import InputError
 from gsbench.parsing import LOADER, MAX_VALUES
 from gsbench.runs.trial_folder import TrialFolder
-from gsbench.settings import checked
+from gsbench.settings import check_values
 from gsbench.system.own_modules import allow_modules
 
 
@@ -229,7 +229,7 @@ def typed_words(overrides: DictConfig) -> tuple[list[str], list[str]]:
 
 def with_seed(trial: Trial, seed: int) -> Trial:
     """The same trial with another seed. Only for a trial whose other settings do not read the seed."""
-    seed = checked(Config, {"seed": seed}, "")["seed"]
+    seed = check_values(Config, {"seed": seed}, "")["seed"]
     words = tuple(f"seed={seed}" if word.startswith("seed=") else word for word in trial.overrides)
     return replace(trial, values=trial.values | {"seed": seed}, overrides=words)
 

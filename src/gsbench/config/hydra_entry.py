@@ -19,7 +19,7 @@ from gsbench.config.schema import register_schemas
 from gsbench.config.trust import HYDRAS_CALLBACKS
 from gsbench.errors import GsbenchError, InputError
 from gsbench.system.install import conf_dir
-from gsbench.words import closest
+from gsbench.words import did_you_mean
 
 CONFIG_NAME = "config"  # conf/config.yaml
 # Hydra 1.3 warns unless it is told which version's defaults hold; Hydra 1.4 has one set and warns if it is told.
@@ -119,7 +119,7 @@ def explain(error: BaseException, overrides: Sequence[str]) -> str:
     if group:
         word = group.group(1)
         keys = [*GROUPS, *_keys_below("", overrides)]
-        return f"{word} is not a group or setting{closest(word, keys)} (groups: {', '.join(GROUPS)})"
+        return f"{word} is not a group or setting{did_you_mean(word, keys)} (groups: {', '.join(GROUPS)})"
     missing = re.search(
         r"Could not find '([^']+)'.*?Available options in '([^']+)':\s*(.*?)(?:\n\n|Config search|$)", text, re.S
     )
@@ -127,7 +127,7 @@ def explain(error: BaseException, overrides: Sequence[str]) -> str:
         wanted, name = missing.group(1), missing.group(2)
         choices = sorted({*options(name), *re.findall(r"[\w.-]+", missing.group(3))})
         word = wanted.rpartition("/")[2]
-        near = closest(word, choices) or HINTS.get(name, "")
+        near = did_you_mean(word, choices) or HINTS.get(name, "")
         return f"{name}={word} does not exist{near} (choose: {', '.join(choices)})"
     absent = re.search(r"[Mm]issing mandatory value: ([\w.]+)", text)
     if absent:
@@ -160,7 +160,7 @@ def _unknown_setting(bad: str, given: str | None, text: str, overrides: Sequence
     keys = _keys_below(parent, overrides)
     is_users_class = any(word.startswith(f"{parent}._target_=") for word in overrides)
     hint = f"; a key that only your class has is added with a plus: +{key}=…" if is_users_class else ""
-    near = _belongs_to(parent, bad) or closest(bad, keys) or _groups_with(key)
+    near = _belongs_to(parent, bad) or did_you_mean(bad, keys) or _groups_with(key)
     return f"{key} is not a setting{file}{near}{hint} ({parent or 'top level'} has: {', '.join(keys) or 'no settings'})"
 
 

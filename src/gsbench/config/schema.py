@@ -30,7 +30,7 @@ from gsbench.settings import (
     TargetName,
     Threads,
     check_settings,
-    checked,
+    check_values,
     is_folder_name,
     unknown_setting,
 )
@@ -181,9 +181,9 @@ def checked_values(config: DictConfig) -> dict[str, Any]:
         values[group] |= plain(_converted(schema, given, group))
     root = {key: value for key, value in values.items() if key not in (*GROUP_SCHEMAS, *COMPONENTS)}
     _require_all(Config, values, "")
-    values |= checked(Config, root, "")
+    values |= check_values(Config, root, "")
     for group in COMPONENTS:
-        checked(ComponentConfig, {key: values[group].get(key) for key in ("name", "_target_")}, group)
+        check_values(ComponentConfig, {key: values[group].get(key) for key in ("name", "_target_")}, group)
     scene, train, densify, launch = values["scene"], values["train"], values["densify"], values["launch"]
     if late := [step for step in values["eval"]["at"] if step > train["iterations"]]:
         raise InputError(f"eval.at names iteration {late[0]}, and train.iterations is {train['iterations']}")

@@ -21,7 +21,7 @@ from omegaconf.grammar_parser import parse
 from gsbench.errors import InputError
 from gsbench.external.settings import program_of
 from gsbench.system.own_modules import allowed_modules
-from gsbench.words import closest
+from gsbench.words import did_you_mean
 
 TARGET = "_target_"
 PERMISSIONS = "allow_targets"  # the setting that says what may run; it counts on the command line only
@@ -109,7 +109,7 @@ def check_target(target: str | None, group: str, allowed: Sequence[str], own: Se
     prefix = target.split(".")[0]
     if prefix == PACKAGE:
         raise InputError(f"{group}.{TARGET}={target} is not a class for {group}")
-    near = closest(prefix, allowed)
+    near = did_you_mean(prefix, allowed)
     advice = permission_advice([prefix], allowed)
     raise InputError(f"{group}.{TARGET}={target} is not gsbench's own{near}; if you trust that code, {advice}")
 
@@ -127,7 +127,8 @@ def load_class(target: str, group: str, allowed: Sequence[str]) -> Any:
         raise InputError(f"{group}.{TARGET}={target} cannot be imported ({reason})") from error
     if cls is missing:
         raise InputError(
-            f"{group}.{TARGET}={target} cannot be imported: {module_name} has no {name}{closest(name, dir(module))}"
+            f"{group}.{TARGET}={target} cannot be imported: {module_name} has no "
+            f"{name}{did_you_mean(name, dir(module))}"
         )
     # A name that an allowed module merely imports (`mine.Popen`) is somebody else's code.
     defined_as = f"{getattr(cls, '__module__', None)}.{getattr(cls, '__qualname__', name)}"

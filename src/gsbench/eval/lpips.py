@@ -13,7 +13,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from gsbench.errors import InputError
-from gsbench.weights import MissingWeights, WeightsFile, find_weights, load_state
+from gsbench.weights import MissingWeightsError, WeightsFile, find_weights, load_state
 
 # The networks' input normalisation, per channel: (x - SHIFT) / SCALE for x in [-1, 1].
 SHIFT = (-0.030, -0.088, -0.188)
@@ -218,7 +218,7 @@ def load_lpips(
 ) -> Lpips:
     """Load an LPIPS network; its weights are searched in ``folder`` and the usual places, else downloaded.
 
-    Raises ``MissingWeights`` if they are not found.
+    Raises ``MissingWeightsError`` if they are not found.
     """
     backbone = BACKBONES[net]
     features = find_first_weights(backbone.features, folder, download)
@@ -231,7 +231,7 @@ def find_first_weights(specs: tuple[WeightsFile, ...], folder: Path | None, down
     for spec in specs[1:]:
         try:
             return find_weights(spec, folder, download=False)
-        except MissingWeights:
+        except MissingWeightsError:
             continue
     return find_weights(specs[0], folder, download)
 

@@ -16,7 +16,7 @@ from gsbench.eval.metric import UnavailableError
 from gsbench.eval.metrics import flip, flip_map, psnr
 from gsbench.eval.protocol import Protocol
 from gsbench.eval.ssim import masked_ssim, ssim
-from gsbench.weights import MissingWeights
+from gsbench.weights import MissingWeightsError
 
 
 @dataclass(frozen=True)
@@ -27,17 +27,19 @@ class MetricContext:
     device: torch.device
     weights: Path | None = None
     download: bool = True
-    networks: dict[str, Lpips | MissingWeights] = field(default_factory=dict, repr=False)  # LPIPS, each loaded once
+    networks: dict[str, Lpips | MissingWeightsError] = field(
+        default_factory=dict, repr=False
+    )  # LPIPS, each loaded once
 
     def network(self, net: str) -> Lpips:
         """The LPIPS network ``net``; raises UnavailableError if its weights are missing."""
         if net not in self.networks:
             try:
                 self.networks[net] = load_lpips(net, self.weights, self.download, self.device)
-            except MissingWeights as error:
+            except MissingWeightsError as error:
                 self.networks[net] = error
         network = self.networks[net]
-        if isinstance(network, MissingWeights):
+        if isinstance(network, MissingWeightsError):
             raise UnavailableError(str(network), awaited=True)
         return network
 

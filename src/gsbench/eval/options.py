@@ -13,7 +13,7 @@ from gsbench.eval.facts import FPS, LPIPS, MORE, find_metric, further_keys, know
 from gsbench.eval.protocol import PROTOCOLS
 from gsbench.runs.declaration import AT, QUESTIONS, metric_and_question
 from gsbench.settings import MISSING, FolderName, PathName, check_settings
-from gsbench.words import closest
+from gsbench.words import did_you_mean
 
 METRIC_NAME = re.compile(r"[a-z][a-z0-9_]*")
 RESERVED_NAMES = (*known_keys(), "view", "lpips")  # keys of metrics, the column of views, and the protocol's LPIPS
@@ -79,7 +79,7 @@ class EvalConfig:
         if facts is None:
             known = [*known_keys(), *self.extra]
             raise InputError(
-                f"eval.primary={key} is not a metric{closest(key, known)} (known are {', '.join(known)}; your own "
+                f"eval.primary={key} is not a metric{did_you_mean(key, known)} (known are {', '.join(known)}; your own "
                 "metric by its name under eval.extra)"
             )
         if facts.setting == "eval.flip" and not self.flip:

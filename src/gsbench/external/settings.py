@@ -19,7 +19,7 @@ from pydantic import PositiveFloat
 
 from gsbench.errors import InputError
 from gsbench.settings import MISSING, check_settings
-from gsbench.words import closest
+from gsbench.words import did_you_mean
 
 # Placeholders of a command, in addition to the options of its YAML file.
 DATA = "data"  # folder of the training views: images/ and the COLMAP model sparse/0
@@ -63,7 +63,7 @@ def fill_placeholders(text: str, values: Mapping[str, object], key: str) -> str:
         name = match[1]
         if name not in values:
             names = ", ".join(f"{{{known}}}" for known in values)
-            raise InputError(f"{key}: nothing is known as {{{name}}}{closest(name, values)} (there are {names})")
+            raise InputError(f"{key}: nothing is known as {{{name}}}{did_you_mean(name, values)} (there are {names})")
         return str(values[name])
 
     return PLACEHOLDER.sub(value, text)

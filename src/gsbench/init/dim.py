@@ -114,7 +114,7 @@ class FeatureInitializer(ColmapInitializer):
     def find_weights(self) -> tuple[Path | None, Path | None]:
         """Checked weights files of the extractor and the matcher, None for one without weights.
 
-        Raises ``MissingWeights`` if a file is missing.
+        Raises ``MissingWeightsError`` if a file is missing.
         """
 
     def check(self, capture: Capture, reference: Path | None) -> None:

@@ -8,7 +8,7 @@ from dataclasses import replace
 from importlib import metadata
 from math import floor, log10
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pycolmap
@@ -19,10 +19,7 @@ from gsbench.init.base import MODEL_FOLDER, PICTURE_FILE, REPORT_FILE, Gauge, In
 from gsbench.init.colmap.alignment import Array, Similarity, rotation_angles, transformed_rotations
 from gsbench.init.colmap.reconstruct import common_poses, poses_by_name, save_reconstruction
 from gsbench.scene.colmap import model_points
-from gsbench.scene.types import EXTENT_MARGIN, Capture
-
-if TYPE_CHECKING:
-    import pycolmap
+from gsbench.scene.types import Capture, extent_of_centers
 
 SIDE, MARGIN = 960, 60  # px
 MAX_POINTS = 200_000  # drawn; more would only cover each other
@@ -113,10 +110,8 @@ FEW_POINTS = 100
 def training_extent(model: pycolmap.Reconstruction, capture: Capture) -> float:
     """3DGS's ``cameras_extent`` of the training images with a pose in the model, or 0 if there are none."""
     poses = poses_by_name(model)
-    centers = np.array([poses[name][0] for name in capture.train_names if name in poses]).reshape(-1, 3)
-    if len(centers) == 0:
-        return 0.0
-    return float(EXTENT_MARGIN * np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
+    centers = [poses[name][0] for name in capture.train_names if name in poses]
+    return extent_of_centers(np.array(centers)) if centers else 0.0
 
 
 def measure_gauge(extent: float, scale_to_reference: float | None) -> Gauge:

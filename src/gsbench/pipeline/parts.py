@@ -37,11 +37,11 @@ from gsbench.raster.executors import AUTO, offers, resolve
 from gsbench.runs.code import OWN, module_digest, unnamed_modules, user_modules
 from gsbench.runs.declaration import metric_and_question
 from gsbench.scene.options import SceneConfig
-from gsbench.settings import checked, option_fields, unknown_setting
+from gsbench.settings import check_values, option_fields, unknown_setting
 from gsbench.system.resources import available_threads
 from gsbench.train.device import select_device
 from gsbench.train.options import TrainConfig
-from gsbench.words import closest
+from gsbench.words import did_you_mean
 
 log = logging.getLogger(__name__)
 
@@ -194,7 +194,7 @@ def build(group: str, values: dict[str, Any], allow_targets: list[str]) -> Any:
     own = target.startswith(OWN)
     if dataclasses.is_dataclass(cls) and not own:
         _check_fields(cls, target, options, group)
-        options = checked(cls, options, group)
+        options = check_values(cls, options, group)
     else:
         _check_names(cls, options, group)
         if options and not own:
@@ -223,8 +223,8 @@ def _check_fields(cls: type, target: str, options: dict[str, Any], group: str) -
     if unknown := next((name for name in options if name not in fields), None):
         key = f"{group}.{unknown}"
         raise InputError(
-            f"{key} is not a setting{closest(unknown, fields)} ({target} has: {', '.join(fields) or 'none'}); remove "
-            f"it by ~{key}, or start from another choice, {group}=NAME"
+            f"{key} is not a setting{did_you_mean(unknown, fields)} ({target} has: {', '.join(fields) or 'none'}); "
+            f"remove it by ~{key}, or start from another choice, {group}=NAME"
         )
 
 

@@ -18,7 +18,7 @@ from pathlib import Path
 from gsbench.errors import InputError
 from gsbench.settings import MISSING, TargetName, check_settings
 from gsbench.system.install import install_command
-from gsbench.words import closest
+from gsbench.words import did_you_mean
 
 log = logging.getLogger(__name__)
 
@@ -207,4 +207,4 @@ class RasterConfig:
         check_settings(self, "raster")
         if self._target_ is None and self.name not in names():
             choices = ", ".join(names())
-            raise InputError(f"raster must be one of {choices}, got {self.name!r}{closest(self.name, names())}")
+            raise InputError(f"raster must be one of {choices}, got {self.name!r}{did_you_mean(self.name, names())}")

@@ -19,7 +19,7 @@ from gsbench.scene.images import image_size
 from gsbench.scene.names import png_name
 from gsbench.scene.readers import fingerprint, list_images
 from gsbench.view.trials import find_trial
-from gsbench.words import closest
+from gsbench.words import did_you_mean
 
 CAMERAS_ONLY = ("init=random", "init.count=100")  # the fastest initialiser; its points are not used
 
@@ -61,8 +61,8 @@ def find_reference_images(place: str, settings: Sequence[str], runs: Path) -> Re
     scenes = options("scene")
     if place not in scenes:
         raise InputError(
-            f"--truth {place} is no folder, no trial EXPERIMENT:SCENE:DENSIFY and no scene{closest(place, scenes)} "
-            f"(scenes: {', '.join(scenes)})"
+            f"--truth {place} is no folder, no trial EXPERIMENT:SCENE:DENSIFY and no scene"
+            f"{did_you_mean(place, scenes)} (scenes: {', '.join(scenes)})"
         )
     return _scene(place, settings)
 

@@ -21,7 +21,7 @@ from pydantic_core import to_json
 from gsbench.errors import InputError
 from gsbench.files import atomic, require_no_links
 from gsbench.parsing import DamagedError, one_line, read_bytes, read_tail, read_yaml
-from gsbench.records import MAX_NUMBER, Amount, Count, Record, read_if_sound, read_typed, typed
+from gsbench.records import MAX_NUMBER, Amount, Count, Record, parse_typed, read_if_sound, read_typed
 from gsbench.runs.keys import config_hash
 from gsbench.runs.layout import (
     BUILDING,
@@ -208,7 +208,7 @@ class TrialFolder:
             values = read_yaml(path)
         except FileNotFoundError:
             raise InputError(f"{path} is not there: give the command of the trial again") from None
-        typed(to_json(values), Configuration, path)
+        parse_typed(to_json(values), Configuration, path)
         return values | {"allow_targets": []}  # only the user who gives a command may allow code to run
 
     # ---- results
@@ -222,7 +222,7 @@ class TrialFolder:
         path = self.path / RESULTS
         content = read_bytes(path)
         record = record_from(content, path)
-        made_of = typed(content, ResultsFile, path).made_of
+        made_of = parse_typed(content, ResultsFile, path).made_of
         if made_of is not None and made_of.results != content_hash(content):
             raise DamagedError(path, f"was changed after it was written: `gsbench retry {self.home.name}` repairs it")
         self._digests = {} if made_of is None else made_of.digests

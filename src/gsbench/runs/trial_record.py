@@ -21,8 +21,8 @@ from gsbench.records import (
     Text,
     Whole,
     adapter,
+    describe_misfit,
     iterate_rows,
-    misfit,
     read_typed,
 )
 from gsbench.runs.layout import METRICS, TRAINING
@@ -167,7 +167,7 @@ def record_from(content: bytes, path: Path) -> TrialRecord:
         if status_fault is not None:
             status = "missing" if status_fault["type"] == "missing" else reprlib.repr(status_fault["input"])
             raise UnfinishedError(path, f"is unfinished, its status is {status}") from None
-        raise DamagedError(path, misfit(error)) from None
+        raise DamagedError(path, describe_misfit(error)) from None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -76,6 +76,10 @@ class Scene:
 
 
 def scene_extent(cameras: Sequence[Camera]) -> float:
-    """1.1 x the largest distance of a camera centre from their mean (3DGS's getNerfppNorm), in world units."""
-    centers = np.stack([camera.center for camera in cameras])  # [V, 3]
+    """3DGS's ``cameras_extent`` of ``cameras``, in world units."""
+    return extent_of_centers(np.stack([camera.center for camera in cameras]))
+
+
+def extent_of_centers(centers: NDArray[np.float64]) -> float:
+    """1.1 x the largest distance of a camera centre [V, 3] from their mean, in world units (3DGS's getNerfppNorm)."""
     return float(EXTENT_MARGIN * np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from gsbench.errors import InputError
-from gsbench.words import closest, is_path
+from gsbench.words import did_you_mean, is_path
 
 MAX_PORT = 65535
 SETTING = re.compile(r"[+~]*[a-z_]\w*([./]\w+)*=")
@@ -30,7 +30,7 @@ class ArgumentParser(argparse.ArgumentParser):
             unknown += settings
         if unknown:
             options = [option for action in self._actions for option in action.option_strings]
-            hints = (closest(word.partition("=")[0], options) for word in unknown if word.startswith("--"))
+            hints = (did_you_mean(word.partition("=")[0], options) for word in unknown if word.startswith("--"))
             self.error(f"unrecognized arguments: {' '.join(unknown)}{next(filter(None, hints), '')}")
         return parsed
 

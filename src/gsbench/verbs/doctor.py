@@ -112,7 +112,7 @@ def check_weights() -> Iterator[Finding]:
     """Findings about the weights of networks that are here; nothing is downloaded."""
     from gsbench.eval.lpips import BACKBONES, find_first_weights
     from gsbench.init.dim import EXTRACTOR_WEIGHTS, LIGHTGLUE_WEIGHTS
-    from gsbench.weights import WEIGHTS_VARIABLE, MissingWeights, hub_cache
+    from gsbench.weights import WEIGHTS_VARIABLE, MissingWeightsError, hub_cache
 
     wanted = {f"LPIPS {name}": backbone.features for name, backbone in BACKBONES.items()}
     wanted |= {f"LPIPS {name} heads": (backbone.heads,) for name, backbone in BACKBONES.items()}
@@ -121,7 +121,7 @@ def check_weights() -> Iterator[Finding]:
     for purpose, specs in wanted.items():
         try:
             yield Finding("ok", "weights", f"{purpose}: {find_first_weights(specs, None, download=False)}")
-        except MissingWeights as error:
+        except MissingWeightsError as error:
             origin = specs[0].url or specs[0].source
             missing = f"{specs[0].names[0]} is not here; gsbench downloads it when needed from {origin}"
             place = f"or put it into ${WEIGHTS_VARIABLE} or {hub_cache()}"

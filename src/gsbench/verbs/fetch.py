@@ -14,7 +14,7 @@ from gsbench.files import remove_temporaries, storage_errors
 from gsbench.logs import progress
 from gsbench.system.locks import hold
 from gsbench.verbs.arguments import ArgumentParser
-from gsbench.words import closest, is_path, readable_bytes
+from gsbench.words import did_you_mean, is_path, readable_bytes
 
 MIRROR_VARIABLE = "GSBENCH_MIRROR"
 LOCK = ".fetch.lock"
@@ -87,14 +87,14 @@ def _dataset(catalog: Mapping[str, PublicDataset], name: str) -> PublicDataset:
     for dataset in catalog.values():
         if name in dataset.scenes:
             raise InputError(f"{name} is a scene: gsbench fetch {dataset.name} {name}")
-    raise InputError(f"no data set {name!r}{closest(name, list(catalog))} (there are: {', '.join(catalog)})")
+    raise InputError(f"no data set {name!r}{did_you_mean(name, list(catalog))} (there are: {', '.join(catalog)})")
 
 
 def _scenes(dataset: PublicDataset, names: Sequence[str]) -> Sequence[str]:
     for name in names:
         if name not in dataset.scenes:
             raise InputError(
-                f"{dataset.name} has no scene {name!r}{closest(name, list(dataset.scenes))} "
+                f"{dataset.name} has no scene {name!r}{did_you_mean(name, list(dataset.scenes))} "
                 f"(it has: {', '.join(dataset.scenes)})"
             )
     return list(dict.fromkeys(names)) or dataset.scenes

@@ -15,7 +15,7 @@ from gsbench.init.networks.features import Features, FeatureSettings
 from gsbench.scene.images import read_image
 from gsbench.scene.options import downscaled_size
 from gsbench.system.install import install_command
-from gsbench.weights import MissingWeights, load_state
+from gsbench.weights import MissingWeightsError, load_state
 
 GPU_MEMORY_HINT = "lower init.max_image_size or init.max_keypoints, or set init.device=cpu"
 SUPERPOINT_BORDER = 4  # px without keypoints, as in deep-image-matching
@@ -34,7 +34,7 @@ class Extractor(Protocol):
 def build_extractor(settings: FeatureSettings, weights: Path | None, device: torch.device) -> Extractor:
     """The extractor with its network on ``device``; ``weights`` is the checked file, or None if it needs none.
 
-    Raises ``MissingWeights`` if the file does not fit the network.
+    Raises ``MissingWeightsError`` if the file does not fit the network.
     """
     return _BUILDERS[settings.extractor](settings, weights, device)
 
@@ -69,12 +69,14 @@ def load_into(network: torch.nn.Module, state: Mapping[str, torch.Tensor], path:
     try:
         missing, unexpected = network.load_state_dict(dict(state), strict=False)
     except RuntimeError as error:
-        raise MissingWeights(f"weights file {path} has tensors of other shapes than the network: replace it") from error
+        raise MissingWeightsError(
+            f"weights file {path} has tensors of other shapes than the network: replace it"
+        ) from error
     learned = {name for name, _ in network.named_parameters()}
     missing = sorted(learned.intersection(missing))
     if missing or unexpected:
         example = (missing or unexpected)[0]
-        raise MissingWeights(
+        raise MissingWeightsError(
             f"weights file {path} is for another network ({len(missing)} tensors missing, {len(unexpected)} foreign, "
             f"for example {example}): replace it"
         )
@@ -197,7 +199,7 @@ class Matcher(Protocol):
 def build_matcher(settings: FeatureSettings, weights: Path | None, device: torch.device) -> Matcher:
     """The matcher named in ``settings``; ``weights`` is LightGlue's checked file.
 
-    Raises ``MissingWeights`` if the file does not fit the network.
+    Raises ``MissingWeightsError`` if the file does not fit the network.
     """
     if settings.matcher == "mutual_nearest":
         return MutualNearestMatcher(settings.max_ratio, device)
