@@ -19,7 +19,16 @@ from gsbench.analysis.results import Experiment, load_experiment
 from gsbench.analysis.statistics import answer_family
 from gsbench.analysis.tables import build_table
 from gsbench.analysis.verdicts import PairVerdicts, families, in_words, judge_pairs
-from gsbench.runs.declaration import STAMP, Arm, Declaration, Question, open_question, read_declarations, record_text
+from gsbench.runs.declaration import (
+    STAMP,
+    Arm,
+    Declaration,
+    Question,
+    latest_declaration,
+    open_question,
+    read_declarations,
+    record_text,
+)
 from tests.analysis.synthetic import Plan, write_runs
 
 EARLY, LATE = "2020-01-01T00:00:00Z", "2037-01-01T00:00:00Z"
@@ -157,6 +166,17 @@ def test_a_declaration_after_results_is_said_and_gives_no_place_of_its_own(tmp_p
     assert "12 of the 12 trials had been measured" in page
     assert "all metrics adjusted for their number: better in LPIPS VGG raw" in page
     assert "declared beforehand." not in page
+
+
+def test_what_is_declared_again_stands_from_the_first_time() -> None:
+    psnr, later, flip = (
+        Declaration(time=time, questions=(Question(metric=metric, sign=0),))
+        for metric, time in (("psnr", EARLY), ("psnr", LATE), ("flip", LATE))
+    )
+    assert latest_declaration([psnr]) is psnr
+    assert latest_declaration([psnr, later]) is psnr
+    assert latest_declaration([flip, psnr, later]) is psnr
+    assert latest_declaration([psnr, flip, later]) is later
 
 
 def test_a_declaration_that_took_the_place_of_another_is_said(tmp_path: Path) -> None:

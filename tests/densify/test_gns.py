@@ -53,8 +53,12 @@ def test_the_pressure_and_its_gradient(step: int, soft: bool) -> None:
         assert float(gradient[i]) == pytest.approx((up - down) / 2e-6, rel=1e-5)
 
 
-def test_the_weight_follows_an_aim_that_falls_to_nothing() -> None:
-    """The authors' schedule, iteration by iteration, for an opacity that stays where it is."""
+@pytest.mark.parametrize("sinks", [0.0, 2.0])
+def test_the_weight_follows_an_aim_that_falls_to_nothing(sinks: float) -> None:
+    """The authors' schedule, iteration by iteration, for opacities that stay once the first has set the aim.
+
+    Where they sank, the weight falls first, rests while the aim passes, and rises.
+    """
     densifier, gaussians = begun(max_gaussians=20)
     last = float(gaussians.opacities.sort(descending=True).values[19])
     weight, aim, acted = 2e-4, None, []
@@ -74,6 +78,9 @@ def test_the_weight_follows_an_aim_that_falls_to_nothing() -> None:
         assert float(term) == pytest.approx(
             restated(densifier, gaussians.opacity_logits.numpy(), weight, step < 16_000), rel=1e-9
         )
+        if len(acted) == 1:
+            gaussians.opacity_logits.sub_(sinks)
+            last = float(gaussians.opacities.sort(descending=True).values[19])
     assert acted == list(range(15_001, 23_001, 50))
 
 

@@ -147,6 +147,8 @@ def test_inputs_that_cannot_be_used_are_named(rasterizer: Rasterizer, device: st
         rasterizer.render(gaussians, _camera(16, 16), 0, torch.zeros(4, device=device))
     with pytest.raises(ValueError, match="background"):
         rasterizer.render(gaussians, _camera(16, 16), 0, black.double())
+    with pytest.raises(ValueError, match="background"):
+        rasterizer.render(gaussians, _camera(16, 16), 0, black + math.nan)
     with pytest.raises(ValueError, match="width"):
         rasterizer.render(gaussians, _camera(20_000, 16), 0, black)
     with pytest.raises(ValueError, match="fx"):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import importlib
+import importlib.util
 import shutil
 import sys
 from collections.abc import Callable, Iterator
@@ -246,3 +247,11 @@ def test_what_was_imported_and_is_not_named_is_told(home: Path) -> None:
     before = set(sys.modules)
     importlib.import_module("own_code")
     assert unnamed_modules(before, {"own_code", "helper"}) == ["late"]
+
+
+def test_a_module_whose_file_is_gone_has_no_digest(tmp_path: Path) -> None:
+    spec = importlib.util.spec_from_file_location("passing", tmp_path / "passing.py")
+    assert spec is not None
+    assert code._digest_on_disk(spec) is None
+    (tmp_path / "passing.py").write_text(SOURCE)
+    assert code._digest_on_disk(spec) == hashlib.sha256(SOURCE.encode()).hexdigest()
