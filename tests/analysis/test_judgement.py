@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from gsbench.analysis.judgement import find_outlying, judge
-from gsbench.analysis.pairing import Pairs, choose_pairs, find_pairs
+from gsbench.analysis.pairing import Pairs, choose_pairs, pair
 from gsbench.analysis.results import Experiment, TrialResult
 from gsbench.runs.declaration import Arm, Declaration, Question
 from tests.analysis.untruths import scene_pairs
@@ -30,18 +30,18 @@ def named(trials: tuple[TrialResult, ...], seeds: tuple[int, ...] = (0, 1, 2)) -
 
 def test_pairs_share_scene_and_seed(make_experiment: Callable[..., Experiment]) -> None:
     trials = make_experiment(effect={"psnr": 0.7}, trial_noise=0.0, residual_noise=0.0).trials
-    found = find_pairs(trials, PSNR)
+    found = pair(trials, PSNR)
     assert found.scenes == ("courtyard", "garden")
     assert found.differences.shape == (2, 3)
     assert np.allclose(found.differences, 0.7)  # all noise is shared by the arms
-    assert find_pairs(trials, named(trials)).differences.tolist() == found.differences.tolist()
+    assert pair(trials, named(trials)).differences.tolist() == found.differences.tolist()
 
 
 def test_what_has_no_partner_is_named_and_scenes_keep_the_seeds_that_all_have(
     make_experiment: Callable[..., Experiment],
 ) -> None:
     trials = [t for t in make_experiment().trials if (t.scene, t.densify, t.seed) != ("garden", "adc", 1)]
-    found = find_pairs(trials, PSNR)
+    found = pair(trials, PSNR)
     assert "garden: seed 1 has no partner" in found.left_out
     assert "2 seeds of each scene count, since garden has no more (others up to 3)" in found.left_out
     assert found.differences.shape == (2, 2)
@@ -53,7 +53,7 @@ def test_of_planned_seeds_none_beyond_the_first_that_is_missing_counts(
 ) -> None:
     trials = make_experiment().trials
     kept = [t for t in trials if (t.scene, t.densify, t.seed) != ("garden", "adc", 1)]
-    assert find_pairs(kept, named(trials)).seeds == 1
+    assert pair(kept, named(trials)).seeds == 1
 
 
 def test_arms_under_different_conditions_are_not_compared(make_experiment: Callable[..., Experiment]) -> None:
@@ -61,7 +61,7 @@ def test_arms_under_different_conditions_are_not_compared(make_experiment: Calla
     for trial in trials:
         if trial.densify == "adc":
             object.__setattr__(trial.record, "iterations", 7000)
-    found = find_pairs(trials, PSNR)
+    found = pair(trials, PSNR)
     assert not found.rows
     assert all("the arms differ in iterations, so they are not compared" in line for line in found.left_out)
 
@@ -82,9 +82,9 @@ def test_of_nothing_no_ratio_is_taken(make_experiment: Callable[..., Experiment]
     for trial in trials:
         if (trial.densify, trial.seed) == (densify, 1):
             trial.record.metrics["psnr"] = 0.0
-    assert find_pairs(trials, PSNR).seeds == 3
-    assert find_pairs(trials, replace(PSNR, metric="ssim", relative=True)).seeds == 3  # all below one
-    found = find_pairs(trials, replace(PSNR, relative=True))
+    assert pair(trials, PSNR).seeds == 3
+    assert pair(trials, replace(PSNR, metric="ssim", relative=True)).seeds == 3  # all below one
+    found = pair(trials, replace(PSNR, relative=True))
     assert found.rows[0].seeds == (0, 2)
     assert "garden seed 1: PSNR (dB) is 0, and a ratio needs numbers above 0" in found.left_out
 

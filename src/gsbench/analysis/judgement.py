@@ -1,7 +1,7 @@
 """The verdicts on the questions of a declaration. `judge` is the only code that decides them.
 
 It serves reports, tables, checks of claims, sweeps that stop when decided and ablations, and gets its pairs of trials
-from `gsbench.analysis.pairing.find_pairs`.
+from `gsbench.analysis.pairing.pair`.
 """
 
 import math
@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gsbench.analysis.pairing import Pairs, find_pairs
+from gsbench.analysis.pairing import Pairs, pair
 from gsbench.analysis.quantities import Quantity, asked_quantity
 from gsbench.analysis.results import TrialPair, TrialResult, group_by
 from gsbench.analysis.statistics import (
@@ -162,7 +162,7 @@ def judge(trials: Sequence[TrialResult], declaration: Declaration) -> list[Verdi
 
 def _with_pairs(trials: Sequence[TrialResult], question: Question, declaration: Declaration) -> Verdict:
     """The question with its pairs of trials, not judged yet."""
-    pairs = find_pairs(trials, question)
+    pairs = pair(trials, question)
     new = pairs.trials[1::2] if question.versions else pairs.trials  # an earlier baseline alone shows no difference
     late = sum(trial.measured < declaration.moment for trial in new)
     quantity = asked_quantity(question.metric, trials)

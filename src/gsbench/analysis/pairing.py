@@ -1,4 +1,4 @@
-"""Pairs of trials (`find_pairs`, of one scene and seed) and pairs of arms (`choose_pairs`).
+"""Pairs of trials (`pair`, of one scene and seed) and pairs of arms (`choose_pairs`).
 
 All verdicts pair trials here; `gsbench.analysis.judgement.judge` decides what the pairs show.
 """
@@ -97,7 +97,7 @@ class Pairs:
         return replace(self, rows=tuple(row for row in rows if row.seeds))
 
 
-def find_pairs(trials: Sequence[TrialResult], question: Question) -> Pairs:
+def pair(trials: Sequence[TrialResult], question: Question) -> Pairs:
     """Pair the trials of a question by scene and seed, and say which have no partner or cannot be compared.
 
     Trials are compared only under equal conditions. Budgets may differ if the question names its trials itself, since a

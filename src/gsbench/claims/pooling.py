@@ -16,7 +16,7 @@ import numpy as np
 
 from gsbench.analysis.cells import select_trials, with_variants
 from gsbench.analysis.fairness import budget_words
-from gsbench.analysis.pairing import Pairs, find_pairs
+from gsbench.analysis.pairing import Pairs, pair
 from gsbench.analysis.results import Arm, TrialResult, group_by
 from gsbench.analysis.statistics import Interval, StudentT, t_test
 from gsbench.claims.archive import unpack_archive
@@ -140,8 +140,7 @@ def read_studies(path: Path, question: PooledQuestion, name: str) -> ArchiveStud
                 qualifiers = [protocol] * (len(by_protocol) > 1) + [arms[0][0].init] * (len(groups) > 1)
                 label = f"{name} ({', '.join(qualifiers)})" if qualifiers else name
                 pairs_by_arms = [
-                    find_pairs(own, Question(metric=question.metric, baseline=baseline, arm=arm))
-                    for baseline, arm in arms
+                    pair(own, Question(metric=question.metric, baseline=baseline, arm=arm)) for baseline, arm in arms
                 ]
                 together = Pairs(tuple(row for pairs in pairs_by_arms for row in pairs.rows))
                 if not together.rows:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from gsbench.analysis.cells import with_variants
-from gsbench.analysis.pairing import BASELINE, choose_pairs, find_pairs
+from gsbench.analysis.pairing import BASELINE, choose_pairs, pair
 from gsbench.analysis.planning import Components, designs_needed, estimate_components
 from gsbench.analysis.quantities import Quantity, quantity
 from gsbench.analysis.results import load_experiment
@@ -44,7 +44,7 @@ def main(argv: Sequence[str], runs: Path) -> int:
         raise InputError(f"{options.experiment} has one arm, and planning needs pairs of trials of two")
     for baseline, arm in pairs:
         compared = [trial for trial in trials if trial.arm in (baseline, arm)]
-        paired = find_pairs(compared, Question(metric=metric.key, baseline=baseline, arm=arm))
+        paired = pair(compared, Question(metric=metric.key, baseline=baseline, arm=arm))
         if not paired.rows:
             raise InputError(f"no trials of {baseline} and {arm} can be paired in {metric.name}: {paired.left_out[0]}")
         components = estimate_components([row.arm - row.baseline for row in paired.rows])
