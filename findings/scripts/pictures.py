@@ -17,7 +17,17 @@ from PIL import Image
 from gsbench.analysis.results import TrialResult, read_experiment, read_views
 
 PICTURES = Path(__file__).parents[1] / "pictures"
-DENSIFIERS = ("adc", "volumetric", "volumetric-1", "volumetric_once", "volumetric_once-1", "no_shrink", "longaxis")
+DENSIFIERS = (
+    "opensplat",
+    "adc",
+    "fastgs",
+    "volumetric",
+    "volumetric-1",
+    "volumetric_once",
+    "volumetric_once-1",
+    "no_shrink",
+    "longaxis",
+)
 CLOUDS = ("sfm", "sfm_dense", "dim", "random")
 LPIPS = "lpips_squeeze"  # less is better
 GAP = 4  # px between pictures
@@ -38,6 +48,7 @@ SHOWN: dict[str, tuple[str, str, KindOf, Sequence[str]]] = {
     "dimension": ("volumetric-1", "adc", _split, ("interpolation", "extrapolation")),
     "full": ("volumetric", "adc", _cap, ("governor", "soft")),
     "initialisers": ("dim", "sfm", _split, ("interpolation",)),
+    "opensplat": ("opensplat", "adc", _split, ("interpolation",)),
 }
 
 

@@ -13,7 +13,7 @@ import functools
 import re
 import tempfile
 import zipfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -79,7 +79,7 @@ def read_trials(name: str) -> pd.DataFrame:
         for folder, _ in trials
     }
     rows = [settings[folder] for folder in lines.folder]
-    shown = {key: [row[key] for row in rows] for key in ("max_size", "iterations", "max_gaussians", "cap")}
+    shown = {key: [row.get(key) for row in rows] for key in ("max_size", "iterations", "max_gaussians", "cap")}
     splits = ["extrapolation" if row["split"] == "sector" else "interpolation" for row in rows]
     results = results.drop(columns="split").assign(**shown, split=splits, trial=lines.folder)
     return with_arms(results)
@@ -274,6 +274,27 @@ def budgets_table(name: str, arms: Sequence[str], against: str = "adc") -> str:
     return table(["budget", "arm", *(title for title, _ in columns.values()), f"LPIPS − {against}"], rows)
 
 
+def arms_table(name: str, against: Mapping[str, str]) -> str:
+    """A row per scene and arm: means over the seeds, and the differences from the arm that ``against`` names."""
+    frame = read_trials(name)
+    columns = {"num_gaussians": ("Gaussians", 0)} | {key: METRICS[key] for key in ("psnr", "ssim", LPIPS)}
+    asked = ("psnr", LPIPS)
+    found = {arm: [differences(frame, arm, other, key) for key in asked] for arm, other in against.items()}
+    rows = []
+    for scene, own in frame.groupby("scene"):
+        points = f"{own.num_init_points.mean():,.0f}"
+        for arm in dict.fromkeys([*against.values(), *against]):
+            means = own[own.arm == arm][list(columns)].mean()
+            cells = [f"{means[key]:,.{digits}f}" for key, (_, digits) in columns.items()]
+            last = [
+                mean_with_interval(change.xs(scene, level="scene"), METRICS[key][1])
+                for key, change in zip(asked, found.get(arm, ()), strict=False)
+            ]
+            rows.append([f"{scene}, {points}", arm, *cells, against.get(arm, ""), *(last or ["", ""])])
+    titles = [title for title, _ in columns.values()]
+    return table(["scene, initial points", "arm", *titles, "minus", *(METRICS[key][0] for key in asked)], rows)
+
+
 def clouds_table(name: str) -> str:
     """An initialiser a row: points of its cloud, LPIPS and PSNR in each scene and on average, means over the seeds."""
     frame = read_trials(name)
@@ -330,6 +351,7 @@ def first_differences(name: str, arms: Sequence[str], against: str) -> str:
 def sections() -> list[tuple[str, list[Callable[[], str] | str]]]:
     """The sections of `TABLES`: a title, then sentences and tables."""
     parts = ("volumetric", "volumetric_once", "no_shrink")
+    others = dict.fromkeys(("absgrad", "longaxis", "pixelgs", "steepgs", "taming", "mrnf"), "volumetric")
     both, more = ("volumetric", "volumetric_once"), ("volumetric-1", "volumetric_once-1")
     clouds = ("dim", "sfm_dense", "jittered", "sfm_all_views", "carved", "random")
     steered = ("absgrad", "longaxis", "mcmc", "volumetric", "volumetric_once")
@@ -347,6 +369,9 @@ def sections() -> list[tuple[str, list[Callable[[], str] | str]]]:
         ("Which part of the rule", [
             made(claims_table, "parts"), "LPIPS by scene:", made(scenes_table, "parts", parts),
             "All metrics:", made(metrics_table, "parts", parts), by_volume, made(shares_table, "parts", parts),
+        ]),
+        ("Other rules at one count", [
+            made(claims_table, "rules"), "Means over the seeds:", made(arms_table, "rules", others),
         ]),
         ("Eight scenes at one count", [
             made(claims_table, "volume"), "LPIPS by scene:", made(scenes_table, "volume", both),
