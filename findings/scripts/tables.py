@@ -352,6 +352,7 @@ def sections() -> list[tuple[str, list[Callable[[], str] | str]]]:
     """The sections of `TABLES`: a title, then sentences and tables."""
     parts = ("volumetric", "volumetric_once", "no_shrink")
     others = dict.fromkeys(("absgrad", "longaxis", "pixelgs", "steepgs", "taming", "mrnf"), "volumetric")
+    peers = {"opensplat_fixed": "fixed", "opensplat": "adc", "fastgs": "adc"}
     both, more = ("volumetric", "volumetric_once"), ("volumetric-1", "volumetric_once-1")
     clouds = ("dim", "sfm_dense", "jittered", "sfm_all_views", "carved", "random")
     steered = ("absgrad", "longaxis", "mcmc", "volumetric", "volumetric_once")
@@ -372,6 +373,9 @@ def sections() -> list[tuple[str, list[Callable[[], str] | str]]]:
         ]),
         ("Other rules at one count", [
             made(claims_table, "rules"), "Means over the seeds:", made(arms_table, "rules", others),
+        ]),
+        ("OpenSplat beside ours", [
+            made(claims_table, "opensplat"), "Means over the seeds:", made(arms_table, "opensplat", peers),
         ]),
         ("Eight scenes at one count", [
             made(claims_table, "volume"), "LPIPS by scene:", made(scenes_table, "volume", both),
