@@ -93,7 +93,7 @@ def test_an_archive_of_too_many_bytes_is_neither_written_nor_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     file = archive(tmp_path, Plan())
-    monkeypatch.setattr("gsbench.claims.archive.MOST_TOGETHER", 1000)
+    monkeypatch.setattr("gsbench.claims.archive.MAX_TOTAL_BYTES", 1000)
     with pytest.raises(InputError, match="and 1 kB are the most"):
         unpack_archive(file, tmp_path / "back")
     with pytest.raises(InputError, match="and 1 kB are the most"):

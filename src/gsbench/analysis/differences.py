@@ -24,7 +24,7 @@ IGNORED_SETTINGS = (
     *("seed", "name", "device", "threads", "tracking.", "launch.", "hydra.", "experiment", "scene.path"),
     *("eval.primary", "eval.controls", "densify.switches"),
 )
-MOST_NAMED = 6  # a sentence names so many ingredients and counts the rest
+MAX_NAMED = 6  # a sentence names so many ingredients and counts the rest
 NO_RECORD = "settings that are not recorded (a trial has no readable config.yaml)"
 ELSEWHERE = "a training elsewhere, which left no record"
 BY_PROGRAM = "everything that the program {} does differently"
@@ -196,7 +196,7 @@ def ingredients_sentence(names: Sequence[str], first: Arm, second: Arm) -> str:
     """``sfm-longaxis differs from sfm-adc by split, gradient and threshold.``"""
     if not names:
         return f"{second} and {first} differ in no recorded setting."
-    shown = [*names[:MOST_NAMED], *([f"{len(names) - MOST_NAMED} more"] if len(names) > MOST_NAMED else [])]
+    shown = [*names[:MAX_NAMED], *([f"{len(names) - MAX_NAMED} more"] if len(names) > MAX_NAMED else [])]
     return f"{second} differs from {first} by {listed(shown)}{'' if is_mixed(names) else ' alone'}."
 
 

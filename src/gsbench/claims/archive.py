@@ -49,7 +49,7 @@ TRIALS, CONFIGURATIONS = "results.jsonl", "configurations.jsonl"
 PICTURES_FOLDER, PICTURES = "pictures", (RENDERS, GROUND_TRUTH)
 # Archives may come from strangers: these limits stop a zip bomb. They are larger than any experiment needs.
 MAX_BYTES = 1 << 28  # bytes of one unpacked file
-MOST_TOGETHER = 1 << 30  # bytes of all unpacked files
+MAX_TOTAL_BYTES = 1 << 30  # bytes of all unpacked files
 FIXED_DATE = (1980, 1, 1, 0, 0, 0)  # of all files in the zip, so that archives do not depend on time: zip's earliest
 PRIVATE = ("runs", "tracking")  # settings that only name the user's folders and servers
 PASSWORD = re.compile(r"(?<=://)[^/@\s]*@")  # user and password in a URL
@@ -186,8 +186,8 @@ def _read(file: Path) -> tuple[dict[str, Any], dict[str, bytes]]:
 
 
 def _check_size(size: int) -> None:
-    if size > MOST_TOGETHER:
-        raise InputError(f"its files are {readable_bytes(size)}, and {readable_bytes(MOST_TOGETHER)} are the most")
+    if size > MAX_TOTAL_BYTES:
+        raise InputError(f"its files are {readable_bytes(size)}, and {readable_bytes(MAX_TOTAL_BYTES)} are the most")
 
 
 def _member(archive: zipfile.ZipFile, name: str) -> bytes:

@@ -41,7 +41,7 @@ from gsbench.words import did_you_mean
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,60}")
 KEY = re.compile(r"[+]?\w+([./]\w+)*")  # of a setting
 GIVEN_BY_CHECK = ("name", "seed", "runs", "eval.primary")  # settings that the check sets itself
-MOST_ALPHA = 0.2
+MAX_ALPHA = 0.2
 NO_SIZE = "the whole claim depends on it: 0.005, or 10% of the baseline's value"
 DIRECTIONS = {"higher": 1, "lower": -1, "same": 0}
 
@@ -107,7 +107,7 @@ class ClaimsFile:
     arms: dict[str, Any]  # the settings of each arm
     claims: list[Claim]
     settings: Settings = field(default_factory=dict)
-    error_rate: Annotated[float, Interval(gt=0, le=MOST_ALPHA)] = ALPHA
+    error_rate: Annotated[float, Interval(gt=0, le=MAX_ALPHA)] = ALPHA
     size: str = ""
 
     def scenes_of(self, claim: Claim) -> tuple[str, ...]:

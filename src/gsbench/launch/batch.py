@@ -60,7 +60,7 @@ def begin_for_another_launcher(trials: Sequence[Trial]) -> None:
 
 def _begin(trials: Sequence[Trial], unfinished: Sequence[Trial]) -> None:
     """Refuse trials that are known to fail; then make the runs folder, tidy the store, write plan and declarations."""
-    declared_metrics(trials)
+    declared_metrics(trials)  # raises for two metrics in one experiment, before anything is written
     runs, launcher = checked_runs_folder(trials[0].values["runs"]), trials[0].values["launch"]["name"]
     # A node of a cluster may have folders and devices that this machine lacks.
     if launcher != "slurm" and (missing := missing_folders(unfinished)):

@@ -214,7 +214,7 @@ class StagedRasterizer(ABC, Generic[FrameT]):
 
 
 class _RenderState(Generic[FrameT]):
-    """What a render keeps for its backward pass and its footprint, with the token of the leased memory."""
+    """State of a render for its backward pass and its footprint, with the token of the leased memory."""
 
     frame: FrameT
     lifetime: Lifetime

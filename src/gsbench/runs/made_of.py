@@ -26,7 +26,7 @@ MADE_OF = "made_of"  # the key in results.json
 READ_LATER = (PER_VIEW, CURVES, EVENTS, HISTOGRAMS)  # files that tables and reports read
 PYCOLMAP = "pycolmap"  # the package whose version affects every initial cloud
 # Files up to so many bytes are compared by content, since a flipped bit changes neither size nor time.
-MOST_HASHED = 1 << 20
+MAX_HASHED_BYTES = 1 << 20
 
 Stamp = tuple[int, ...]  # size in bytes, times of change in ns
 
@@ -174,7 +174,7 @@ def _changed_at(folder: Path) -> int | None:
 
 
 def _is_hashed(name: str, path: Path) -> bool:
-    return name in READ_LATER or path.stat().st_size <= MOST_HASHED
+    return name in READ_LATER or path.stat().st_size <= MAX_HASHED_BYTES
 
 
 def _digest(path: Path) -> str | None:
