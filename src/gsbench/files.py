@@ -16,6 +16,8 @@ from typing import Any
 from gsbench.errors import GsbenchError, InputError
 
 CHUNK = 1 << 20
+# Of a file name. File systems allow 255, but the temporary name of a file that is being written is longer.
+MAX_NAME_BYTES = 220
 TEMPORARY = re.compile(r"^\..+\.tmp(-\d+)?$")  # name of a file that gsbench is still writing
 FULL = (errno.ENOSPC, errno.EDQUOT)
 BROKEN = (errno.EIO, errno.ELOOP, errno.ESTALE)

@@ -18,7 +18,7 @@ from gsbench.gaussians.paper_values import LearningRates
 from gsbench.gaussians.trainable import TrainableGaussians
 from gsbench.raster.base import RenderOutput
 from gsbench.raster.reference import ReferenceRasterizer, bin_gaussians, blending_weights, project, tile_rectangles
-from gsbench.scene.camera import Camera
+from gsbench.scene.types import Camera
 from gsbench.train.loss import torch_photometric_loss
 from tests.densify import restatement
 from tests.densify.test_rounds import EXTENT, assert_same, to_rows

@@ -16,7 +16,7 @@ import pytest
 from PIL import Image
 
 from gsbench.cli import run
-from gsbench.scene.camera import ANGLE, DISTANCE
+from gsbench.scene.types import ANGLE, DISTANCE
 from tests.end_to_end.conftest import SMALL, Run
 
 pytestmark = pytest.mark.slow

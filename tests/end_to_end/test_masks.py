@@ -20,7 +20,7 @@ from gsbench.init.base import MODEL_FOLDER
 from gsbench.init.colmap.initializer import ColmapInitializer
 from gsbench.scene.colmap import read_model
 from gsbench.scene.courtyard.render import render_courtyard
-from gsbench.scene.masks import read_mask
+from gsbench.scene.images import read_mask
 from gsbench.scene.readers import read_colmap
 from tests.end_to_end.conftest import trial_of
 

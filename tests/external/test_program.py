@@ -20,8 +20,7 @@ from gsbench.external.program import run_program
 from gsbench.external.settings import External, fill_placeholders, split_command
 from gsbench.init.base import PointCloud
 from gsbench.runs.keys import config_hash
-from gsbench.scene.camera import Camera
-from gsbench.scene.types import View
+from gsbench.scene.types import Camera, View
 from gsbench.system.isolate import error_tail
 from tests.config.test_schema import composed
 from tests.processes import is_running

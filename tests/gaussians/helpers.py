@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from gsbench.gaussians.model import NUM_SH_REST, Gaussians
-from gsbench.scene.camera import Camera
+from gsbench.scene.types import Camera
 
 
 def random_gaussians(

@@ -26,8 +26,7 @@ from gsbench.raster.contract import CASES
 from gsbench.raster.reference import ReferenceRasterizer
 from gsbench.runs.keys import INIT, TRAIN, Step
 from gsbench.runs.store import Store
-from gsbench.scene.camera import ANGLE, COUNTED, DISTANCE
-from gsbench.scene.types import Scene, View
+from gsbench.scene.types import ANGLE, COUNTED, DISTANCE, Scene, View
 from gsbench.train.trainer import snapshot_file
 
 TRAINED = Step(TRAIN, {}, lambda folder: None)

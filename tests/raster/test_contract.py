@@ -23,7 +23,7 @@ from gsbench.raster.contract import (
 )
 from gsbench.raster.executors import Executor, find_executor, offers
 from gsbench.raster.reference import ReferenceRasterizer
-from gsbench.scene.camera import Camera
+from gsbench.scene.types import Camera
 from tests.raster.strategies import extreme_gaussians
 
 PEERS = ("gsplat",)  # to measure against: their departures from the contract stand in their modules

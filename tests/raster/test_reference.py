@@ -10,7 +10,7 @@ import torch
 
 from gsbench.gaussians.model import Gaussians
 from gsbench.raster.reference import ReferenceRasterizer, project
-from gsbench.scene.camera import Camera
+from gsbench.scene.types import Camera
 from tests.gaussians.helpers import front_camera, random_gaussians
 
 

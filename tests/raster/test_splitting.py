@@ -13,7 +13,7 @@ from gsbench.raster import create_rasterizer
 from gsbench.raster.base import CONSTANTS
 from gsbench.raster.contract import Case
 from gsbench.raster.reference import Projection, ReferenceRasterizer, project, tile_rectangles
-from gsbench.scene.camera import Camera
+from gsbench.scene.types import Camera
 
 CASES = (
     Case(7, 5, 20, sh_degree=0),

@@ -24,8 +24,7 @@ from gsbench.raster.reference import ReferenceRasterizer
 from gsbench.raster.triton import composite, layout, lists
 from gsbench.raster.triton.executor import TritonRasterizer
 from gsbench.raster.triton.launch import Workspace
-from gsbench.scene.camera import Camera
-from gsbench.scene.types import Scene, View
+from gsbench.scene.types import Camera, Scene, View
 from gsbench.train.loss import torch_photometric_loss
 from gsbench.train.loss_triton import TritonLoss
 from gsbench.train.options import TrainConfig

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pycolmap
 
-from gsbench.scene.camera import Camera
 from gsbench.scene.colmap import pinhole_camera
+from gsbench.scene.types import Camera
 
 
 def looking(

@@ -10,11 +10,11 @@ import pytest
 from PIL import Image
 
 from gsbench.errors import InputError
-from gsbench.scene.camera import Camera
 from gsbench.scene.colmap import model_points, read_model, read_reference, write_model
 from gsbench.scene.colmap_files import ModelChecks, check_model
 from gsbench.scene.options import SplitRule
 from gsbench.scene.readers import read_colmap, read_photos
+from gsbench.scene.types import Camera
 from tests.scene.cameras import cameras_of
 
 from .conftest import smooth_image

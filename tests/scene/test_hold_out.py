@@ -12,10 +12,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gsbench.errors import InputError
-from gsbench.scene.camera import Camera
 from gsbench.scene.hold_out import hold_out
 from gsbench.scene.options import SceneConfig, SplitRule
 from gsbench.scene.readers import read_colmap, read_photos
+from gsbench.scene.types import Camera
 from tests.scene.test_sectors import ring
 
 NAMES = [f"{k:02d}.png" for k in range(24)]

@@ -16,8 +16,7 @@ from gsbench.errors import InputError
 from gsbench.gaussians.ply import check_ply, read_ply
 from gsbench.init.points import read_points
 from gsbench.scene.colmap import read_model
-from gsbench.scene.images import IMAGE_SUFFIXES, exif_orientation, image_size, read_image
-from gsbench.scene.names import check_picture_names
+from gsbench.scene.images import IMAGE_SUFFIXES, check_picture_names, exif_orientation, image_size, read_image
 from gsbench.scene.options import SplitRule
 from gsbench.scene.readers import fingerprint, list_images, read_photos
 

@@ -12,11 +12,11 @@ import pytest
 from PIL import Image
 
 from gsbench.errors import InputError
-from gsbench.scene.camera import CameraModel
 from gsbench.scene.colmap import read_model
 from gsbench.scene.load import ImageToPrepare, load_scene, prepare_all, undistort
 from gsbench.scene.options import SplitRule
 from gsbench.scene.readers import read_colmap
+from gsbench.scene.types import CameraModel
 
 WIDTH, HEIGHT = 200, 150
 MODELS = {

@@ -14,8 +14,8 @@ from PIL import Image
 
 from gsbench.errors import InputError
 from gsbench.pipeline.steps.scene import masking_step
+from gsbench.scene.images import fill_ignored, find_masks, prepare_photograph, prepared_mask, read_mask, resize_mask
 from gsbench.scene.load import load_scene
-from gsbench.scene.masks import fill_ignored, find_masks, prepare_photograph, prepared_mask, read_mask, resize_mask
 from gsbench.scene.options import SceneConfig
 from gsbench.scene.readers import read_colmap, read_photos
 from gsbench.scene.types import Capture

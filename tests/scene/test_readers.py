@@ -10,7 +10,8 @@ import pytest
 from PIL import Image
 
 from gsbench.errors import InputError
-from gsbench.scene.names import match_names, select_images, split_names
+from gsbench.scene.hold_out import select_images, split_names
+from gsbench.scene.images import match_names
 from gsbench.scene.options import SceneConfig, SplitRule
 from gsbench.scene.readers import list_images, missing_model, read_colmap, read_photos
 

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gsbench.scene.camera import ANGLE, DISTANCE, Camera, nearest_training_cameras
 from gsbench.scene.courtyard.render import ring_camera
 from gsbench.scene.hold_out import arrange_cameras, sector_range
+from gsbench.scene.types import ANGLE, DISTANCE, Camera, nearest_training_cameras
 from tests.scene import cameras
 
 looking = partial(cameras.looking, size=(40, 30), focal=50.0)

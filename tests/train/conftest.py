@@ -8,8 +8,7 @@ import torch
 
 from gsbench.gaussians.model import Gaussians
 from gsbench.raster.reference import ReferenceRasterizer
-from gsbench.scene.camera import Camera
-from gsbench.scene.types import Scene, View
+from gsbench.scene.types import Camera, Scene, View
 from tests.gaussians.helpers import random_gaussians
 
 

@@ -9,8 +9,7 @@ from skimage.metrics import structural_similarity
 
 from gsbench.eval.images import replace_ignored
 from gsbench.raster import create_rasterizer
-from gsbench.scene.camera import Camera
-from gsbench.scene.types import View
+from gsbench.scene.types import Camera, View
 from gsbench.train.loss import PhotometricLoss
 from gsbench.train.views import SceneViews, Targets
 

@@ -12,8 +12,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
 from gsbench.errors import InputError
-from gsbench.scene.camera import Camera
-from gsbench.scene.types import View
+from gsbench.scene.types import Camera, View
 from gsbench.view.picture import photograph_at, side_by_side
 from gsbench.view.server import fitting_fov, level_up, mean_up, page_camera
 from gsbench.view.trials import read_causes

@@ -10,8 +10,7 @@ from torch import Tensor
 from gsbench.errors import InputError
 from gsbench.gaussians.model import NUM_SH_REST, Gaussians
 from gsbench.gaussians.ply import read_ply
-from gsbench.scene.camera import Camera
-from gsbench.scene.types import Scene, View
+from gsbench.scene.types import Camera, Scene, View
 
 SEED = 0
 FOCAL = 0.9  # of the image width

@@ -18,12 +18,9 @@ from typing import IO
 from gsbench.datasets.catalog import SceneFiles
 from gsbench.downloads import USER_AGENT, FetchError, RetryPolicy, with_retries
 from gsbench.errors import InputError
-from gsbench.files import CHUNK, atomic, require_regular
+from gsbench.files import CHUNK, MAX_NAME_BYTES, atomic, require_regular
 from gsbench.logs import Progress
 from gsbench.words import counted, readable_bytes
-
-# File systems allow 255 for each part of a path, but the temporary name of a file that is being written is longer.
-MAX_NAME_BYTES = 220
 
 
 class DamagedMemberError(Exception):

@@ -14,11 +14,9 @@ from gsbench.files import write_json
 from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.ply import read_ply
 from gsbench.init.base import MODEL_FOLDER, PointCloud
-from gsbench.scene.camera import Camera
 from gsbench.scene.colmap import write_model
-from gsbench.scene.images import read_image
-from gsbench.scene.names import check_picture_names, png_name
-from gsbench.scene.types import View
+from gsbench.scene.images import check_picture_names, png_name, read_image
+from gsbench.scene.types import Camera, View
 from gsbench.words import counted, some_of
 
 IMAGES = "images"

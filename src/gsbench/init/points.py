@@ -147,8 +147,7 @@ def seen_colors(points: Array, capture: Capture, model: pycolmap.Reconstruction)
     Occlusion is ignored; the nearest camera is the least likely to be occluded. Pixels that a mask ignores give no
     colour.
     """
-    from gsbench.scene.images import read_image
-    from gsbench.scene.masks import read_mask
+    from gsbench.scene.images import read_image, read_mask
 
     colors = np.full((len(points), 3), -1, dtype=np.int16)
     nearest = np.full(len(points), np.inf)

@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from gsbench.gaussians.model import Gaussians
-    from gsbench.scene.camera import Camera
+    from gsbench.scene.types import Camera
 
 
 @dataclass(frozen=True)

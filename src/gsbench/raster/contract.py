@@ -15,7 +15,7 @@ from gsbench.gaussians.model import Gaussians
 from gsbench.raster.base import Rasterizer, RenderOutput
 from gsbench.raster.executors import offers
 from gsbench.raster.reference import ReferenceRasterizer
-from gsbench.scene.camera import Camera
+from gsbench.scene.types import Camera
 
 VALUE_TOLERANCE = 1e-4  # of image and alpha
 GRADIENT_TOLERANCE = 1e-3  # of the largest entry of each gradient

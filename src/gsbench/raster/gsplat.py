@@ -31,7 +31,7 @@ from gsbench.gaussians.model import Gaussians
 from gsbench.raster.base import CONSTANTS, RasterConstants, RenderOutput
 from gsbench.raster.executors import find_executor
 from gsbench.raster.staged import Readback, bad_values, check_settings, raise_for_values
-from gsbench.scene.camera import Camera
+from gsbench.scene.types import Camera
 
 MAX_RADIUS = 2**24  # px; keeps the tile numbers of a huge Gaussian within int32
 COEFFICIENTS = {0: 1, 1: 4, 2: 9, 3: 16}  # number of harmonics up to each degree

@@ -14,7 +14,7 @@ from torch.utils.checkpoint import checkpoint
 from gsbench.gaussians.model import Gaussians, colors
 from gsbench.raster.base import CONSTANTS, Footprint, RasterConstants, RenderOutput, slope_limits, view_depths
 from gsbench.raster.staged import check_inputs
-from gsbench.scene.camera import Camera
+from gsbench.scene.types import Camera
 
 MAX_RADIUS = 2**24  # px; keeps the radius of a huge Gaussian within int32
 

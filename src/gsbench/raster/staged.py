@@ -10,7 +10,7 @@ from torch.autograd.function import once_differentiable
 
 from gsbench.gaussians.model import MAX_SH_DEGREE, Gaussians
 from gsbench.raster.base import Footprint, RenderOutput
-from gsbench.scene.camera import Camera
+from gsbench.scene.types import Camera
 
 MAX_SIDE = 16384  # px; a larger image is most likely a mistake in the settings
 MIN_QUATERNION_NORM = 1e-12  # below, torch's ``normalize`` no longer gives a unit quaternion

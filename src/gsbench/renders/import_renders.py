@@ -25,8 +25,7 @@ from gsbench.runs.keys import EVALUATE, sha256_of
 from gsbench.runs.layout import CONFIG, GROUND_TRUTH, IN_RUNS, MASKS, PER_VIEW, RENDERS, SEED
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import FROM_RENDERS, RENDERS_ALONE, Code, TrialRecord
-from gsbench.scene.images import read_image
-from gsbench.scene.names import png_name
+from gsbench.scene.images import png_name, read_image
 from gsbench.settings import is_folder_name
 
 KEPT_GROUPS = ("scene", "eval", "tracking", "launch")  # groups of the configuration that apply to renders too

@@ -15,8 +15,7 @@ from gsbench.runs import keys
 from gsbench.runs.layout import GROUND_TRUTH, MASKS, RENDERS, RESULTS, STORE
 from gsbench.runs.store import Store
 from gsbench.runs.trial_folder import TrialFolder
-from gsbench.scene.images import image_size
-from gsbench.scene.names import png_name
+from gsbench.scene.images import image_size, png_name
 from gsbench.scene.readers import fingerprint, list_images
 from gsbench.view.trials import find_trial
 from gsbench.words import did_you_mean

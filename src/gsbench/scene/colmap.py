@@ -9,11 +9,9 @@ import pycolmap
 from numpy.typing import NDArray
 
 from gsbench.errors import InputError
-from gsbench.scene.camera import Camera, CameraModel
 from gsbench.scene.colmap_files import check_model
-from gsbench.scene.images import check_size, image_size
-from gsbench.scene.names import match_names
-from gsbench.scene.types import Capture
+from gsbench.scene.images import check_size, image_size, match_names
+from gsbench.scene.types import Camera, CameraModel, Capture
 
 PINHOLE_MODELS = (pycolmap.CameraModelId.SIMPLE_PINHOLE, pycolmap.CameraModelId.PINHOLE)
 UNIT_TOLERANCE = 1e-9  # a quaternion whose length differs from 1 by no more is not normalised again

@@ -9,21 +9,17 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gsbench.errors import InputError
-from gsbench.scene.camera import Camera
-from gsbench.scene.names import select_images, split_names
-from gsbench.scene.options import SplitRule
-from gsbench.words import counted
+from gsbench.scene.options import MIN_IMAGES, TEST_EVERY, SplitRule
+from gsbench.scene.types import Array, Camera
+from gsbench.words import counted, some_of
 
 SURROUNDED = 180.0  # degrees: cameras with a wider gap between azimuths stand on one side of the scene
 OPEN_RING = 30.0  # degrees: the order begins after a gap wider than this, else at the first camera
 FACING = 0.9  # share of the cameras that must look towards the centre
 PARALLEL = 1e-3  # smallest eigenvalue of the axes' normal matrix (at most 2/3) below which axes count as parallel
 AZIMUTH_DECIMALS = 6  # azimuths are rounded to so many decimals of a degree, so that all processors agree on ties
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -124,6 +120,60 @@ def _azimuths(cameras: Sequence[Camera], centers: Array) -> tuple[Array | None, 
 
 def _sorted(coordinates: Array) -> tuple[int, ...]:
     return tuple(int(index) for index in np.argsort(coordinates, kind="stable"))
+
+
+def select_images(names: Sequence[str], max_images: int, least: int = MIN_IMAGES) -> list[str]:
+    """Select at most ``max_images`` of n names, evenly spaced: the k-th of m selected names has index ``k * n // m``.
+
+    The first name is always kept, and views on a closed ring stay evenly spaced. Images are selected before the split.
+
+    Examples:
+        >>> select_images(["a", "b", "c", "d", "e"], 3)
+        ['a', 'b', 'd']
+    """
+    if max_images < least:
+        raise InputError(f"scene.max_images must be at least {least}, got {max_images}")
+    if len(names) <= max_images:
+        return list(names)
+    return [names[k * len(names) // max_images] for k in range(max_images)]
+
+
+def split_names(
+    names: Sequence[str],
+    test_every: int = TEST_EVERY,
+    train: Sequence[str] | None = None,
+    test: Sequence[str] | None = None,
+) -> tuple[list[str], list[str]]:
+    """Split sorted names into (training, test).
+
+    Every ``test_every``-th name from the first is a test view; ``test_every=0`` holds out none. Explicit lists replace
+    this rule. If only one list is given, the other side gets all other names. If both are given, names in neither list
+    are dropped.
+
+    Raises `InputError` if there is no training view, or no test view although ``test_every`` is not 0.
+    """
+    if test_every < 0:
+        raise InputError(f"scene.test_every must be 0 (no test views) or positive, got {test_every}")
+    if train is None and test is None:
+        held_out = set(names[::test_every]) if test_every else set()
+    elif test is None:
+        held_out = set(names) - set(train or ())
+    else:
+        held_out = set(test)
+        if both := sorted(held_out & set(train or ())):
+            raise InputError(f"the split lists hold {some_of(both)} for training and for testing: name each image once")
+    kept = set(names if train is None else train)
+    training = [name for name in names if name in kept and name not in held_out]
+    testing = [name for name in names if name in held_out]
+    if not training:
+        raise InputError(
+            f"the split leaves no training view of {len(names)}: raise scene.test_every or correct the lists"
+        )
+    if not testing and test_every:
+        raise InputError(
+            f"the split leaves no test view of {len(names)}: correct the lists, or give scene.test_every=0"
+        )
+    return training, testing
 
 
 SplitLists = tuple[Sequence[str] | None, Sequence[str] | None]  # names for training, names for testing

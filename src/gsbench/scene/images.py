@@ -1,9 +1,17 @@
-"""Reading and resizing photographs.
+"""Photographs and masks: finding them by name, reading, resizing, and filling in what a mask ignores.
 
 Every image becomes uint8 RGB. EXIF orientation is ignored, as in COLMAP, because cameras refer to the stored pixels.
+
+A mask says which pixels of a photograph count: black pixels are ignored, all others count. COLMAP extracts no features
+where a mask "is black (pixel intensity value 0 in grayscale)" (its FAQ, "Mask image regions"), and nerfstudio trains
+only where a mask is not 0 (its page "Data conventions"). Ignored pixels are replaced before any other step reads a
+photograph, so that they cannot influence a result.
 """
 
-from pathlib import Path
+import shutil
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path, PurePosixPath
 from typing import Literal
 
 import numpy as np
@@ -11,8 +19,9 @@ from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
 from gsbench.errors import InputError
-from gsbench.files import require_regular
+from gsbench.files import MAX_NAME_BYTES, require_regular
 from gsbench.scene.options import Backdrop
+from gsbench.words import some_of
 
 Resample = Literal["lanczos", "area", "bicubic"]
 
@@ -23,6 +32,64 @@ EXIF_ORIENTATION = 0x0112
 _FILTERS = {"lanczos": Image.Resampling.LANCZOS, "area": Image.Resampling.BOX, "bicubic": Image.Resampling.BICUBIC}
 _SIXTEEN_BIT_MODES = ("I;16", "I;16L", "I;16B", "I;16N")
 _WIDE_MODES = ("I", "F")  # 32-bit integer and float, which have no agreed value for white
+
+Mask = NDArray[np.bool_]  # [H, W], True where a pixel counts
+
+SUFFIX = ".png"
+WHITE = np.uint8(255)
+IMAGES, MASKS = "images", "masks"  # in the folder of `prepare_photograph`
+MAX_GREY_SHARE = 0.05  # of pixels between black and the brightest value; a photograph given as a mask has far more
+NEARLY_ONE = 1 - 1e-6  # a mean of ones in float32 may round to less than 1
+_FAST_PNG = 1  # zlib level
+
+
+def match_names(wanted: Iterable[str], files: Iterable[str]) -> dict[str, str]:
+    """Map each wanted image name to its file; names without a file are left out.
+
+    A file of the same name comes first, then the only file whose path differs in the extension alone (``a.png`` for
+    ``a.JPG``). There is no match if several such files fit a name, or if several names fit such a file.
+    """
+    files = set(files)
+    by_stem: dict[str, list[str]] = defaultdict(list)
+    for file in files:
+        by_stem[stem_of(file)].append(file)
+    matches: dict[str, str] = {}
+    claims: dict[str, list[str]] = defaultdict(list)
+    for name in wanted:
+        if name in files:
+            matches[name] = name
+        elif len(by_stem[stem_of(name)]) == 1:
+            claims[by_stem[stem_of(name)][0]].append(name)
+    exact = set(matches.values())
+    matches.update({names[0]: file for file, names in claims.items() if len(names) == 1 and file not in exact})
+    return matches
+
+
+def stem_of(name: str) -> str:
+    """The path of an image without its extension."""
+    path = PurePosixPath(name)
+    return (path.with_suffix("") if path.suffix.lower() in IMAGE_SUFFIXES else path).as_posix()
+
+
+def check_picture_names(names: Iterable[str], folder: Path) -> None:
+    """Raise `InputError` if a view's picture would have a too long name, or the same name as another view's."""
+    view_of: dict[str, str] = {}
+    for name in names:
+        picture = png_name(name)
+        if len(picture.encode()) > MAX_NAME_BYTES:
+            raise InputError(
+                f"{folder / name}: a name of more than {MAX_NAME_BYTES} bytes, folders included: shorten it"
+            )
+        if picture in view_of:
+            raise InputError(
+                f"{folder}: the pictures of {view_of[picture]} and {name} would both be {picture}: rename one"
+            )
+        view_of[picture] = name
+
+
+def png_name(view_name: str) -> str:
+    """The file name of a view's picture; sub-folders become part of the name."""
+    return Path(view_name).with_suffix(".png").as_posix().replace("/", "__")
 
 
 def image_size(path: Path) -> tuple[int, int]:
@@ -115,3 +182,147 @@ def open_image(path: Path) -> Image.Image:
     except Exception as error:  # Pillow's readers may raise any exception on a damaged file
         reason = "not a readable image" if isinstance(error, UnidentifiedImageError) else str(error)
         raise InputError(f"{path}: {reason}: replace or remove it") from error
+
+
+def find_masks(folder: Path, names: Sequence[str]) -> dict[str, Path]:
+    """The mask file in ``folder`` of each image: ``a/b.jpg.png`` for ``a/b.jpg``, as COLMAP names it.
+
+    ``names`` are paths below the folder of the images. Raises InputError naming the images without a mask.
+    """
+    masks = {name: folder / f"{name}{SUFFIX}" for name in names}
+    if missing := [name for name, mask in masks.items() if not mask.is_file()]:
+        raise InputError(
+            f"scene.masks: no mask of {some_of(missing)} in {folder}: add {missing[0]}{SUFFIX} (all white where every "
+            "pixel counts)"
+        )
+    return masks
+
+
+def check_mask_sizes(images: Path, masks: Mapping[str, Path]) -> None:
+    """Raise `InputError` for a mask that is not an image or differs in size from its photograph below ``images``."""
+    for name, mask in masks.items():
+        size, wanted = image_size(mask), image_size(images / name)
+        if size != wanted:
+            raise InputError(
+                f"{mask}: the mask is {size[0]}x{size[1]} px and its image {name} {wanted[0]}x{wanted[1]}: give masks "
+                "of the images' size"
+            )
+
+
+def read_mask(path: Path) -> Mask:
+    """Read a mask [H, W]: False where the file is black.
+
+    Raises InputError for a file that is no mask: with colours, with many greys, or black everywhere.
+    """
+    with open_image(path) as image:
+        try:
+            image.load()
+            if image.has_transparency_data and np.asarray(image.convert("RGBA"))[..., 3].min() < 255:
+                raise InputError(f"{path}: a mask says by black what is ignored, not by transparency: save it as grey")
+            pixels = np.asarray(image.convert("RGB") if image.mode in ("P", "CMYK", "YCbCr", "RGBA", "LA") else image)
+        except InputError:
+            raise
+        except Exception as error:  # Pillow's readers may raise any exception on a damaged file
+            raise InputError(f"{path}: the mask is damaged ({error}): replace it") from error
+    if pixels.ndim == 3:
+        if (pixels != pixels[..., :1]).any():
+            raise InputError(f"{path}: is in colours, and no mask: make it black where pixels are ignored, else white")
+        pixels = pixels[..., 0]
+    mask: Mask = pixels != 0
+    if not mask.any():
+        raise InputError(f"{path}: the mask is black all over, so no pixel counts: correct it, or leave the image out")
+    grey_share = float((mask & (pixels != pixels.max())).mean())
+    if grey_share > MAX_GREY_SHARE:
+        raise InputError(
+            f"{path}: {grey_share:.0%} of its pixels are grey, so it is not a mask: make it black where pixels are "
+            "ignored, else white"
+        )
+    return mask
+
+
+def write_mask(mask: Mask, path: Path) -> None:
+    """Write the mask as a PNG in black and white."""
+    Image.fromarray(mask.astype(np.uint8) * WHITE).save(path, format="PNG", compress_level=_FAST_PNG)
+
+
+def prepare_photograph(
+    folder: Path, images: Path, masks: Mapping[str, Path], name: str, backdrop: Backdrop = "black"
+) -> None:
+    """Write the photograph ``name`` with its ignored pixels replaced and its transparent pixels over ``backdrop``.
+
+    The photograph goes to ``images/<name>`` below ``folder``: a copy if nothing changes, else a PNG with the original
+    EXIF data. Its mask, if any, goes to ``masks/<name>.png`` in black and white.
+    """
+    target, mask_target = folder / IMAGES / name, prepared_mask(folder, name)
+    for path in (target, mask_target):
+        path.parent.mkdir(parents=True, exist_ok=True)
+    mask = None
+    if name in masks:
+        mask = read_mask(masks[name])
+        write_mask(mask, mask_target)
+    with open_image(images / name) as original:
+        exif, transparent = original.info.get("exif", b""), original.has_transparency_data
+    if (mask is None or mask.all()) and (backdrop == "black" or not transparent):
+        shutil.copyfile(images / name, target)
+        return
+    pixels = read_image(images / name, backdrop)
+    if mask is not None:
+        if pixels.shape[:2] != mask.shape:
+            raise InputError(f"{masks[name]}: the mask changed while it was read: run again")
+        pixels = fill_ignored(pixels, mask)
+    Image.fromarray(pixels).save(target, format="PNG", compress_level=_FAST_PNG, exif=exif)
+
+
+def prepared_mask(folder: Path, name: str) -> Path:
+    """The file to which `prepare_photograph` writes the mask of the image ``name``, as COLMAP names it."""
+    return folder / MASKS / f"{name}{SUFFIX}"
+
+
+def fill_ignored(image: NDArray[np.uint8], mask: Mask) -> NDArray[np.uint8]:
+    """``image`` [H, W, 3] with its ignored pixels interpolated from counted pixels nearby.
+
+    Uses the pull and push of Gortler et al. 1996, "The Lumigraph", section 3.4.1: the counted pixels are averaged over
+    blocks of 2, 4, 8, … pixels; then coarser levels are interpolated bilinearly into finer pixels without a value. The
+    filling leaves no edge at the border of the mask where features would be detected.
+    """
+    filled = _pull_push(image.astype(np.float32), mask)
+    return np.where(mask[..., None], image, np.rint(filled).astype(np.uint8))
+
+
+def _pull_push(image: NDArray[np.float32], mask: Mask) -> NDArray[np.float32]:
+    if mask.all():
+        return image
+    height, width = mask.shape
+    to_even = ((0, height % 2), (0, width % 2))
+    weights = np.pad(mask, to_even).astype(np.float32)
+    rows, columns = weights.shape[0] // 2, weights.shape[1] // 2
+    blocks = (rows, 2, columns, 2)
+    sums = (np.pad(image * mask[..., None], (*to_even, (0, 0)))).reshape(*blocks, 3).sum((1, 3))  # [H/2, W/2, 3]
+    counted = weights.reshape(blocks).sum((1, 3))  # [H/2, W/2]
+    coarse = _pull_push(sums / np.maximum(counted, 1)[..., None], counted > 0)
+    pushed = _double(_double(coarse, 0), 1)[:height, :width]
+    return np.where(mask[..., None], image, pushed)
+
+
+def _double(image: NDArray[np.float32], axis: int) -> NDArray[np.float32]:
+    """``image`` [H, W, 3] with twice as many pixels along ``axis``, interpolated linearly."""
+    ends = [(1, 1) if dimension == axis else (0, 0) for dimension in range(image.ndim)]
+    padded = np.pad(image, ends, mode="edge")
+    length = image.shape[axis]
+    before, after = (np.take(padded, range(start, start + length), axis) for start in (0, 2))
+    pair = np.stack([0.75 * image + 0.25 * before, 0.75 * image + 0.25 * after], axis=axis + 1)
+    shape = list(image.shape)
+    shape[axis] = 2 * length
+    return pair.reshape(shape)
+
+
+def resize_mask(mask: Mask, width: int, height: int) -> Mask:
+    """The mask at another size: a pixel counts if all original pixels with centres in its area count.
+
+    The filters that resize photographs reach further than that. Beyond the mask's border they use the pixels that
+    `fill_ignored` made.
+    """
+    if mask.shape == (height, width):
+        return mask
+    shares = Image.fromarray(mask.astype(np.float32)).resize((width, height), Image.Resampling.BOX)
+    return np.asarray(shares) >= NEARLY_ONE

@@ -29,13 +29,21 @@ from PIL import Image
 
 from gsbench.errors import InputError
 from gsbench.logs import Progress, no_progress
-from gsbench.scene.camera import Camera, CameraModel, to_pinhole
 from gsbench.scene.colmap_files import model_files
-from gsbench.scene.images import Resample, check_size, image_size, read_image, resize_image
-from gsbench.scene.masks import WHITE, Mask, read_mask, resize_mask, write_mask
-from gsbench.scene.names import MIN_IMAGES
-from gsbench.scene.options import downscaled_size
-from gsbench.scene.types import Capture, Scene, View
+from gsbench.scene.images import (
+    WHITE,
+    Mask,
+    Resample,
+    check_size,
+    image_size,
+    read_image,
+    read_mask,
+    resize_image,
+    resize_mask,
+    write_mask,
+)
+from gsbench.scene.options import MIN_IMAGES, downscaled_size
+from gsbench.scene.types import Camera, CameraModel, Capture, Scene, View, to_pinhole
 from gsbench.system.isolate import CrashError, run_isolated
 from gsbench.words import some_of
 

@@ -11,6 +11,8 @@ from pydantic import NonNegativeInt, PositiveInt
 from gsbench.errors import InputError
 from gsbench.settings import MISSING, FolderName, PathName, check_settings, is_folder_name
 
+MAX_IMAGES = 200  # the paper's limit per scene
+MIN_IMAGES = 3
 MIN_SIZE = 16  # px: the smallest side of an image that is trained on
 
 
@@ -122,7 +124,7 @@ class SceneConfig:
     downscale: PositiveInt = 1  # divides both sides
     max_size: Annotated[int, Ge(MIN_SIZE)] | None = None  # longest side, px; never enlarges
     resample: Literal["lanczos", "area", "bicubic"] = "lanczos"
-    max_images: Annotated[int, Ge(3)] = 200  # evenly spaced over the sorted names
+    max_images: Annotated[int, Ge(MIN_IMAGES)] = MAX_IMAGES  # evenly spaced over the sorted names
     test_every: Annotated[int, Ge(2)] = TEST_EVERY  # every_nth: hold out every so-many-th sorted name
     split: SplitName = "every_nth"  # what is held out: every test_every-th image, a sector, lists; matched: see `check`
     train_list: PathName | None = None  # file of names, one a line; null with split=list: train_list.txt

@@ -12,11 +12,9 @@ from gsbench.datasets.catalog import how_to_get
 from gsbench.errors import InputError
 from gsbench.files import require_regular
 from gsbench.scene.colmap_files import model_files
-from gsbench.scene.hold_out import CamerasByName, hold_out
-from gsbench.scene.images import IMAGE_SUFFIXES
-from gsbench.scene.masks import check_mask_sizes, find_masks
-from gsbench.scene.names import MAX_IMAGES, MIN_IMAGES, check_picture_names, match_names, select_images
-from gsbench.scene.options import EVERY_NTH, TEST_LIST, TRAIN_LIST, SplitRule
+from gsbench.scene.hold_out import CamerasByName, hold_out, select_images
+from gsbench.scene.images import IMAGE_SUFFIXES, check_mask_sizes, check_picture_names, find_masks, match_names
+from gsbench.scene.options import EVERY_NTH, MAX_IMAGES, MIN_IMAGES, TEST_LIST, TRAIN_LIST, SplitRule
 from gsbench.scene.transforms import Transforms
 from gsbench.scene.types import Capture
 from gsbench.words import counted, some_of
@@ -41,7 +39,7 @@ def read_colmap(
 
     The photographs are the files in the folder that have a pose in the model; their extensions may differ from the
     model's names. `select_images` chooses the ones that are kept, `SplitRule` the ones that are held out. ``masks`` is
-    the folder of the masks below ``path`` (see `gsbench.scene.masks.find_masks`).
+    the folder of the masks below ``path`` (see `gsbench.scene.images.find_masks`).
 
     Raises `InputError` if a folder is missing, the model is damaged, or fewer than three photographs are usable.
     """

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from gsbench.errors import InputError
 from gsbench.parsing import resolved
 from gsbench.records import Number, Record, Text, read_typed
-from gsbench.scene.camera import CameraModel
 from gsbench.scene.images import IMAGE_SUFFIXES, image_size
+from gsbench.scene.types import CameraModel
 from gsbench.words import some_of
 
 log = logging.getLogger(__name__)

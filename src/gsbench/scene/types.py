@@ -1,16 +1,89 @@
-"""Types of a scene: a `Capture` of photographs on disk before initialisation, a `Scene` of views with cameras after."""
+"""Types of a scene: a `Camera`, a `Capture` of photographs before initialisation, and a `Scene` of views with cameras.
+
+Also measures of cameras: the scene extent, and the distance of test cameras from the training cameras.
+"""
+
+from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gsbench.scene.camera import Camera
+Array = NDArray[np.float64]
 
 EXTENT_MARGIN = 1.1  # 3DGS: cameras_extent = 1.1 x the largest distance of a training camera to their mean
+PINHOLE_NAMES = ("SIMPLE_PINHOLE", "PINHOLE")
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A pinhole camera in OpenCV axes (x right, y down, z forward).
+
+    ``fx, fy, cx, cy`` are in pixels, in COLMAP's convention: the centre of the first pixel is (0.5, 0.5), so a centred
+    principal point is ``cx = width / 2``. ``rotation`` [3, 3] and ``translation`` [3] map a world point to camera
+    coordinates: ``x_camera = rotation @ x_world + translation`` (float64).
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    rotation: NDArray[np.float64]
+    translation: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        if self.width < 1 or self.height < 1:
+            raise ValueError(f"camera: width and height must be at least 1 px, got {self.width}x{self.height}")
+        if not (np.isfinite(self.fx) and np.isfinite(self.fy) and self.fx > 0 and self.fy > 0):
+            raise ValueError(f"camera: fx and fy must be finite and positive, got fx={self.fx}, fy={self.fy}")
+        if not (np.isfinite(self.cx) and np.isfinite(self.cy)):
+            raise ValueError(f"camera: cx and cy must be finite, got cx={self.cx}, cy={self.cy}")
+        rotation = np.asarray(self.rotation, dtype=np.float64)
+        translation = np.asarray(self.translation, dtype=np.float64)
+        if rotation.shape != (3, 3) or not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4):
+            raise ValueError("camera: rotation must be an orthonormal 3x3 matrix")
+        if translation.shape != (3,) or not np.isfinite(translation).all():
+            raise ValueError("camera: translation must be three finite numbers")
+        object.__setattr__(self, "rotation", rotation)
+        object.__setattr__(self, "translation", translation)
+
+    @property
+    def center(self) -> NDArray[np.float64]:
+        """The camera centre in world units, [3]."""
+        return -self.rotation.T @ self.translation
+
+    def resized(self, width: int, height: int) -> Camera:
+        """The same camera for the same image at another size in pixels."""
+        sx, sy = width / self.width, height / self.height
+        return replace(
+            self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy
+        )
+
+
+@dataclass(frozen=True)
+class CameraModel:
+    """A COLMAP camera as plain values: the model's name, the size in px, and the parameters in COLMAP's order."""
+
+    name: str
+    width: int
+    height: int
+    params: tuple[float, ...]
+
+    @property
+    def distorted(self) -> bool:
+        return self.name not in PINHOLE_NAMES
+
+
+def to_pinhole(camera: CameraModel) -> Camera:
+    """Convert an undistorted COLMAP camera to a `Camera` at the origin."""
+    fx, fy, cx, cy = camera.params if camera.name == "PINHOLE" else (camera.params[0], *camera.params)
+    return Camera(camera.width, camera.height, fx, fy, cx, cy, np.eye(3), np.zeros(3))
 
 
 @dataclass(frozen=True)
@@ -47,7 +120,7 @@ class View:
     """One photograph with its camera; ``image`` is [H, W, 3] uint8, sRGB.
 
     ``mask`` [H, W] is True where a pixel counts, or None if all pixels count. Ignored pixels hold the colours made by
-    `gsbench.scene.masks.fill_ignored`.
+    `gsbench.scene.images.fill_ignored`.
     """
 
     name: str
@@ -83,3 +156,39 @@ def scene_extent(cameras: Sequence[Camera]) -> float:
 def extent_of_centers(centers: NDArray[np.float64]) -> float:
     """1.1 x the largest distance of a camera centre [V, 3] from their mean, in world units (3DGS's getNerfppNorm)."""
     return float(EXTENT_MARGIN * np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
+
+
+ANGLE, DISTANCE = "angle_to_nearest", "distance_to_nearest"
+COUNTED = "counted"  # the share of a view's pixels that its mask does not ignore; only for views with masks
+
+
+def angles_between(directions: Array, references: Array) -> Array:
+    """Angles [V, W] in degrees between unit vectors [V, 3] and [W, 3]."""
+    # The chord is accurate near an angle of 0, the arc cosine is not.
+    chords = np.linalg.norm(directions[:, None] - references[None], axis=-1)
+    return 2 * np.degrees(np.arcsin(np.clip(chords / 2, 0.0, 1.0)))
+
+
+def nearest_training_cameras(
+    cameras: Sequence[Camera], training: Sequence[Camera], extent: float
+) -> list[dict[str, float]]:
+    """Measure how far each camera is from the training camera nearest in angle, and from the one nearest in position.
+
+    ``angle_to_nearest`` is the smallest angle between the viewing directions, in degrees. ``distance_to_nearest`` is
+    the smallest distance between the centres, in scene extents; it is left out if the extent is 0.
+    """
+    if not cameras or not training:
+        return [{} for _ in cameras]
+    directions, training_directions = (
+        np.array([camera.rotation[2] for camera in group]) for group in (cameras, training)
+    )
+    centers, training_centers = (np.array([camera.center for camera in group]) for group in (cameras, training))
+    angles = angles_between(directions, training_directions).min(axis=1)  # [V]
+    distances = np.linalg.norm(centers[:, None] - training_centers[None], axis=-1).min(axis=1)  # [V]
+    measured = []
+    for angle, distance in zip(angles, distances, strict=True):
+        values = {ANGLE: float(angle)}
+        if extent > 0:
+            values[DISTANCE] = float(distance) / extent
+        measured.append(values)
+    return measured

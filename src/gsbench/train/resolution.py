@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 
 from gsbench.densify import Refinement
 from gsbench.events import RefineEvent
-from gsbench.scene.camera import Camera
-from gsbench.scene.masks import resize_mask
-from gsbench.scene.types import View
+from gsbench.scene.images import resize_mask
+from gsbench.scene.types import Camera, View
 from gsbench.train.options import TrainConfig
 from gsbench.train.views import Targets
 

@@ -16,8 +16,7 @@ from gsbench.gaussians.initial import gaussians_from_cloud
 from gsbench.gaussians.model import MAX_SH_DEGREE, Gaussians, rgb_to_dc
 from gsbench.gaussians.paper_values import VOLUME_THRESHOLD
 from gsbench.raster.base import Rasterizer, RenderOutput
-from gsbench.scene.camera import Camera
-from gsbench.scene.types import View
+from gsbench.scene.types import Camera, View
 from gsbench.view.trials import ViewedTrial
 
 DIMMED = 0.35  # brightness of the render behind Gaussians coloured by their causes

@@ -19,8 +19,7 @@ from gsbench.errors import InputError
 from gsbench.events import Cause
 from gsbench.gaussians.model import MAX_SH_DEGREE
 from gsbench.gaussians.paper_values import VOLUME_THRESHOLD
-from gsbench.scene.camera import Camera
-from gsbench.scene.types import View
+from gsbench.scene.types import Camera, View
 from gsbench.view.picture import Layers, Picture, TrialPainter, photograph_at, side_by_side
 from gsbench.view.visitors import refuse_other_pages
 

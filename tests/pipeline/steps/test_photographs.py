@@ -17,7 +17,7 @@ from gsbench.pipeline.steps import scene as scene_steps
 from gsbench.pipeline.steps.scene import CaptureSource, Views, ground_truth_step, masked_capture, masking_step
 from gsbench.runs.keys import INIT, Step
 from gsbench.runs.store import Store
-from gsbench.scene.masks import read_mask
+from gsbench.scene.images import read_mask
 from gsbench.scene.options import SceneConfig
 from gsbench.scene.readers import read_photos
 from gsbench.scene.types import Capture, Scene

@@ -18,7 +18,7 @@ from gsbench.init.colmap.reconstruct import load_reference, select_pairs
 from gsbench.init.networks.extractors import build_extractor, build_matcher, extract_features, match
 from gsbench.init.networks.features import Features, FeatureSettings, FeatureStore
 from gsbench.logs import Progress
-from gsbench.scene.masks import read_mask
+from gsbench.scene.images import read_mask
 from gsbench.scene.types import Capture
 from gsbench.words import some_of
 

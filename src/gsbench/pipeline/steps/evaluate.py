@@ -29,10 +29,8 @@ from gsbench.raster import Rasterizer
 from gsbench.runs.keys import EVALUATE, Step
 from gsbench.runs.layout import ELLIPSOIDS, FIGURES, LINEAGE, METRICS, PER_VIEW, POINT_CLOUD, RENDERS
 from gsbench.runs.trial_record import Earlier, Evaluation
-from gsbench.scene.camera import COUNTED, nearest_training_cameras
-from gsbench.scene.images import read_image
-from gsbench.scene.names import png_name
-from gsbench.scene.types import Scene
+from gsbench.scene.images import png_name, read_image
+from gsbench.scene.types import COUNTED, Scene, nearest_training_cameras
 from gsbench.train.trainer import snapshot_file
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ from gsbench.densify.volumetric import log_volume
 from gsbench.events import Cause
 from gsbench.gaussians.model import Gaussians
 from gsbench.raster.reference import project
-from gsbench.scene.camera import Camera
+from gsbench.scene.types import Camera
 
 OUTLINE_POINTS = 48
 MAX_OUTLINES = 1500  # of the most voluminous Gaussians; more outlines would hide the picture

@@ -21,10 +21,8 @@ from gsbench.runs.made_of import PYCOLMAP, version_of
 from gsbench.runs.store import Store
 from gsbench.scene.colmap import write_frames
 from gsbench.scene.courtyard.render import render_courtyard
-from gsbench.scene.images import image_size
+from gsbench.scene.images import IMAGES, image_size, png_name, prepare_photograph, prepared_mask, write_mask
 from gsbench.scene.load import load_scene
-from gsbench.scene.masks import IMAGES, prepare_photograph, prepared_mask, write_mask
-from gsbench.scene.names import png_name
 from gsbench.scene.options import Backdrop, SceneConfig, check_final_size
 from gsbench.scene.readers import (
     SPARSE_FOLDERS,

@@ -25,7 +25,7 @@ from gsbench.raster.cpu.projection import BAD_VALUE, VISIBLE, backproject_shards
 from gsbench.raster.cpu.shuffle import REST
 from gsbench.raster.cpu.workspace import HEADROOM, Arena, ArenaPool, ShardRunner, TensorPool
 from gsbench.raster.staged import Gradients, Lifetime, RenderRequest, StagedRasterizer, raise_for_values
-from gsbench.scene.camera import Camera
+from gsbench.scene.types import Camera
 from gsbench.system.resources import available_cores
 
 # Fixed numbers, so that results have the same bits for any number of threads. Each shard of tiles sums gradients in its

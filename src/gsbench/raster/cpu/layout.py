@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from gsbench.raster.base import projection_numbers
 from gsbench.raster.cpu.simd import LANES, SUM_LANES
-from gsbench.scene.camera import Camera
+from gsbench.scene.types import Camera
 
 TILE = 16  # px; a tile is 4x4 blocks, row by row. Fixed by the 16-bit masks; must equal RasterConstants.tile
 TILE_PIXELS = TILE * TILE

@@ -28,7 +28,7 @@ from gsbench.raster.triton.layout import (
 )
 from gsbench.raster.triton.lists import Lists, Projected, Units, find_all_units, make_lists
 from gsbench.raster.triton.projection import backproject, project, sum_units
-from gsbench.scene.camera import Camera
+from gsbench.scene.types import Camera
 
 
 @dataclass

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import triton.language as tl
 
 from gsbench.raster.base import CONSTANTS, projection_numbers
-from gsbench.scene.camera import Camera
+from gsbench.scene.types import Camera
 
 # One program of one warp composites one block: half a tile of 3DGS, four pixels per lane. Lane l has row
 # l // LANE_COLUMNS, and in it every LANE_COLUMNS-th pixel from column l % LANE_COLUMNS on.

@@ -14,9 +14,9 @@ from PIL import Image
 
 from gsbench.errors import InputError
 from gsbench.logs import Progress, no_progress
-from gsbench.scene.camera import Camera
 from gsbench.scene.courtyard.kernels import render
 from gsbench.scene.courtyard.layout import Layout, build_layout
+from gsbench.scene.types import Camera
 
 VERSION = 1  # to be raised when the images change
 MAX_STEP = radians(7.5)  # between neighbouring views; wider steps gave wrong SfM models on scenes like this one

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gsbench.scene.camera import Camera
+from gsbench.scene.types import Camera
 from tests.scene.cameras import looking
 
 SOUND: dict[str, Any] = {
