@@ -21,7 +21,7 @@ from gsbench.gaussians.ply import write_ply
 from gsbench.launch.record import add_to_plan
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.stopping import Stopped
-from gsbench.verbs import doctor, retry, ui
+from gsbench.verbs import load_verb, machine, servers, trials
 from tests.finished import write_results
 from tests.gaussians.helpers import random_gaussians
 
@@ -38,9 +38,8 @@ def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.mark.parametrize("verb", list(cli.VERBS))
 def test_every_verb_has_help_without_torch(verb: str, tmp_path: Path) -> None:
-    module = importlib.import_module(f"gsbench.verbs.{verb}")
     with pytest.raises(SystemExit) as done:
-        module.main(["--help"], tmp_path)
+        load_verb(verb)(["--help"], tmp_path)
     assert done.value.code == 0
 
 
@@ -139,7 +138,7 @@ def test_retry_runs_the_unfinished_with_their_own_settings(
 def test_retry_of_a_trial_without_a_plan_takes_its_own_configuration(runs: Path) -> None:
     folders = make_experiment(runs)
     (runs / "x" / "plan.json").unlink()
-    again = retry.recompose(folders[1], None, runs, [], str(runs.parent))
+    again = trials.recompose(folders[1], None, runs, [], str(runs.parent))
     assert TrialFolder.of(again.values).path == folders[1]
     assert again.values == compose_one(["name=x", "densify=adc", "seed=1"]).values
 
@@ -215,34 +214,34 @@ def test_ui_serves_on_this_machine_only(monkeypatch: pytest.MonkeyPatch) -> None
             return 0
 
     monkeypatch.setattr(subprocess, "Popen", Server)
-    monkeypatch.setattr(ui, "end_descendants", lambda: None)
-    assert ui.serve("sqlite:///x.db", 1234) == 0
+    monkeypatch.setattr(servers, "end_descendants", lambda: None)
+    assert servers.serve("sqlite:///x.db", 1234) == 0
     assert commands[0][commands[0].index("--host") + 1] == "127.0.0.1"
 
 
 def test_doctor_names_the_packages_that_triton_compiles_with(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(doctor, "version_of", lambda package: "3.7.1")
+    monkeypatch.setattr(machine, "version_of", lambda package: "3.7.1")
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.delenv("CC", raising=False)
-    (finding,) = doctor.check_triton()
+    (finding,) = machine.check_triton()
     assert finding.verdict == "note"
     assert "a C compiler: install the package gcc" in finding.text
     (tmp_path / "gcc").write_text("")
     (tmp_path / "gcc").chmod(0o755)
     monkeypatch.setattr("sysconfig.get_paths", lambda scheme: {"include": str(tmp_path)})
-    (finding,) = doctor.check_triton()
+    (finding,) = machine.check_triton()
     version = f"{sys.version_info.major}.{sys.version_info.minor}"
     assert f"Python.h: install the package python{version}-dev" in finding.text
     (tmp_path / "Python.h").write_text("")
-    assert not list(doctor.check_triton())
+    assert not list(machine.check_triton())
     monkeypatch.setenv("CC", "nosuchcc -O2")
-    (finding,) = doctor.check_triton()
+    (finding,) = machine.check_triton()
     assert "CC is nosuchcc -O2, which is not there" in finding.text
 
 
 def test_doctor_on_a_runs_folder(runs: Path) -> None:
-    assert next(doctor.check_runs(runs)).verdict in ("ok", "note")
-    assert next(doctor.check_runs(Path("/proc/nowhere"))).verdict == "bad"
+    assert next(machine.check_runs(runs)).verdict in ("ok", "note")
+    assert next(machine.check_runs(Path("/proc/nowhere"))).verdict == "bad"
 
 
 def test_a_stop_while_a_native_module_is_imported_is_told_as_a_stop(

@@ -289,7 +289,7 @@ def test_glob_lists_the_options_of_a_group() -> None:
 
 
 def test_report_writes_into_a_folder_as_tables_does(place: Path) -> None:
-    from gsbench.verbs.report import file_at
+    from gsbench.verbs.results import file_at
 
     (place / "folder.html").mkdir()
     assert file_at(Path("a/page.html"), "x") == Path("a/page.html")

@@ -9,17 +9,14 @@ INTERRUPTED = 130  # 128 + SIGINT, as shells count
 
 # The imports are in the block, because a Ctrl-C during them would otherwise print a traceback.
 try:
-    import importlib
     import os
-    from collections.abc import Callable
-    from pathlib import Path
 
     from gsbench import __version__
     from gsbench.errors import GsbenchError, InputError
     from gsbench.files import checked_runs_folder, storage_errors
     from gsbench.logs import printable_output, set_up_logging
     from gsbench.system.own_modules import SAFE_PATH
-    from gsbench.verbs import VERBS
+    from gsbench.verbs import VERBS, load_verb
     from gsbench.words import did_you_mean
 except KeyboardInterrupt:
     print("gsbench: stopped before it began", file=sys.stderr)
@@ -86,11 +83,6 @@ def _refuse(error: GsbenchError, code: int) -> int:
     return code
 
 
-def runs_dir() -> Path:
-    """The runs folder of the verbs: ``$GSBENCH_RUNS``, else ``runs`` in the current folder."""
-    return checked_runs_folder(os.environ.get("GSBENCH_RUNS", "runs"))
-
-
 def _verb(name: str, argv: list[str]) -> int:
     if name not in VERBS:
         from gsbench.config.command_words import hint_for
@@ -99,10 +91,9 @@ def _verb(name: str, argv: list[str]) -> int:
             f"{name!r} is neither a verb nor a setting like key=value"
             f"{hint_for(name) or did_you_mean(name, list(VERBS))} (verbs: {', '.join(VERBS)})"
         )
-    main_function: Callable[[list[str], Path], int] = importlib.import_module(f"gsbench.verbs.{name}").main
-    runs = runs_dir()
+    verb, runs = load_verb(name), checked_runs_folder(os.environ.get("GSBENCH_RUNS", "runs"))
     with storage_errors(runs):
-        return main_function(argv, runs)
+        return verb(argv, runs)
 
 
 USAGE = """\
@@ -138,7 +129,7 @@ def _help(words: list[str]) -> int:
     folders = searched_folders(parse(words)[0])  # the choices in the user's folders are listed too
     print(USAGE)
     print("Verbs (gsbench VERB --help):")
-    for name, text in VERBS.items():
+    for name, (_, text) in VERBS.items():
         print(f"  {name:<10} {text}")
     print("\n" + options_text(folders))
     return DONE

@@ -8,13 +8,13 @@ import pytest
 
 from gsbench.analysis.explain import explain_cell
 from gsbench.errors import InputError
-from gsbench.verbs import explain as verb
+from gsbench.verbs.results import explain
 from tests.analysis.synthetic import Plan, write_runs
 
 
 def test_a_cell_names_its_trials_hashes_and_versions(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     paths = write_runs(tmp_path, Plan(experiment="table1", inits=("dim",), scenes=("garden",)))
-    assert verb.main(["table1:garden:lpips:volumetric"], tmp_path) == 0
+    assert explain(["table1:garden:lpips:volumetric"], tmp_path) == 0
     text = capsys.readouterr().out
     for path in paths:
         assert (str(path) in text) == ("volumetric" in str(path))

@@ -18,7 +18,7 @@ from gsbench.analysis.results import load_experiment
 from gsbench.analysis.table_formats import Table, to_latex
 from gsbench.errors import InputError
 from gsbench.runs.declaration import Arm
-from gsbench.verbs import tables
+from gsbench.verbs.results import tables
 from tests.analysis.synthetic import write_arms
 from tests.analysis.test_attribution import densifier
 
@@ -159,16 +159,16 @@ def test_the_sheet_stands_before_the_verdicts_numbers_in_the_report(tmp_path: Pa
 def test_the_verb_writes_a_sheet_for_each_pair_in_every_format(
     tmp_path: Path, paths: list[Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert tables.main(["exp", "--layout", "fairness"], tmp_path) == 0
+    assert tables(["exp", "--layout", "fairness"], tmp_path) == 0
     assert "### Fairness sheet: sfm-longaxis against sfm-adc" in capsys.readouterr().out
     for format_name, suffix in (("latex", "tex"), ("csv", "csv"), ("html", "html")):
         out = tmp_path / "out"
-        assert tables.main(["exp", "--layout", "fairness", "--format", format_name, "--out", str(out)], tmp_path) == 0
+        assert tables(["exp", "--layout", "fairness", "--format", format_name, "--out", str(out)], tmp_path) == 0
         assert (out / f"exp-fairness-sfm-longaxis-sfm-adc.{suffix}").stat().st_size > 500
     one = tmp_path / "one"
     write_arms(one, {"adc": densifier("adc")})
     with pytest.raises(InputError, match="one arm"):
-        tables.main(["exp", "--layout", "fairness"], one)
+        tables(["exp", "--layout", "fairness"], one)
 
 
 def test_the_latex_has_columns_that_wrap(tmp_path: Path, paths: list[Path]) -> None:

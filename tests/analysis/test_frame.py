@@ -15,7 +15,7 @@ import pytest
 from gsbench.analysis import to_frame
 from gsbench.analysis.results import Experiment, load_experiment
 from gsbench.errors import InputError
-from gsbench.verbs import tables
+from gsbench.verbs.results import tables
 from tests.analysis.test_tables import one_trial
 
 Make = Callable[..., Experiment]
@@ -61,14 +61,12 @@ def test_the_csv_of_trials_reads_back_as_the_frame(
     make_experiment: Make, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     frame = to_frame(make_experiment())
-    assert tables.main(["exp", "--format", "trials"], tmp_path) == 0
+    assert tables(["exp", "--format", "trials"], tmp_path) == 0
     again = pd.read_csv(io.StringIO(capsys.readouterr().out))
     assert again.columns.tolist() == frame.columns.tolist()
     for name in ("psnr", "flip", "seconds_train"):
         np.testing.assert_array_equal(again[name], frame[name])
-    assert (
-        tables.main(["exp", "--format", "trials", "--where", "seed=1", "--out", str(tmp_path / "out")], tmp_path) == 0
-    )
+    assert tables(["exp", "--format", "trials", "--where", "seed=1", "--out", str(tmp_path / "out")], tmp_path) == 0
     assert len(pd.read_csv(tmp_path / "out" / "exp-trials.csv")) == 4
     with pytest.raises(InputError, match="takes no --metrics"):
-        tables.main(["exp", "--format", "trials", "--metrics", "psnr"], tmp_path)
+        tables(["exp", "--format", "trials", "--metrics", "psnr"], tmp_path)

@@ -29,7 +29,7 @@ from gsbench.analysis.tables import build_table
 from gsbench.errors import InputError
 from gsbench.eval.facts import find_metric
 from gsbench.system.install import conf_dir
-from gsbench.verbs import tables
+from gsbench.verbs.results import tables
 from tests.analysis.synthetic import Plan, write_runs
 from tests.analysis.test_tables import one_trial, texts
 
@@ -154,14 +154,14 @@ def test_an_experiment_without_the_papers_arms_is_refused(make_experiment: Calla
 def test_the_verb_prints_and_writes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     runs = tmp_path / "runs"
     write_runs(runs, Plan(experiment="table1", inits=("dim",), scenes=("garden",)))
-    assert tables.main(["table1"], runs) == 0
+    assert tables(["table1"], runs) == 0
     out = capsys.readouterr().out
     assert "### Table 1, measured" in out
     assert "### Table 1, difference" in out
-    assert tables.main(["table1", "--format", "latex", "--out", str(tmp_path / "out")], runs) == 0
+    assert tables(["table1", "--format", "latex", "--out", str(tmp_path / "out")], runs) == 0
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["table1-difference.tex", "table1.tex"]
-    assert tables.main(["table1", "--rows", "scene,densify", "--metrics", "psnr", "--format", "csv"], runs) == 0
-    assert tables.main(["paper"], runs) == 0
+    assert tables(["table1", "--rows", "scene,densify", "--metrics", "psnr", "--format", "csv"], runs) == 0
+    assert tables(["paper"], runs) == 0
     assert "ratio of totals" in capsys.readouterr().out
 
 
@@ -169,12 +169,12 @@ def test_the_verb_names_bad_options_and_left_out_trials(tmp_path: Path, capsys: 
     path = write_runs(tmp_path, Plan())[0]
     (path / "results.json").write_text("{")
     with pytest.raises(InputError, match="no trial has iterations=7"):
-        tables.main(["exp", "--where", "iterations=7"], tmp_path)
+        tables(["exp", "--where", "iterations=7"], tmp_path)
     assert "left out: exp/courtyard/sfm-adc/c0ffee00-seed0: damaged" in capsys.readouterr().err
     with pytest.raises(InputError, match="KEY=VALUE"):
-        tables.main(["exp", "--where", "iterations"], tmp_path)
+        tables(["exp", "--where", "iterations"], tmp_path)
     with pytest.raises(InputError, match="scene is in --rows and --columns"):
-        tables.main(["exp", "--rows", "scene", "--columns", "scene"], tmp_path)
+        tables(["exp", "--rows", "scene", "--columns", "scene"], tmp_path)
     assert load_experiment(tmp_path, "exp").trials
 
 
@@ -188,12 +188,12 @@ def test_below_the_differences_stands_what_the_paper_says_of_its_setup(
 
 def test_the_papers_own_set_up_has_the_papers_layout(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_runs(tmp_path, Plan(experiment="table1_own", inits=("dim_paper",), scenes=("garden",)))
-    assert tables.main(["table1_own"], tmp_path) == 0
+    assert tables(["table1_own"], tmp_path) == 0
     out = capsys.readouterr().out
     assert "### Table 1, measured (experiment table1_own)" in out
     assert "replace the paper's DIM" not in out  # image matching by the settings of the paper's time is the paper's DIM
     assert "| garden | dim_paper | adc |" in out
-    assert tables.main(["table1_own", "--paper", "3dgs"], tmp_path) == 0
+    assert tables(["table1_own", "--paper", "3dgs"], tmp_path) == 0
     assert "The paper on poses: it takes the cameras that come" in capsys.readouterr().out
 
 
@@ -227,7 +227,7 @@ def test_ours_stand_beside_the_printed_numbers(tmp_path: Path, capsys: pytest.Ca
     table = published_table(load_experiment(tmp_path, "exp").trials, "3dgs")
     assert texts(table) == [["garden", "sfm", "adc", "27.410", "+0.000 =", "0.868", "+0.032 ≠", "0.103", "+0.097 ≠"]]
     assert any(note.startswith("Read from github.com/nerfbaselines") for note in table.notes)
-    assert tables.main(["exp", "--paper", "3dgs"], tmp_path) == 0
+    assert tables(["exp", "--paper", "3dgs"], tmp_path) == 0
     assert "### Difference from 3dgs" in capsys.readouterr().out
 
 

@@ -26,7 +26,7 @@ from gsbench.analysis.verdicts import by_scene_lines, headline, judge_pairs
 from gsbench.errors import InputError
 from gsbench.runs.declaration import Arm
 from gsbench.runs.trial_record import Histogram
-from gsbench.verbs import report
+from gsbench.verbs.results import report
 from tests.analysis.synthetic import Plan, write_arms, write_runs
 
 ADC, VOLUMETRIC = Arm("sfm", "adc"), Arm("sfm", "volumetric")
@@ -307,7 +307,7 @@ def test_nothing_to_draw_is_an_empty_string() -> None:
 
 
 def test_the_verb_writes_the_file(runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert report.main(["exp", "--out", str(tmp_path / "sub" / "r.html")], runs) == 0
+    assert report(["exp", "--out", str(tmp_path / "sub" / "r.html")], runs) == 0
     assert (tmp_path / "sub" / "r.html").read_text().startswith("<!doctype html>")
     assert str(tmp_path / "sub" / "r.html") in capsys.readouterr().out
     assert [path.name for path in (tmp_path / "sub").iterdir()] == ["r.html"]

@@ -26,7 +26,7 @@ from gsbench.gaussians.ply import write_ply
 from gsbench.raster.cpu import CpuRasterizer
 from gsbench.raster.cpu import executor as cpu_executor
 from gsbench.raster.reference import project
-from gsbench.verbs.bench import _parser, main
+from gsbench.verbs.machine import _bench_parser, bench
 from tests.benchmarks.counters import timed_kernels
 
 pytestmark = pytest.mark.slow
@@ -78,12 +78,12 @@ def test_a_rasterizer_of_the_users_own(
     )
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(tmp_path))
-    assert main(["--raster", "twice.Twice", "--size", "20x20", "--count", "9", "--repeats", "1"]) == 0
+    assert bench(["--raster", "twice.Twice", "--size", "20x20", "--count", "9", "--repeats", "1"]) == 0
     assert capsys.readouterr().out.splitlines()[1].split()[0] == "twice.Twice"
 
 
 def test_json_with_memory(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["--raster", "cpu", "--size", "40x30", "--count", "60", "--json", "--repeats", "1"]) == 0
+    assert bench(["--raster", "cpu", "--size", "40x30", "--count", "60", "--json", "--repeats", "1"]) == 0
     (row,) = json.loads(capsys.readouterr().out)
     assert row.keys() >= KEYS
     assert (row["raster"], row["size"], row["count"]) == ("cpu", "40x30", 60)
@@ -93,7 +93,7 @@ def test_json_with_memory(capsys: pytest.CaptureFixture[str]) -> None:
 def test_table_of_a_ply(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "model.ply"
     write_ply(trained_like_gaussians(70), path)
-    assert main(["--ply", str(path), "--size", "40x30", "--repeats", "1", "--no-memory"]) == 0
+    assert bench(["--ply", str(path), "--size", "40x30", "--repeats", "1", "--no-memory"]) == 0
     header, line = capsys.readouterr().out.splitlines()
     assert "forward_ms" in header
     assert line.split()[:3] == ["cpu", "40x30", "70"]
@@ -125,7 +125,7 @@ def test_the_skewed_scene_has_the_skew_of_a_trained_model() -> None:
 
 
 def test_every_scene_can_be_chosen() -> None:
-    (choice,) = (action for action in _parser()._actions if action.dest == "scene")
+    (choice,) = (action for action in _bench_parser()._actions if action.dest == "scene")
     assert tuple(choice.choices) == tuple(SCENES)
 
 
@@ -155,4 +155,4 @@ def test_bad_input(arguments: list[str], cause: str) -> None:
     if arguments[1].startswith("gsplat") and torch.cuda.is_available():
         pytest.skip("there is a GPU")
     with pytest.raises(InputError, match=cause):
-        main(arguments)
+        bench(arguments)

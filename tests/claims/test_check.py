@@ -21,7 +21,7 @@ from gsbench.config.compose import Trial, with_seed
 from gsbench.errors import InputError
 from gsbench.runs.declaration import read_declarations
 from gsbench.runs.trial_folder import TrialFolder
-from gsbench.verbs.check import describe
+from gsbench.verbs.claims import describe
 from tests.analysis.synthetic import Plan, trial_data, write_trial
 from tests.claims.test_file import GOOD, changed, without
 from tests.launch.test_declare import TINY

@@ -26,7 +26,7 @@ from gsbench.external.settings import External
 from gsbench.raster.executors import RasterConfig
 from gsbench.scene.options import SceneConfig
 from gsbench.train.options import TrainConfig
-from gsbench.verbs import VERBS
+from gsbench.verbs import VERBS, load_verb
 from gsbench.verbs.queries import QUERIES
 from tests.conftest import ROOT
 
@@ -72,7 +72,7 @@ def keys_of(group: str) -> frozenset[str]:
 @cache
 def options_of(verb: str) -> frozenset[str]:
     with contextlib.redirect_stdout(io.StringIO()) as text, contextlib.suppress(SystemExit):
-        importlib.import_module(f"gsbench.verbs.{verb}").main(["--help"], Path("runs"))
+        load_verb(verb)(["--help"], Path("runs"))
     return frozenset(re.findall(r"(?<![\w-])--?[a-z][a-z-]*", text.getvalue()))
 
 

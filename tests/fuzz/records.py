@@ -36,7 +36,7 @@ from gsbench.launch.states import states_of_experiment
 from gsbench.runs.declaration import read_declarations
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.tracking.trial import TrackedTrial, read_state
-from gsbench.verbs.status import lines_of
+from gsbench.verbs.trials import lines_of
 from tests.finished import record_of
 from tests.fuzz.corrupt import corrupt
 

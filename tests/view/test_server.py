@@ -20,7 +20,7 @@ from gsbench.events import Cause
 from gsbench.gaussians.initial import gaussians_from_cloud
 from gsbench.raster import create_rasterizer
 from gsbench.system.install import install_command
-from gsbench.verbs import view as verb
+from gsbench.verbs import servers
 from gsbench.view.picture import Layers, TrialPainter
 from gsbench.view.server import Session, Viewer, check_port, free_port
 from gsbench.view.trials import find_trial, load_viewed, read_causes
@@ -184,9 +184,9 @@ def test_what_cannot_be_viewed_is_said(small_runs: Path, tmp_path: Path) -> None
 def test_without_viser_the_mend_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(InputError, match=re.escape(install_command("view"))):
-        verb.main(["a:b:c"], Path())
+        servers.view(["a:b:c"], Path())
     with pytest.raises(InputError, match="one or two"):
-        verb.main(["a:b:c"] * 3, Path())
+        servers.view(["a:b:c"] * 3, Path())
 
 
 def test_a_port_in_use_is_said() -> None:

@@ -8,6 +8,7 @@ mean. Studies are pooled only if their protocols agree.
 
 import math
 import tempfile
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -81,6 +82,15 @@ def pool(studies: Sequence[Study]) -> Pooled:
     return Pooled(tuple(studies), refusal, None if refusal else t_test(effects))
 
 
+def markdown_table(pooled: Pooled) -> list[str]:
+    """The studies as lines of a Markdown table."""
+    lines = ["| study | difference | 95 % interval | protocol |", "|---|---|---|---|"]
+    for study in pooled.studies:
+        interval = "unknown" if study.interval is None else f"{study.interval.low:+.4g} to {study.interval.high:+.4g}"
+        lines.append(f"| {study.name} | {study.effect:+.4g} | {interval} | {study.protocol} |")
+    return lines
+
+
 def describe(pooled: Pooled) -> list[str]:
     """The result of pooling in sentences."""
     test = pooled.test
@@ -122,6 +132,39 @@ class ArchiveStudies:
     studies: tuple[Study, ...]
     notes: tuple[str, ...] = ()
     trials: frozenset[str] = frozenset()
+
+
+def pool_sources(
+    sources: Sequence[Path], wanted: PooledQuestion, protocol: str | None = None
+) -> tuple[Pooled, list[str], list[str]]:
+    """Pool all studies in ``sources``: (their mean, notes on them, a line for each source or study that is left out).
+
+    Raises InputError if no study is left.
+    """
+    studies, notes, faults = [], list[str](), list[str]()
+    seen: dict[str, Path] = {}
+    stems = Counter(source.stem for source in sources)
+    for source in sources:
+        try:
+            archive = read_studies(source, wanted, source.stem if stems[source.stem] == 1 else str(source))
+        except InputError as error:
+            faults.append(f"left out: {error}")
+            continue
+        if twice := archive.trials & seen.keys():
+            faults.append(f"left out: {source} has trials that {seen[min(twice)]} has, and they would count twice")
+            continue
+        seen |= dict.fromkeys(archive.trials, source)
+        notes += archive.notes
+        for study in archive.studies:
+            if protocol is not None and study.protocol != protocol:
+                notes.append(f"{study.name}: not asked for, it is by {study.protocol}")
+            elif study.interval is None:
+                faults.append(f"left out: {study.name} has one pair of trials: nothing tells how sure it is")
+            else:
+                studies.append(study)
+    if not studies:
+        raise InputError((faults or notes)[0].removeprefix("left out: "))
+    return pool(studies), notes, faults
 
 
 def read_studies(path: Path, question: PooledQuestion, name: str) -> ArchiveStudies:

@@ -21,7 +21,7 @@ LOCK = ".fetch.lock"
 PATIENCE = RetryPolicy()
 
 
-def main(argv: Sequence[str], runs: Path) -> int:
+def fetch(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: 0 if all requested scenes are here."""
     catalog = read_catalog()
     options = _parser(list(catalog)).parse_args(argv)

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from gsbench.verbs import doctor
-from gsbench.verbs.doctor import Finding
+from gsbench.verbs import machine
+from gsbench.verbs.machine import Finding
 from tests.conftest import ROOT
 
 GB = 10**9
@@ -23,14 +23,14 @@ def said(findings: Iterable[Finding]) -> list[tuple[str, str]]:
 
 
 def of_devices(topic: str) -> list[Finding]:
-    return [finding for finding in doctor.check_devices() if finding.topic == topic]
+    return [finding for finding in machine.check_devices() if finding.topic == topic]
 
 
 @pytest.fixture
 def no_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.setattr(torch.version, "cuda", None)
-    monkeypatch.setattr(doctor, "installed_gpus", list)
+    monkeypatch.setattr(machine, "installed_gpus", list)
 
 
 @pytest.fixture
@@ -53,12 +53,12 @@ def test_gpus_with_their_memory(gpus: None, monkeypatch: pytest.MonkeyPatch) -> 
 def test_every_extra_is_known() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     extras = set(project["optional-dependencies"]) - {"dev", "docs"}
-    assert {extra for _, extra in doctor.OPTIONAL.values()} == extras
+    assert {extra for _, extra in machine.OPTIONAL.values()} == extras
 
 
 def test_no_gpu_and_why(no_gpu: None, monkeypatch: pytest.MonkeyPatch) -> None:
     assert said(of_devices("gpu")) == [("note", "none (this torch is a build for CPUs): raster=auto uses the CPU")]
-    monkeypatch.setattr(doctor, "installed_gpus", lambda: ["0"])
+    monkeypatch.setattr(machine, "installed_gpus", lambda: ["0"])
     ((verdict, text),) = said(of_devices("gpu"))
     assert verdict == "note"
     assert "1 NVIDIA GPU here, but this torch is a build for CPUs" in text
@@ -85,20 +85,20 @@ def test_rasterizers_on_a_gpu(gpus: None, monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_triton_that_is_too_old_is_said_with_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(doctor, "version_of", lambda package: "3.3.1")
+    monkeypatch.setattr(machine, "version_of", lambda package: "3.3.1")
     monkeypatch.setattr(importlib.metadata, "version", lambda package: "3.3.1")
-    ((verdict, text),) = said(doctor.check_triton())
+    ((verdict, text),) = said(machine.check_triton())
     assert verdict == "note"
     assert "needs triton 3.4 or newer, and 3.3.1 is installed" in text
     assert "torch>=2.8" in text
 
 
 def test_the_whole_of_it_on_this_machine(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    doctor.main([], tmp_path / "runs")
+    machine.doctor([], tmp_path / "runs")
     lines = capsys.readouterr().out.splitlines()
     topics = {line.split()[1] for line in lines}
     assert {"gsbench", "python", "torch", "gpu", "rasterizer", "runs", "weights"} <= topics
     assert all(line.split()[0] in ("ok", "note", "bad") for line in lines)
-    for module in doctor.OPTIONAL:
+    for module in machine.OPTIONAL:
         (line,) = (line for line in lines if line.split()[1] == module)
         assert ("not installed" in line) == (importlib.util.find_spec(module) is None)

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from gsbench.errors import InputError
-from gsbench.verbs.plan import main
+from gsbench.verbs.claims import plan
 from tests.analysis.synthetic import Plan, write_runs
 
 
@@ -20,7 +20,7 @@ def runs(tmp_path: Path) -> Path:
 
 
 def test_it_names_designs_that_suffice(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["exp", "--metric", "psnr", "--difference", "0.2"], runs) == 0
+    assert plan(["exp", "--metric", "psnr", "--difference", "0.2"], runs) == 0
     out = capsys.readouterr().out
     assert "sfm-volumetric against sfm-adc" in out
     assert "(from 9 pairs on 3 scenes)" in out
@@ -28,7 +28,7 @@ def test_it_names_designs_that_suffice(runs: Path, capsys: pytest.CaptureFixture
 
 
 def test_one_scene_does_not_speak_of_others(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["one"], runs) == 0
+    assert plan(["one"], runs) == 0
     assert "run pilot trials on a second scene" in capsys.readouterr().out
 
 
@@ -44,4 +44,4 @@ def test_one_scene_does_not_speak_of_others(runs: Path, capsys: pytest.CaptureFi
 )
 def test_bad_input_is_refused(runs: Path, words: list[str], message: str) -> None:
     with pytest.raises(InputError, match=message):
-        main(words, runs)
+        plan(words, runs)

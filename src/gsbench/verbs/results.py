@@ -1,4 +1,4 @@
-"""``gsbench tables``: print or write the tables of an experiment, from its result files."""
+"""Verbs that show an experiment's results from its files: ``gsbench tables``, ``report`` and ``explain``."""
 
 import argparse
 import re
@@ -7,8 +7,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from gsbench.analysis.cells import select_trials, to_frame, with_variants
+from gsbench.analysis.explain import ADDRESS, explain_cell
 from gsbench.analysis.fairness import fairness_table
 from gsbench.analysis.notes import compared_pairs
+from gsbench.analysis.pairing import BASELINE
 from gsbench.analysis.paper import PAPER_TABLES, layout_of, load_paper, paper_tables, published_names, published_table
 from gsbench.analysis.results import Arm, Experiment, TrialResult, load_experiment
 from gsbench.analysis.table_formats import FORMATS
@@ -20,11 +22,13 @@ from gsbench.verbs.arguments import ArgumentParser, add_where, names, path
 TRIALS = "trials"
 FAIRNESS = "fairness"
 PAPER_NOTES = "paper"  # `gsbench tables paper` shows the paper's own inconsistencies
+REPORT_NAME = "report.html"
+FILE_SUFFIXES = (".html", ".htm")  # of a report
 
 
-def main(argv: Sequence[str], runs: Path) -> int:
+def tables(argv: Sequence[str], runs: Path) -> int:
     """Run the verb; raises InputError for bad input."""
-    options = _parser().parse_args(argv)
+    options = _tables_parser().parse_args(argv)
     options.format = options.format or _format_of(options.out)
     if options.experiment == PAPER_NOTES and not (runs / PAPER_NOTES).exists():
         print("\n".join(f"- {line}" for line in load_paper().contradictions))
@@ -91,7 +95,7 @@ def _as_file(arm: Arm) -> str:
     return re.sub(r"[^\w.=-]+", "_", str(arm))
 
 
-def _parser() -> ArgumentParser:
+def _tables_parser() -> ArgumentParser:
     parser = ArgumentParser(
         prog="gsbench tables",
         description="Tables of an experiment, from its result files; `gsbench tables paper` lists where the paper's "
@@ -151,3 +155,44 @@ def _write(texts: Mapping[str, str], out: Path | None, name: str) -> None:
         with writable_output(file):
             write_text(file, text)
         print(file)
+
+
+def report(argv: Sequence[str], runs: Path) -> int:
+    """Run the verb; raises InputError for bad input."""
+    from gsbench.analysis.report.build import build_report  # here, for a quick answer to --help
+
+    parser = ArgumentParser(prog="gsbench report", description="One HTML file with the evidence of an experiment.")
+    parser.add_argument("experiment")
+    parser.add_argument(
+        "--out", type=path, metavar="PATH", help=f"a folder or a .html file; default: {REPORT_NAME} with the experiment"
+    )
+    parser.add_argument("--baseline", help=f"the densifier to compare with ({BASELINE})")
+    options = parser.parse_args(argv)
+    experiment = load_experiment(runs, options.experiment)
+    densifiers = sorted({trial.densify for trial in experiment.trials})
+    if options.baseline is not None and options.baseline not in densifiers:
+        raise InputError(f"--baseline {options.baseline}: {experiment.name} has {', '.join(densifiers)}")
+    file = experiment.folder / REPORT_NAME if options.out is None else file_at(options.out, experiment.name)
+    for warning in experiment.warnings:
+        print(f"left out: {warning}", file=sys.stderr)
+    text = build_report(experiment, options.baseline or BASELINE)
+    with writable_output(file):
+        write_text(file, text)
+    print(file)
+    return 0
+
+
+def file_at(out: Path, experiment: str) -> Path:
+    """The file that ``--out`` means: ``out`` itself, or in a folder a file named after the experiment."""
+    is_file = out.suffix.lower() in FILE_SUFFIXES and not out.is_dir()
+    return out if is_file else out / f"{experiment}-{REPORT_NAME}"
+
+
+def explain(argv: Sequence[str], runs: Path) -> int:
+    """Run the verb; raises InputError for bad input."""
+    parser = ArgumentParser(
+        prog="gsbench explain", description="The runs, settings, data and code versions behind a cell of a table."
+    )
+    parser.add_argument("cell", metavar="CELL", help=f"a number of a table: {ADDRESS}")
+    print(explain_cell(parser.parse_args(argv).cell, runs))
+    return 0

@@ -1,0 +1,322 @@
+"""Verbs that answer whether an idea helps: ``gsbench check``, ``plan`` and ``ablate`` (docs/claims.md)."""
+
+import argparse
+import math
+import tempfile
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from gsbench.analysis.cells import with_variants
+from gsbench.analysis.pairing import BASELINE, choose_pairs, pair
+from gsbench.analysis.planning import Components, designs_needed, estimate_components
+from gsbench.analysis.quantities import Quantity, quantity
+from gsbench.analysis.results import load_experiment, read_experiment
+from gsbench.analysis.statistics import MIN_SCENES
+from gsbench.app.command import compose_trials, run_trials
+from gsbench.claims.ablation import (
+    choose_switches,
+    declared_switches,
+    judge_runs,
+    markdown_table,
+    off_settings,
+    run_name,
+    runs_to_train,
+)
+from gsbench.claims.check import Check, prepare, recheck
+from gsbench.claims.file import ClaimsFile, read_claims
+from gsbench.claims.stopping import KeyAndSeed, run_looks
+from gsbench.config.compose import Trial
+from gsbench.config.trust import PERMISSIONS
+from gsbench.errors import InputError
+from gsbench.files import make_runs_folder, writable_output, write_text
+from gsbench.launch.batch import missing_folders, run_batch
+from gsbench.launch.dry_run import describe_plan
+from gsbench.launch.record import declare_questions
+from gsbench.runs.declaration import Question, read_declarations
+from gsbench.runs.layout import SEED
+from gsbench.settings import Switch
+from gsbench.verbs.arguments import ArgumentParser, names, path
+from gsbench.words import counted
+
+HTML = "claims.html"
+MAX_DESIGNS = 5  # combinations of scenes and seeds that `plan` shows
+DEFAULT_METRIC = "psnr"
+
+
+def check(argv: Sequence[str], runs: Path) -> int:
+    """Run the verb: 0 for any verdicts; raises InputError for bad input."""
+    parser = ArgumentParser(
+        prog="gsbench check",
+        description="Test the claims of a file (docs/claims.md): write the plan down, run trials until each claim is "
+        "decided, and write a page with the verdicts.",
+    )
+    parser.add_argument("claims", type=path, help="a YAML file, such as conf/claims/volumetric.yaml")
+    parser.add_argument(
+        "permissions",
+        nargs="*",
+        default=[],
+        metavar="allow_targets=[MINE]",
+        help="what the claims' arms may run beside gsbench; a file of claims cannot allow it",
+    )
+    parser.add_argument("--dry-run", action="store_true", help="show trials, time and what is not testable here")
+    parser.add_argument(
+        "--from",
+        dest="archive",
+        type=path,
+        metavar="ARCHIVE",
+        help="make the verdicts again from what gsbench export --results wrote; runs nothing, needs no photographs",
+    )
+    parser.add_argument("--out", type=path, metavar="PAGE", help="with --from: write the whole page, a .html file")
+    options = parser.parse_args(argv)
+    file = read_claims(options.claims)
+    if options.archive is not None:
+        if options.dry_run:
+            raise InputError("check --from runs nothing, so no other option than --out goes with it")
+        return _recheck(file, options.archive, options.out)
+    if options.out is not None:
+        raise InputError(f"--out goes with --from; what is run here writes {HTML} beside its trials")
+    check = prepare(file, runs, missing_folders, _permissions(options.permissions))
+    if options.dry_run:
+        print("\n".join(describe(check)))
+    else:
+        _run(check)
+    return 0
+
+
+def _recheck(file: ClaimsFile, archive: Path, out: Path | None) -> int:
+    """Print the verdicts by the archive's trials, and write their page to ``out`` if given; returns 0.
+
+    Raises InputError for an ``out`` of another format.
+    """
+    from gsbench.claims.page import make_page, to_html, to_text
+
+    if out is not None and out.suffix != ".html":
+        raise InputError(f"--out {out}: a page ends in .html")
+    with tempfile.TemporaryDirectory() as folder:
+        page = make_page(file, *recheck(file, archive, Path(folder)))
+        print(to_text(page), end="")
+        if out is None:
+            print("The whole page says what each verdict rests on: --out PAGE.html")
+        else:
+            with writable_output(out):
+                write_text(out, to_html(page))
+            print(out)
+    return 0
+
+
+def _permissions(words: Sequence[str]) -> Sequence[str]:
+    """The words after the file. Raises InputError for words that are no permissions."""
+    for word in words:
+        if word.split("=")[0] != PERMISSIONS:
+            raise InputError(f"{word}: settings of a check are in its file of claims; here only {PERMISSIONS}=[…]")
+    return words
+
+
+def describe(check: Check) -> list[str]:
+    """The lines of a dry run: each claim with its question or why it is not testable, the trials, and the time."""
+    file, declaration = check.file, check.declaration
+    questions = {question.name: question for question in declaration.questions}
+    lines = [f"{file.paper}: {counted(len(questions), 'claim')} to be tested"]
+    for claim in file.claims:
+        missing = declaration.missing.get(claim.id, [])
+        if claim.id not in questions:
+            lines.append(f"not testable here  {claim.id}: {claim.not_testable or '; '.join(missing)}")
+            continue
+        what = f"{claim.metric} of {claim.arm} against {claim.baseline}: {claim.direction}, by {claim.effect} at least"
+        scenes, looks = ", ".join(questions[claim.id].scenes), ", ".join(map(str, declaration.looks))
+        lines.append(f"to be tested       {claim.id}: {what}; on {scenes}; looks at {looks} seeds")
+        lines += [f"                   without {reason}" for reason in missing]
+    if not questions:
+        return lines
+    first, most = check.trials(declaration.looks[0]), check.trials(declaration.looks[-1])
+    lines.append(
+        f"{counted(len(first), 'trial')} until the first look, {len(most)} at most; "
+        f"each test may err in {100 * file.error_rate / len(questions):.3g} % of such sweeps"
+    )
+    if most:
+        lines += describe_plan(most, most[0].values["launch"]["parallel"])
+    return lines
+
+
+def _run(check: Check) -> None:
+    from gsbench.claims.page import make_page, to_html
+
+    make_runs_folder(check.runs)
+    check = replace(check, declaration=declare_questions(check.home, check.declaration))
+
+    def run(planned: Sequence[KeyAndSeed]) -> None:
+        unfinished = [trial for trial in check.to_run(planned) if trial.files.why_not_done(trial.values)]
+        if unfinished:
+            run_batch(unfinished)
+
+    verdicts = check.verdicts(run_looks(check.declaration, check.judged, run))
+    page = make_page(check.file, verdicts, check.declaration, read_declarations(check.home))
+    write_text(check.home / HTML, to_html(page))
+    for verdict in verdicts:
+        print(f"{verdict.word:<19}  {verdict.claim.id}: {verdict.reason}")
+    print(check.home / HTML)
+
+
+def plan(argv: Sequence[str], runs: Path) -> int:
+    """Run the verb; raises InputError for bad input."""
+    parser = ArgumentParser(
+        prog="gsbench plan",
+        description="From an experiment's trials: the scenes and seeds that resolve a difference with 80 % power.",
+    )
+    parser.add_argument("experiment")
+    parser.add_argument("--metric", default="psnr", help="such as psnr (the default), ssim, lpips_squeeze")
+    parser.add_argument(
+        "--difference", type=_above_zero, help="the difference to see; default: what papers count as an improvement"
+    )
+    parser.add_argument("--baseline", default=BASELINE, help=f"the densifier to compare with ({BASELINE})")
+    options = parser.parse_args(argv)
+    trials = with_variants(load_experiment(runs, options.experiment).trials)
+    metric = quantity(options.metric, trials)
+    if metric.cost:
+        raise InputError(f"--metric {options.metric}: only metrics can be planned for, not counts and times")
+    difference = options.difference or metric.worthwhile
+    if difference is None:
+        raise InputError(f"--difference is needed: {metric.name} has no usual least difference that matters")
+    pairs = choose_pairs(sorted({trial.arm for trial in trials}), options.baseline)
+    if not pairs:
+        raise InputError(f"{options.experiment} has one arm, and planning needs pairs of trials of two")
+    for baseline, arm in pairs:
+        compared = [trial for trial in trials if trial.arm in (baseline, arm)]
+        paired = pair(compared, Question(metric=metric.key, baseline=baseline, arm=arm))
+        if not paired.rows:
+            raise InputError(f"no trials of {baseline} and {arm} can be paired in {metric.name}: {paired.left_out[0]}")
+        components = estimate_components([row.arm - row.baseline for row in paired.rows])
+        print("\n".join([f"{arm} against {baseline}", *_lines(components, metric, difference)]))
+    return 0
+
+
+def _lines(components: Components, metric: Quantity, difference: float) -> list[str]:
+    digits = f".{metric.decimals + 1}f"
+    between = "" if components.between is None else f", between scenes by {components.between:{digits}}"
+    lines = [
+        f"  differences in {metric.name} vary between seeds by {components.within:{digits}}{between} "
+        f"(from {counted(components.trials, 'pair')} on {counted(components.scenes, 'scene')})"
+    ]
+    for like_these in (False, True):
+        group = f"scenes like these (from {MIN_SCENES} scenes on)" if like_these else "these scenes"
+        if like_these and components.between is None:
+            lines.append(f"  for {group}: run pilot trials on a second scene")
+            continue
+        designs = designs_needed(difference, components, like_these)
+        designs.sort(key=lambda design: (design.trials, design.scenes))
+        texts = [f"{design.scenes} × {design.seeds} ({design.trials} trials)" for design in designs[:MAX_DESIGNS]]
+        lines.append(
+            f"  to see {difference:g} on {group}, scenes × seeds: {', '.join(texts) or 'no number that can be run'}"
+        )
+    return lines
+
+
+def _above_zero(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not value > 0 or not math.isfinite(value):
+        raise argparse.ArgumentTypeError(f"must be a number above 0, got {text!r}")
+    return value
+
+
+def ablate(argv: Sequence[str], runs: Path) -> int:
+    """Run the verb: the exit code says, as a sweep's does, whether a trial failed; raises InputError for bad input."""
+    options = _ablate_parser().parse_args(argv)
+    settings = options.settings
+    words = [*settings, *([] if _names_experiment(settings) else [f"name={_default_name(settings)}"])]
+    first = _trials(words)
+    densify = _only_densifier(first)
+    declared = declared_switches(_class_switches(first[0]), first[0].values["densify"])
+    switches = choose_switches(declared, options.switches, densify)
+    by_run = {run: _trials([*words, *_words(off_settings(run, switches), first[0])]) for run in runs_to_train(switches)}
+    _check_different(by_run)
+    trials = [trial for group in by_run.values() for trial in group]
+    print(
+        f"{densify}: {counted(len(switches), 'part')} ({', '.join(switches)}), {len(by_run)} runs, "
+        f"{counted(len(trials), 'trial')}"
+    )
+    for run, group in by_run.items():
+        hashes = ", ".join(dict.fromkeys(trial.folder.name.partition(SEED)[0] for trial in group))
+        print(f"  {hashes}: {run_name(run, list(switches))}")
+    if options.dry_run:
+        print("\n".join(describe_plan(trials, trials[0].values["launch"]["parallel"])))
+        return 0
+    home = trials[0].files.home
+    code = run_trials(trials)
+    if code == 0:
+        keys = {run: {t.values["scene"]["name"]: t.files.key for t in group} for run, group in by_run.items()}
+        metric = options.metric or trials[0].values["eval"].get("primary") or DEFAULT_METRIC
+        print("\n".join(markdown_table(judge_runs(read_experiment(home).trials, keys, metric))))
+        print(f"all metrics and pictures: gsbench report {home.name}")
+    return code
+
+
+def _ablate_parser() -> ArgumentParser:
+    parser = ArgumentParser(
+        prog="gsbench ablate",
+        description="Train a densifier with its parts switched off in all combinations (docs/claims.md), and judge "
+        "each against the densifier with all of them.",
+    )
+    parser.add_argument(
+        "settings", nargs="*", metavar="KEY=VALUE", help="as of a sweep: densify=volumetric_once seed=0,1,2 …"
+    )
+    parser.add_argument(
+        "--switches", type=names, default=(), metavar="A,B", help="only these; default: all it declares"
+    )
+    parser.add_argument("--metric", help="printed; default: eval.primary, else psnr")
+    parser.add_argument("--dry-run", action="store_true", help="list the trials and their state; run nothing")
+    return parser
+
+
+def _trials(words: Sequence[str]) -> list[Trial]:
+    trials = compose_trials(words, multirun=True)
+    if trials[0].values["launch"]["stop_when_decided"]:
+        raise InputError("ablate needs all seeds of all runs: leave launch.stop_when_decided out")
+    return trials
+
+
+def _only_densifier(trials: Sequence[Trial]) -> str:
+    arms = {(trial.values["init"]["name"], trial.values["densify"]["name"]) for trial in trials}
+    if len(arms) > 1 or len({trial.files.home for trial in trials}) > 1:
+        raise InputError("ablate takes one initialiser and one densifier apart: only scene and seed may list values")
+    if len({(trial.values["scene"]["name"], trial.values["seed"]) for trial in trials}) < len(trials):
+        raise InputError("ablate: only scene and seed may list values")
+    return str(trials[0].values["densify"]["name"])
+
+
+def _class_switches(trial: Trial) -> dict[str, Switch]:
+    from gsbench.pipeline.parts import Parts
+
+    return dict(getattr(type(Parts(trial.values).trainer), "SWITCHES", {}))
+
+
+def _words(settings: dict[str, Any], first: Trial) -> list[str]:
+    """The words that give the densifier these settings; a key that it lacks needs Hydra's plus."""
+    densify = first.values["densify"]
+    return [f"{'' if key in densify else '+'}densify.{key}={_text(value)}" for key, value in settings.items()]
+
+
+def _text(value: Any) -> str:
+    return "null" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def _names_experiment(words: Sequence[str]) -> bool:
+    return any(word.startswith(("name=", "+experiment=")) for word in words)
+
+
+def _default_name(words: Sequence[str]) -> str:
+    chosen = [word.partition("=")[2] for word in words if word.startswith("densify=")]
+    return f"ablate_{chosen[-1].replace('/', '_')}" if chosen else "ablate"
+
+
+def _check_different(by_run: dict[frozenset[str], list[Trial]]) -> None:
+    """Raise InputError for two runs that are the same trial, because a switch changes nothing."""
+    seen: dict[Path, frozenset[str]] = {}
+    for run, group in by_run.items():
+        earlier = seen.setdefault(group[0].folder, run)
+        if earlier != run:
+            raise InputError(f"switching {', '.join(sorted(earlier ^ run))} changes no setting: give another VALUE")

@@ -1,0 +1,196 @@
+"""Verbs for what goes to others or comes from them: ``gsbench evaluate``, ``export``, ``pool`` and ``site``."""
+
+import logging
+import shutil
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+from gsbench.analysis.pairing import BASELINE
+from gsbench.analysis.quantities import asked_quantity
+from gsbench.analysis.results import load_experiment
+from gsbench.errors import InputError
+from gsbench.eval.protocol import PROTOCOLS
+from gsbench.files import atomic, writable_output
+from gsbench.runs.keys import INIT
+from gsbench.runs.layout import STORE
+from gsbench.settings import is_folder_name
+from gsbench.verbs.arguments import ArgumentParser, add_where, names, path
+from gsbench.view import ADDRESS
+from gsbench.words import readable_bytes
+
+DONE, LEFT_OUT = 0, 1
+BETTER = {1: ", more is better", -1: ", less is better", 0: ""}
+
+log = logging.getLogger(__name__)
+
+
+def evaluate(argv: Sequence[str], runs: Path) -> int:
+    """Run the verb: 0 if every photograph was measured."""
+    from gsbench.renders.measure import measure_renders
+
+    measure_renders(_evaluate_parser().parse_intermixed_args(argv), runs)
+    return 0
+
+
+def _evaluate_parser() -> ArgumentParser:
+    parser = ArgumentParser(
+        prog="gsbench evaluate",
+        description="Measure renders of any program against photographs, by the protocol that trials are measured by. "
+        "Names are matched, never guessed; sizes must be equal.",
+    )
+    parser.add_argument("renders", metavar="RENDERS", help="folder of pictures")
+    parser.add_argument("settings", nargs="*", metavar="KEY=VALUE", help="settings of the scene, and eval.…")
+    parser.add_argument(
+        "--truth",
+        metavar="PLACE",
+        required=True,
+        help="the photographs: a folder, a trial (folder or EXPERIMENT:SCENE:"
+        "DENSIFY), or a scene's name, whose test views are taken as a trial sees them",
+    )
+    parser.add_argument("--protocol", choices=list(PROTOCOLS), help="default: that of the trial, or paper")
+    parser.add_argument("--by-order", action="store_true", help="match sorted pictures with sorted photographs")
+    parser.add_argument(
+        "--as", dest="place", metavar="EXPERIMENT:ARM", help="enter them as a trial; ARM is a name, or INIT-NAME"
+    )
+    parser.add_argument("--seed", type=int, default=0, help="which repetition of the arm they are (0)")
+    parser.add_argument("--scene", metavar="NAME", help="with --as, where PLACE is a folder: what to call the scene")
+    parser.add_argument("--json", action="store_true", help="print a JSON object instead of a table")
+    return parser
+
+
+def export(argv: Sequence[str], runs: Path) -> int:
+    """Run the verb: 0 if the file, or folder, was written."""
+    parser = ArgumentParser(
+        prog="gsbench export",
+        description="Write a trained model for other programs; `gsbench export init TRIAL --out DIR` copies the COLMAP "
+        "model that the trial started from; `gsbench export --results EXPERIMENT` writes results, configurations and "
+        "hashes as one small archive, without pixels unless --pictures is given.",
+    )
+    parser.add_argument("--results", metavar="EXPERIMENT", help="the archive of its results (default: EXPERIMENT.zip)")
+    parser.add_argument("trial", nargs="*", metavar="TRIAL", help=f"{ADDRESS}; after the word init: its initial model")
+    parser.add_argument(
+        "--out", type=path, metavar="PATH", help="the file, or for init the folder, to write; needed for a TRIAL"
+    )
+    parser.add_argument("--pictures", action="store_true", help="with --results: the pictures of the test views, too")
+    options = parser.parse_args(argv)
+    if options.results is not None:
+        if options.trial:
+            raise InputError("export --results takes an experiment, --out and --pictures alone")
+        return export_results(options.results, runs, options.out, options.pictures)
+    if options.pictures:
+        raise InputError("--pictures goes with --results")
+    if not options.trial or options.out is None:
+        raise InputError("export needs a TRIAL and --out PATH, or --results EXPERIMENT (see gsbench export --help)")
+    from gsbench.view.trials import find_trial, model_file
+
+    is_init = len(options.trial) == 2 and options.trial[0] == "init"
+    if len(options.trial) > 1 and not is_init:
+        raise InputError(f"one TRIAL is exported, not {len(options.trial)}; for an initial model: export init TRIAL")
+    trial = find_trial(options.trial[-1], runs)
+    out = options.out
+    if out.is_dir() and not is_init:
+        raise InputError(f"--out {out} is a folder: name the file to write")
+    if not is_init:
+        check_form(out)
+    with writable_output(out):
+        if is_init:
+            export_init(trial.path.parents[3] / STORE / INIT.name / trial.record.hashes[INIT.name], out)
+        else:
+            with atomic(out, sync=False) as temporary:
+                shutil.copyfile(model_file(trial), temporary)
+    count = "the initial model" if is_init else f"{trial.record.num_gaussians:,} Gaussians"
+    size = sum(path.stat().st_size for path in ([out] if out.is_file() else out.rglob("*")))
+    print(f"{out}: {trial.label}, {count}, {readable_bytes(size)}")
+    return 0
+
+
+def export_results(name: str, runs: Path, out: Path | None, pictures: bool = False) -> int:
+    """Write the archive of an experiment's results, and warn of what is left out; returns 0."""
+    from gsbench.claims.archive import write_archive
+
+    if not is_folder_name(name):
+        raise InputError(f"{name!r} is not the name of an experiment: give that of its folder below {runs}")
+    file = Path(f"{name}.zip") if out is None else out
+    if file.is_dir():
+        file = file / f"{name}.zip"
+    with writable_output(file):
+        left_out = write_archive(load_experiment(runs, name), file, pictures)
+    for line in left_out:
+        log.warning("left out: %s", line)
+    print(f"{file}: results of {name}, {readable_bytes(file.stat().st_size)}")
+    return 0
+
+
+def check_form(out: Path) -> None:
+    """Raise InputError unless the name of the file is that of a 3DGS PLY."""
+    if not out.name.lower().endswith(".ply") or out.name.lower().endswith(".compressed.ply"):
+        raise InputError(
+            f"--out {out}: gsbench writes the 3DGS .ply, which every viewer and trainer reads (docs/other_models.md "
+            "says what makes other forms of it)"
+        )
+
+
+def export_init(entry: Path, out: Path) -> None:
+    """Copy the COLMAP model of the stage result ``entry`` to `MODEL_FOLDER` of ``out``, as 3DGS trainers read it."""
+    from gsbench.init.base import MODEL_FOLDER
+
+    model = entry / MODEL_FOLDER
+    if not model.is_dir():
+        raise InputError(f"the initial model is no longer in the store ({model}): run the trial again")
+    first = out / MODEL_FOLDER.parts[0]
+    if first.exists():
+        raise InputError(f"{first} exists already: give another --out")
+    shutil.copytree(model, out / MODEL_FOLDER)
+
+
+def pool(argv: Sequence[str], runs: Path) -> int:
+    """Run the verb: 0, or 1 if a source was left out; raises InputError if none can be read."""
+    from gsbench.claims.pooling import PooledQuestion, describe, markdown_table, pool_sources  # slow
+
+    parser = ArgumentParser(
+        prog="gsbench pool",
+        description="A mean over many archives of `gsbench export --results`, each with the same weight.",
+    )
+    parser.add_argument("sources", nargs="+", type=path, metavar="ARCHIVE")
+    parser.add_argument("--arm", type=names, required=True, help="a densifier; names it goes by, comma between")
+    parser.add_argument(
+        "--baseline", type=names, default=(BASELINE,), help=f"the densifier to compare with ({BASELINE})"
+    )
+    parser.add_argument("--metric", default="psnr", help="such as psnr (the default), ssim, lpips_vgg")
+    add_where(parser)
+    parser.add_argument("--protocol", help="only studies by this one, such as paper-1")
+    options = parser.parse_args(argv)
+    wanted = PooledQuestion(options.arm, options.baseline, options.metric, dict(options.where))
+    pooled, notes, faults = pool_sources(options.sources, wanted, options.protocol)
+    title = f"{options.arm[0]} against {options.baseline[0]}"
+    shown = asked_quantity(options.metric)
+    lines = [f"{title}, difference in {shown.name}{BETTER[shown.direction]}", "", *markdown_table(pooled), ""]
+    lines += [*describe(pooled), *notes, *faults]
+    print("\n".join(lines))
+    for fault in faults:
+        print(f"gsbench: {fault}", file=sys.stderr)
+    return LEFT_OUT if faults else DONE
+
+
+def site(argv: Sequence[str], runs: Path) -> int:
+    """Run the verb: 0, or 1 if an archive was left out; raises InputError if none can be read."""
+    from gsbench.claims.site import INDEX, write_site  # here, for a quick answer to --help
+
+    parser = ArgumentParser(
+        prog="gsbench site",
+        description="Write a static site from archives (gsbench export --results); it needs no server. It has sortable "
+        "tables of arms and scenes, all verdicts, and the report of each, with pictures if the archive has them.",
+    )
+    parser.add_argument("archives", nargs="+", type=path, metavar="ARCHIVE")
+    parser.add_argument("--out", type=path, required=True, metavar="DIR", help="the folder to write into")
+    parser.add_argument("--title", default="Results of gsbench", help="of its first page")
+    options = parser.parse_args(argv)
+    page = options.out / INDEX
+    with tempfile.TemporaryDirectory() as scratch, writable_output(page):
+        left_out = write_site(options.archives, options.out, options.title, Path(scratch))
+    for line in left_out:
+        print(f"gsbench: left out: {line}", file=sys.stderr)
+    print(page)
+    return LEFT_OUT if left_out else DONE

@@ -1,0 +1,235 @@
+"""Verbs about the trials of an experiment: ``gsbench status``, ``retry`` and ``sync``."""
+
+import json
+import logging
+import os
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from gsbench.analysis.differences import find_superseded
+from gsbench.analysis.results import TrialResult, read_experiment
+from gsbench.config.command_words import key_of, makes_other_trials, typed_permissions
+from gsbench.config.compose import Trial, compose_one
+from gsbench.config.trust import PERMISSIONS
+from gsbench.errors import GsbenchError, InputError
+from gsbench.launch.dry_run import describe_plan
+from gsbench.launch.record import PlannedTrial, forget, read_plan, remove
+from gsbench.launch.states import TrialState, states_of_experiment
+from gsbench.runs.code import module_digest
+from gsbench.runs.experiments import experiment_home, list_experiments, trial_folders
+from gsbench.runs.trial_folder import TrialFolder
+from gsbench.runs.trial_record import FROM_RENDERS
+from gsbench.system.own_modules import allow_modules
+from gsbench.tracking.follower import sync as send_missing
+from gsbench.tracking.mirror import MirrorError
+from gsbench.tracking.mlflow_sink import VARIABLE, untyped_address
+from gsbench.verbs.arguments import ArgumentParser
+from gsbench.words import counted, readable_time
+
+ORDER = ("failed", "damaged", "running", "queued", "partial", "missing", "superseded", "done")
+TRACKER = "tracking.uri"
+
+log = logging.getLogger(__name__)
+
+
+def status(argv: Sequence[str], runs: Path) -> int:
+    """Run the verb: 0 if all trials are done, running or queued, 1 if some failed or are missing."""
+    parser = ArgumentParser(prog="gsbench status", description="The state of every trial of an experiment.")
+    parser.add_argument("experiment", nargs="?", help="its name; without one, a line for each experiment")
+    parser.add_argument("--all", action="store_true", help="list the finished trials too")
+    parser.add_argument("--json", action="store_true", help="print a JSON list instead of lines")
+    parser.add_argument("--forget", action="store_true", help="remove trials from the plan that never started")
+    parser.add_argument(
+        "--forget-superseded",
+        action="store_true",
+        help="delete the folders of trials that older code made; what their stages computed stays in the store",
+    )
+    options = parser.parse_args(argv)
+    if options.experiment is None:
+        return _overview(runs)
+    home = experiment_home(runs, options.experiment)
+    trials = progress_with_superseded(home)
+    if options.forget_superseded:
+        superseded = [trial for trial in trials if trial.state == "superseded"]
+        remove(home, [trial.folder for trial in superseded])
+        for trial in superseded:
+            print(f"removed {trial.folder}: {trial.note}")
+        print(f"{counted(len(superseded), 'superseded trial')} removed")
+        return 0
+    if options.forget:
+        missing = [trial.folder for trial in trials if trial.state == "missing"]
+        forget(home, missing)
+        print(f"{counted(len(missing), 'trial')} removed from the plan")
+        return 0
+    if options.json:
+        print(json.dumps([_as_dict(trial) for trial in trials], indent=1))
+    else:
+        print("\n".join(lines_of(trials, options.all)))
+    return 0 if all(trial.state in ("done", "running", "queued", "superseded") for trial in trials) else 1
+
+
+def progress_with_superseded(home: Path) -> list[TrialState]:
+    """The state of every trial of the experiment in ``home``, with ``superseded`` for those that older code made."""
+    folders = {folder: trial.cwd for folder, trial in read_plan(home).items()}
+
+    # The user's modules are read in the folder where the trial's command was given: another may have a namesake.
+    def present_digest(module: str, trial: TrialResult) -> str | None:
+        return module_digest(module, folders[trial.path]) if trial.path in folders else None
+
+    reasons = find_superseded(read_experiment(home).trials, present_digest)
+    return [
+        replace(trial, state="superseded", note=reasons[trial.folder])
+        if trial.state == "done" and trial.folder in reasons
+        else trial
+        for trial in states_of_experiment(home)
+    ]
+
+
+def lines_of(trials: list[TrialState], with_done: bool) -> list[str]:
+    """A line for each trial that is not done (or for each, ``with_done``), and a summary."""
+    lines = []
+    for state in ORDER:
+        if state == "done" and not with_done:
+            continue
+        for trial in trials:
+            if trial.state == state:
+                lines.append(f"{state:<8} {trial.label:<50} {_age(trial):>12}  {trial.note}".rstrip())
+    lines.append(summary_of(trials))
+    return lines
+
+
+def summary_of(trials: list[TrialState]) -> str:
+    """The number of trials in each state, in one line."""
+    counts = {state: sum(trial.state == state for trial in trials) for state in reversed(ORDER)}
+    return f"{counted(len(trials), 'trial')}: " + ", ".join(
+        f"{count} {state}" for state, count in counts.items() if count
+    )
+
+
+def _overview(runs: Path) -> int:
+    names = list_experiments(runs)
+    if not names:
+        print(f"no experiment in {runs} yet")
+    for name in names:
+        print(f"{name:<20} {summary_of(progress_with_superseded(runs / name))}")
+    return 0
+
+
+def _age(trial: TrialState) -> str:
+    """``for 5 min`` for a state that lasts, ``5 min ago`` for a final one."""
+    if trial.since is None:
+        return ""
+    time_since = readable_time(max(0.0, time.time() - trial.since))
+    return f"for {time_since}" if trial.state in ("running", "queued") else f"{time_since} ago"
+
+
+def _as_dict(trial: TrialState) -> dict[str, object]:
+    return {"folder": str(trial.folder), "state": trial.state, "since": trial.since, "note": trial.note}
+
+
+def retry(argv: Sequence[str], runs: Path) -> int:
+    """Run the verb: the exit code says, as a sweep's does, whether a trial failed."""
+    from gsbench.app.command import run_trials
+
+    parser = ArgumentParser(
+        prog="gsbench retry", description="Run the failed, stopped, damaged and missing trials of an experiment again."
+    )
+    parser.add_argument("experiment")
+    parser.add_argument(
+        "changes",
+        nargs="*",
+        default=[],
+        metavar="KEY=VALUE",
+        help="settings that do not make a different trial: launch=slurm …; allow_targets=[mine] for your own code",
+    )
+    parser.add_argument("--dry-run", action="store_true", help="only list them")
+    options = parser.parse_args(argv)
+    home = experiment_home(runs, options.experiment)
+    if refused := [change for change in options.changes if makes_other_trials(key_of(change))]:
+        raise InputError(f"{refused[0]} would make other trials than those of the plan: give the sweep's own command")
+    unfinished = [
+        trial.folder
+        for trial in states_of_experiment(home)
+        if trial.state in ("failed", "partial", "damaged", "missing")
+    ]
+    if not unfinished:
+        print(f"nothing to retry: all trials of {options.experiment} are done, running or queued")
+        return 0
+    planned = read_plan(home)
+    modules = os.getcwd()  # noted now, since `recompose` changes the current folder
+    trials = [recompose(folder, planned.get(folder), runs, options.changes, modules) for folder in unfinished]
+    _check_trackers(trials, options.changes)
+    if options.dry_run:
+        print("\n".join(describe_plan(trials, trials[0].values["launch"]["parallel"])))
+        return 0
+    replaced = [old for old, trial in zip(unfinished, trials, strict=True) if trial.folder != old]
+    for old in replaced:
+        log.info("%s: its configuration has changed since; the new one is run", TrialFolder(old).label)
+    code = run_trials(trials)
+    forget(home, [old for old in replaced if old in planned])
+    return code
+
+
+def _check_trackers(trials: Sequence[Trial], changes: Sequence[str]) -> None:
+    """Raise InputError for a trial that would send its results to a tracker which only a file names.
+
+    The runs folder may be somebody else's, and its address theirs.
+    """
+    typed_uri = next((word.partition("=")[2] for word in changes if key_of(word) == TRACKER), None)
+    for trial in trials:
+        if address := untyped_address(trial.values["tracking"], typed_uri):
+            raise InputError(
+                f"{trial.files.label} would send its results to {address}, an address from a file: to allow it, type "
+                f"{TRACKER}={address} (for a trial in no plan: set {VARIABLE}={address}); tracking=none sends nothing"
+            )
+
+
+def recompose(folder: Path, planned: PlannedTrial | None, runs: Path, changes: list[str], modules: str) -> Trial:
+    """The trial in ``folder``: from its planned overrides, else from the configuration that it wrote.
+
+    Neither gives permission to run code: ``changes`` must give it again. ``modules`` is the folder of the user's
+    modules.
+    """
+    if planned is not None:
+        if Path(planned.cwd).is_dir():
+            os.chdir(planned.cwd)  # relative paths were meant from there, and the trials are run from there
+        replaced = {PERMISSIONS, *map(key_of, changes)}
+        kept = [word for word in planned.overrides if key_of(word) not in replaced]
+        if any(change.startswith("launch=") and change not in planned.overrides for change in changes):
+            kept = [word for word in kept if not word.startswith("launch.")]  # they were meant for the other launcher
+        # Modules are not taken from planned.cwd: somebody else's plan would name a folder of theirs.
+        trial = compose_one([*kept, *changes], modules=modules)
+        return Trial(trial.values | {"runs": str(runs)}, trial.overrides)
+    files, allowed = TrialFolder(folder), typed_permissions(changes)
+    if any(key_of(change) != PERMISSIONS for change in changes):
+        raise InputError(f"{files.label} is in no plan, so no setting of it can be changed: run it by its own command")
+    allow_modules(allowed, modules)
+    values = files.configuration() | {"runs": str(runs), PERMISSIONS: list(allowed)}
+    if values["densify"].get("evaluated_from") == FROM_RENDERS:
+        raise InputError(f"{files.label} was entered from renders: give the command of `gsbench evaluate` again")
+    return Trial(values, ())
+
+
+def sync(argv: Sequence[str], runs: Path) -> int:
+    """Run the verb: 1 if the tracker cannot be reached."""
+    parser = ArgumentParser(prog="gsbench sync", description="Mirror ended trials to their tracker, once.")
+    parser.add_argument("experiment", nargs="?", help="its name; without one, all")
+    parser.add_argument(
+        "--uri",
+        help="the tracker, such as http://127.0.0.1:5000 (else $MLFLOW_TRACKING_URI, else the runs folder's own)",
+    )
+    options = parser.parse_args(argv)
+    homes = (
+        [experiment_home(runs, options.experiment)]
+        if options.experiment
+        else [runs / n for n in list_experiments(runs)]
+    )
+    try:
+        folders = [TrialFolder(Path(place)) for home in homes for place in sorted(trial_folders(home))]
+        for line in send_missing(folders, options.uri):
+            print(line, flush=True)
+    except (MirrorError, OSError) as error:
+        raise GsbenchError(f"{error}; the files are complete: try again") from error
+    return 0
