@@ -17,7 +17,7 @@ from PIL import Image
 from gsbench.errors import InputError
 from gsbench.init import MODEL_FOLDER, Dataset, Initializer, Sfm, SiftKornia, read_cloud
 from gsbench.init.base import REPORT_FILE, PointsFrom
-from gsbench.pipeline.steps.inputs import options_of
+from gsbench.runs.keys import options_of
 from gsbench.scene.colmap import read_model
 from gsbench.scene.types import Capture
 

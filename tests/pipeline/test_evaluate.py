@@ -18,13 +18,12 @@ from gsbench.eval.evaluator import Evaluator
 from gsbench.eval.protocol import PAPER
 from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.ply import write_ply
-from gsbench.pipeline.steps import inputs as inputs_module
 from gsbench.pipeline.steps.evaluate import evaluate_step, measure_speed
-from gsbench.pipeline.steps.inputs import UserCode
 from gsbench.raster import create_rasterizer
 from gsbench.raster.contract import CASES
 from gsbench.raster.reference import ReferenceRasterizer
-from gsbench.runs.keys import INIT, TRAIN, Step
+from gsbench.runs import keys
+from gsbench.runs.keys import INIT, TRAIN, Step, UserCode
 from gsbench.runs.store import Store
 from gsbench.scene.types import ANGLE, COUNTED, DISTANCE, Scene, View
 from gsbench.train.trainer import snapshot_file
@@ -58,7 +57,7 @@ def inputs(fps: list[int] | None = None, **options: Any) -> dict[str, Any]:
 
 
 def test_an_evaluation_that_asks_for_nothing_new_has_the_key_that_it_had(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(inputs_module, "edited", lambda files: {})  # as in a release
+    monkeypatch.setattr(keys, "edited", lambda files: {})  # as in a release
     old = {"train": TRAINED.key, "protocol": "paper-1", "unavailable": FOUR_LPIPS, "maps": False}
     assert inputs() == old
     assert inputs([640, 480]) == old | {"fps": [640, 480]}

@@ -9,10 +9,10 @@ import pytest
 from gsbench.config.compose import compose_one
 from gsbench.pipeline import trial as pipeline_trial
 from gsbench.pipeline.parts import Parts
-from gsbench.pipeline.steps import init as init_module
-from gsbench.pipeline.steps import inputs as inputs_module
+from gsbench.pipeline.steps import scene as scene_module
 from gsbench.pipeline.steps.scene import CaptureSource
 from gsbench.pipeline.trial import TrialSteps
+from gsbench.runs import keys
 from gsbench.runs.keys import config_hash
 from gsbench.runs.store import Store
 from gsbench.scene.types import Capture
@@ -39,10 +39,10 @@ class BareSource(CaptureSource):
 
 def test_the_keys_of_a_known_trial_stay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A photographs' trial without cameras: so the keys of the cameras that stand in for them are seen as well."""
-    monkeypatch.setattr(init_module, "version", lambda package: "4.0.0")
-    monkeypatch.setattr(inputs_module, "edited", lambda files: {})  # as in a release
+    monkeypatch.setattr(scene_module, "version", lambda package: "4.0.0")
+    monkeypatch.setattr(keys, "edited", lambda files: {})  # as in a release
     values = compose_one(WORDS).values
     monkeypatch.setattr(pipeline_trial, "CaptureSource", BareSource)
     trial = TrialSteps(Parts(values), Store(tmp_path / "store"))
-    keys = [("config", config_hash(values)), *((step.stage.name, step.key) for step in trial.steps())]
-    assert keys == KEYS
+    found = [("config", config_hash(values)), *((step.stage.name, step.key) for step in trial.steps())]
+    assert found == KEYS

@@ -16,9 +16,8 @@ from gsbench.config.compose import compose_one
 from gsbench.densify import ADC, PixelGS
 from gsbench.errors import InputError
 from gsbench.pipeline.parts import build_rasterizer, check_features
-from gsbench.pipeline.steps.inputs import rasterizer_inputs
 from gsbench.raster import create_rasterizer
-from gsbench.runs.keys import config_hash
+from gsbench.runs.keys import config_hash, rasterizer_inputs
 from tests.config.test_schema import composed
 from tests.conftest import ROOT
 

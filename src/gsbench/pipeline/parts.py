@@ -31,11 +31,11 @@ from gsbench.eval.options import EvalConfig
 from gsbench.eval.protocol import get_protocol
 from gsbench.external.settings import External
 from gsbench.init.base import Initializer
-from gsbench.pipeline.steps.inputs import UserCode
 from gsbench.raster import EXECUTORS, Rasterizer, create_rasterizer
 from gsbench.raster.executors import AUTO, offers, resolve
 from gsbench.runs.code import OWN, module_digest, unnamed_modules, user_modules
 from gsbench.runs.declaration import metric_and_question
+from gsbench.runs.keys import UserCode
 from gsbench.scene.options import SceneConfig
 from gsbench.settings import check_values, option_fields, unknown_setting
 from gsbench.system.resources import available_threads

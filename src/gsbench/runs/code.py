@@ -33,8 +33,8 @@ MODEL = ("scene", "gaussians", "densify", "raster", "train", "events.py")
 LOSS = ("eval/ssim.py", "eval/images.py", "eval/pictures.py")
 ROOMS = {
     "scene": ("scene", "init", "pipeline/steps/scene.py"),
-    "init": ("scene", "init", "gaussians", "weights.py", "pipeline/steps/init.py"),
-    "train": (*MODEL, *LOSS, "external", "pipeline/steps/train.py", "pipeline/steps/external.py"),
+    "init": ("scene", "init", "gaussians", "weights.py", "pipeline/steps/scene.py"),
+    "train": (*MODEL, *LOSS, "external", "pipeline/steps/train.py"),
     "ground_truth": ("scene", "pipeline/steps/scene.py"),
     "evaluate": (*MODEL, "eval", "weights.py", "pipeline/steps"),
 }

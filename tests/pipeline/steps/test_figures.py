@@ -10,7 +10,7 @@ from PIL import Image
 
 from gsbench.events import Cause
 from gsbench.gaussians.model import Gaussians
-from gsbench.pipeline.steps.pictures import _with_legend, draw_ellipsoids
+from gsbench.pipeline.steps.evaluate import _with_legend, draw_ellipsoids
 from tests.train.conftest import orbit_camera
 
 

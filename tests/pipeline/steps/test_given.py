@@ -19,8 +19,8 @@ from gsbench.errors import InputError, TrainingError
 from gsbench.external.settings import External
 from gsbench.gaussians.ply import write_ply
 from gsbench.init.base import MODEL_FOLDER
-from gsbench.pipeline.steps.external import external_step
-from gsbench.pipeline.steps.init import init_step
+from gsbench.pipeline.steps.scene import init_step
+from gsbench.pipeline.steps.train import external_step
 from gsbench.runs.keys import INIT, Step
 from gsbench.runs.store import Store
 from gsbench.scene.colmap import write_model

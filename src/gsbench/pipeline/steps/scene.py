@@ -1,8 +1,12 @@
-"""The photographs of a trial: read from the user's folder, masked, resized to views, and the test views kept as PNG."""
+"""The photographs of a trial and its initial cloud.
+
+Photographs are read from the user's folder, masked, and resized to views; the test views are kept as PNG.
+"""
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import cache, cached_property
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -10,18 +14,17 @@ import numpy as np
 from PIL import Image
 
 from gsbench.files import file_sha256
-from gsbench.init.base import MODEL_FOLDER
+from gsbench.init.base import MODEL_FOLDER, Initializer
 from gsbench.init.points import GREY, read_points
-from gsbench.logs import progress
-from gsbench.pipeline.steps.inputs import split_hash, step_of
+from gsbench.logs import Progress, progress
 from gsbench.runs.code import VIEWS_ROOMS, edited, states_of
-from gsbench.runs.keys import CAPTURE, GROUND_TRUTH, Step
+from gsbench.runs.keys import CAPTURE, GROUND_TRUTH, INIT, NO_USER_CODE, Step, UserCode, options_of, sha256_of, step_of
 from gsbench.runs.layout import MASKS, VIEWS
 from gsbench.runs.made_of import PYCOLMAP, version_of
 from gsbench.runs.store import Store
 from gsbench.scene.colmap import write_frames
 from gsbench.scene.courtyard.render import render_courtyard
-from gsbench.scene.images import IMAGES, image_size, png_name, prepare_photograph, prepared_mask, write_mask
+from gsbench.scene.images import IMAGES, image_size, png_name, prepare_photograph, prepared_mask, read_image, write_mask
 from gsbench.scene.load import load_scene
 from gsbench.scene.options import Backdrop, SceneConfig, check_final_size
 from gsbench.scene.readers import (
@@ -158,7 +161,7 @@ class Views:
         """The inputs on which the views depend, besides the cameras, which come from ``init``."""
         return {
             "capture": self.capture.fingerprint,
-            "test": split_hash(self.capture),
+            "test": sha256_of(list(self.capture.test_names)),
             "downscale": self.options.downscale,
             "max_size": self.options.max_size,
             "resample": self.options.resample,
@@ -202,3 +205,40 @@ def ground_truth_step(views: Views) -> Step:
                 write_mask(view.mask, folder / MASKS / png_name(view.name))
 
     return step_of(GROUND_TRUTH, {"scene": views.inputs, "init": views.init.key}, build)
+
+
+# ---- initialisation: cameras and the first cloud, shared by all trials with the same options
+
+
+def init_step(
+    store: Store,
+    capture: Capture,
+    initializer: Initializer,
+    reference: Step | None = None,
+    user: UserCode = NO_USER_CODE,
+) -> Step:
+    """The initialiser's step. ``reference`` is the step that reconstructs cameras for a capture without them."""
+    inputs = {
+        "capture": capture.fingerprint,
+        "test": sha256_of(list(capture.test_names)),
+        "exact_poses": capture.exact_poses,
+        "options": options_of("init", initializer, user),
+        "content": initializer.content(),
+        "reference": None if reference is None else reference.key,
+        "pycolmap": version("pycolmap"),
+    }
+
+    def build(folder: Path) -> None:
+        with progress("init") as report:
+            check_readable(capture, report)
+            cameras = None if reference is None else store.path(reference) / MODEL_FOLDER
+            initializer.run(capture, folder, report, reference=cameras)
+
+    return step_of(INIT, inputs, build, user, in_processes=True)
+
+
+def check_readable(capture: Capture, report: Progress) -> None:
+    """Decode every photograph once, so that a damaged file is named before hours of work. Raises InputError."""
+    with ThreadPoolExecutor(max_workers=available_threads()) as pool:
+        for done, _ in enumerate(pool.map(lambda name: read_image(capture.images / name).shape, capture.image_names)):
+            report("photographs", done + 1, len(capture.image_names))

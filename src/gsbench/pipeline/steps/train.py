@@ -1,14 +1,27 @@
-"""Training: makes the model, its lineage, curves and events."""
+"""Training, by gsbench or by another program: makes the model, its lineage, curves and events."""
 
 from __future__ import annotations
 
 import dataclasses
+import logging
+import os
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 
+from gsbench.densify import Lineage
+from gsbench.errors import InputError, TrainingError
+from gsbench.external.exchange import collect_model, collect_renders, write_test_cameras, write_training_views
+from gsbench.external.program import run_program
+from gsbench.external.settings import DATA, OUTPUT, TEST_CAMERAS, External, fill_placeholders, split_command
 from gsbench.files import write_json
 from gsbench.gaussians.initial import gaussians_from_cloud
 from gsbench.gaussians.model import Gaussians
@@ -16,18 +29,22 @@ from gsbench.gaussians.ply import read_ply, write_ply
 from gsbench.init import read_cloud
 from gsbench.init.base import GAUSSIANS_FILE, MODEL_FOLDER
 from gsbench.logs import progress
-from gsbench.pipeline.steps.inputs import options_of, rasterizer_inputs, step_of
 from gsbench.pipeline.steps.scene import Views
-from gsbench.runs.keys import TRAIN, Step
-from gsbench.runs.layout import LINEAGE, POINT_CLOUD, TRAINING
+from gsbench.runs.keys import TRAIN, Step, options_of, rasterizer_inputs, step_of
+from gsbench.runs.layout import EVENTS, LINEAGE, POINT_CLOUD, RENDERS, TRAINER_LOG, TRAINING
+from gsbench.runs.trial_record import FROM_MODEL, FROM_RENDERS
 from gsbench.system.install import own_checkout
 from gsbench.system.machine import describe_machine
+from gsbench.system.own_modules import SAFE_PATH
 from gsbench.system.resources import peak_memory_mb, reset_peak_memory
 from gsbench.train.options import WITHOUT_EFFECT_ON_MODEL
 from gsbench.train.trainer import Status, Trainer
+from gsbench.words import readable_time
 
 if TYPE_CHECKING:
     from gsbench.pipeline.parts import Parts
+
+log = logging.getLogger(__name__)
 
 
 def train_step(views: Views, parts: Parts) -> Step:
@@ -88,3 +105,153 @@ def initial_gaussians(init: Path, device: torch.device) -> Gaussians:
         return read_ply(init / GAUSSIANS_FILE, device)
     cloud = read_cloud(init / MODEL_FOLDER)
     return gaussians_from_cloud(cloud.points, cloud.colors, device)
+
+
+# ---- another program: a command that gets the training views, and leaves a model or renders
+
+CONTRACT = 1  # raise it when the files that a program gets, or must leave, change
+WORK = "work"  # subfolder of the build: the program's inputs and outputs
+SECONDS_TO_TELL_VERSION = 120.0
+MAX_OUTPUT = 200  # characters of the version command's output that an error quotes
+OWN_VARIABLES = "GSBENCH_"  # prefix of gsbench's own settings, which the program does not get
+
+
+def external_step(views: Views, trainer: External, parts: Parts) -> Step:
+    """The step in which ``trainer`` trains on the training views, from the cloud of the initialiser.
+
+    Raises InputError for a capture with masks.
+    """
+    if views.capture.masks:
+        raise InputError(
+            f"densify={parts.values['densify']['name']}: another program gets no masks, so it would train on "
+            "ignored pixels: leave scene.masks out, or train with gsbench"
+        )
+    iterations, seed, device, threads = parts.train.iterations, parts.seed, parts.device, parts.threads
+    inputs: dict[str, Any] = {
+        "contract": CONTRACT,
+        "scene": views.inputs,
+        "init": views.init.key,
+        "densify": options_of("densify", trainer),
+        "iterations": iterations,
+        "seed": seed,
+    }
+
+    def build(folder: Path) -> None:
+        scene, cloud = views.scene, read_cloud(views.store.path(views.init) / MODEL_FOLDER)
+        executable, work, log_file = trainer.executable(), folder / WORK, folder / TRAINER_LOG
+        places = {name: work / name for name in (DATA, TEST_CAMERAS, OUTPUT)}
+        values = {name: str(place.resolve()) for name, place in places.items()} | trainer.options
+        values |= {"iterations": iterations, "seed": seed, "device": str(device), "threads": threads}
+        placeholders = {name: f"{{{name}}}" for name in places}  # for the record: the build's folders vanish
+        command = [executable, *(fill_placeholders(word, values, "densify.command") for word in trainer.words[1:])]
+        environment = environment_of(trainer, values)
+        version_output = check_version(trainer, values, environment)
+        places[OUTPUT].mkdir(parents=True)
+        write_training_views(places[DATA], scene.train, cloud)
+        if trainer.needs_test_cameras:
+            write_test_cameras(places[TEST_CAMERAS], scene.test)
+        log.info("train: %s runs; its output: %s", trainer.program, log_file)
+        limit = None if trainer.time_limit_minutes is None else 60 * trainer.time_limit_minutes
+        try:
+            ended = run_program(command, log_file, places[OUTPUT], environment, limit)
+        finally:
+            for place in (DATA, TEST_CAMERAS):
+                shutil.rmtree(places[place], ignore_errors=True)
+        log.info("train: %s ended after %s", trainer.program, readable_time(ended.seconds))
+        pattern = fill_placeholders(trainer.result, values, "densify.result")
+        with naming_the_program(trainer, log_file):
+            summary = take_result(trainer, pattern, views, places[OUTPUT], folder)
+        shutil.rmtree(work)
+        (folder / EVENTS).write_text("")
+        summary |= {
+            "iterations": iterations,
+            "num_init_points": len(cloud),
+            "scene_extent": scene.extent,
+            "seconds": ended.seconds,
+            # Only the program itself could measure its memory on a GPU.
+            "peak_memory_mb": ended.peak_memory_mb if device.type == "cpu" else None,
+            "machine": describe_machine(device),
+            "checkout": own_checkout(),
+            "trained_by": {
+                "program": trainer.program,
+                "version": trainer.version,
+                "said": version_output,
+                "command": [
+                    fill_placeholders(word, values | placeholders, "densify.command") for word in trainer.words
+                ],
+            },
+        }
+        write_json(folder / TRAINING, summary)
+
+    # Its own version: changes of gsbench's trainer do not concern it. A stopped program starts from the beginning.
+    stage = replace(TRAIN, version=1, resumable=False)
+    return step_of(stage, inputs, build)
+
+
+def take_result(trainer: External, pattern: str, views: Views, output: Path, folder: Path) -> dict[str, Any]:
+    """Keep in ``folder`` what the program left in ``output``; returns facts for the training's summary."""
+    if not trainer.leaves_model:
+        collect_renders(output, pattern, trainer.by_order, views.scene.test, folder / RENDERS)
+        return {"evaluated_from": FROM_RENDERS, "num_gaussians": None, "causes": {}}
+    gaussians = collect_model(output, pattern, folder / POINT_CLOUD)
+    lineage = Lineage(len(gaussians))  # without causes: which rule made a Gaussian is unknown here
+    state: dict[str, Any] = {name: tensor.numpy() for name, tensor in lineage.state_dict().items()}
+    np.savez_compressed(folder / LINEAGE, **state)
+    return {"evaluated_from": FROM_MODEL, "num_gaussians": len(gaussians), "causes": lineage.causes_of_living()}
+
+
+@contextmanager
+def naming_the_program(trainer: External, log_file: Path) -> Iterator[None]:
+    """Add the program's name and the path of its log to a TrainingError about its result."""
+    try:
+        yield
+    except TrainingError as error:
+        raise TrainingError(f"{Path(trainer.program).name} ended well, but {error}; log: {log_file}") from error
+
+
+def environment_of(trainer: External, values: Mapping[str, object]) -> dict[str, str]:
+    """The program's environment: gsbench's without its own variables, and what ``densify.environment`` adds."""
+    # Without SAFE_PATH, too: a train.py must find the modules beside it.
+    inherited = {
+        name: value
+        for name, value in os.environ.items()
+        if not name.startswith(OWN_VARIABLES) and (name, value) != SAFE_PATH
+    }
+    return inherited | {
+        name: fill_placeholders(text, values, f"densify.environment.{name}")
+        for name, text in trainer.environment.items()
+    }
+
+
+def check_version(trainer: External, values: Mapping[str, object], environment: Mapping[str, str]) -> str | None:
+    """Run ``densify.version_command`` and return its output on one line; None if there is no such command.
+
+    Raises `InputError` unless the output contains ``densify.version``.
+    """
+    if trainer.version_command is None:
+        return None
+    key = "densify.version_command"
+    command = [fill_placeholders(word, values, key) for word in split_command(trainer.version_command, key)]
+    try:
+        # In an empty folder: `python -c` would import modules that lie in the current one.
+        with tempfile.TemporaryDirectory(prefix="gsbench-version-") as empty:
+            done = subprocess.run(
+                command,
+                cwd=empty,
+                env=dict(environment),
+                stdin=subprocess.DEVNULL,
+                capture_output=True,
+                text=True,
+                errors="replace",
+                timeout=SECONDS_TO_TELL_VERSION,
+                check=False,
+            )
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise InputError(f"{key} cannot be run ({error})") from error
+    output = " ".join((done.stdout + done.stderr).split())
+    if trainer.version not in output:
+        raise InputError(
+            f"densify.version is {trainer.version!r}, but `{' '.join(command)}` says {output[:MAX_OUTPUT]!r}: results "
+            "are kept by the version, so set densify.version to what it is"
+        )
+    return output
