@@ -1,4 +1,4 @@
-"""A round of MCMC and its noise against a restatement, one Gaussian at a time."""
+"""MCMC and MRNF against restatements, one Gaussian at a time."""
 
 from __future__ import annotations
 
@@ -9,11 +9,16 @@ import numpy as np
 import pytest
 import torch
 
-from gsbench.densify import MCMC, DensifyContext
+from gsbench.densify import ADC, MCMC, MRNF, DensifyContext
+from gsbench.densify.mcmc import bounds
+from gsbench.densify.scores import draw
+from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.paper_values import LearningRates
 from gsbench.gaussians.trainable import TrainableGaussians
+from gsbench.raster.reference import ReferenceRasterizer
 from tests.densify import restatement
-from tests.densify.test_rounds import assert_same, to_rows
+from tests.densify.test_rounds import EXTENT, assert_same, to_rows
+from tests.densify.test_scores import BLACK, COUNT, Room, alphas, find_edges, over_median, started
 from tests.gaussians.helpers import random_gaussians
 
 
@@ -89,3 +94,130 @@ def test_mcmc_noise() -> None:
         gate = 1 / (1 + np.exp(100 * (opacity(row) - 0.005)))
         row["means"] = row["means"] + axes @ axes.T @ noise[i] * gate * 5e5 * trainable.position_rate
     assert_same(trainable, rows)
+
+
+def scored(values: Gaussians) -> tuple[np.ndarray, np.ndarray]:
+    """Over the three views: the largest refine weight, and 1 + .25 times the mean edge score over its median."""
+    room, weight, edge = Room(), np.zeros(COUNT), np.zeros(COUNT)
+    for view, camera in enumerate(room.cameras):
+        image = ReferenceRasterizer().render(values, camera, 0, BLACK).image.detach()
+        error = room.dissimilarity(view, image).numpy()
+        blended = alphas(values, camera)
+        weight = np.maximum(weight, (blended * error / error.mean()).sum((1, 2)))
+        edge += over_median((blended * find_edges(room.images[view])).sum((1, 2))) / 3
+    return weight, 1 + 0.25 * over_median(edge)
+
+
+def half(row: restatement.Row, side: int) -> restatement.Row:
+    """Half a standard deviation to a side along the longest axis, which is halved; the others times .85."""
+    scales = np.exp(row["log_scales"])
+    longest = int(np.argmax(scales))
+    axis = restatement.rotation(row["quaternions"])[:, longest]
+    new = scales * 0.85
+    new[longest] = 0.5 * scales[longest]
+    child = restatement.newborn(row, row["means"] + side * 0.5 * scales[longest] * axis, np.log(new))
+    opacity = 0.6 / (1 + np.exp(-row["opacity_logits"]))
+    child["opacity_logits"] = np.log(opacity / (1 - opacity))
+    return child
+
+
+def decayed(row: restatement.Row, left: float) -> restatement.Row:
+    opacity = 1 / (1 + np.exp(-row["opacity_logits"])) - 0.004 * left
+    return row | {
+        "opacity_logits": np.log(opacity / (1 - opacity)),
+        "log_scales": np.log(np.exp(row["log_scales"]) * (1 - 0.002 * left)),
+    }
+
+
+def placed(densifier: MRNF, seed: int) -> TrainableGaussians:
+    """Gaussians with moments, in a room with views."""
+    trainable, _ = started(ADC(), seed)
+    densifier.begin(trainable.values.detach(), DensifyContext(EXTENT, views=Room()))
+    return trainable
+
+
+def begun(densifier: MRNF, seed: int) -> tuple[TrainableGaussians, np.ndarray]:
+    trainable = placed(densifier, seed)
+    trainable.values.opacity_logits.data[:6] = -7.0  # transparent
+    trainable.values.means.data[6, 0] = 1e6  # out of the scene
+    seen = np.random.default_rng(seed).random(COUNT) < 0.8
+    densifier.statistics = {"seen": torch.from_numpy(seen)}
+    return trainable, seen
+
+
+@pytest.mark.parametrize(("step", "room"), [(600, 1000), (600, 5), (16_000, 1000)])
+def test_mrnf_round(step: int, room: int) -> None:
+    densifier = MRNF(max_gaussians=COUNT + room, growth_share=0.4, growth_threshold=0.5)
+    trainable, seen = begun(densifier, 1)
+    rows, (weight, guidance) = to_rows(trainable), scored(trainable.values.detach())
+    event = densifier.refine(step, trainable, torch.Generator().manual_seed(0))
+
+    rng = torch.Generator().manual_seed(0)
+    torch.randperm(3, generator=rng)  # the views: all three
+    opacities = np.array([1 / (1 + np.exp(-row["opacity_logits"])) for row in rows])
+    gone = (opacities < 1 / 255) | (np.arange(COUNT) == 6)
+    assert gone.sum() == 7
+    above = (weight > 0.5) & seen
+    wanted = int(0.4 * above.sum() + 0.5)
+    assert wanted > 9
+    weights = torch.from_numpy(opacities * guidance)
+    refilled = draw(torch.from_numpy(seen & ~gone), weights, 7, rng).numpy()
+    left = min(wanted - 7, room) if step < 15_000 else 0
+    grown = draw(torch.from_numpy(above & ~gone & ~refilled), torch.from_numpy(weight * guidance), left, rng).numpy()
+    split = refilled | grown
+    assert (event.pruned_opacity, event.split_gradient) == (7, split.sum())
+    assert split.sum() == 7 + left
+    assert event.blocked_by_cap == (wanted - 7 - left if step < 15_000 else 0)
+    children = [half(rows[i], side) for side in (1, -1) for i in np.nonzero(split)[0]]
+    kept = [row for i, row in enumerate(rows) if not split[i] and not gone[i]]
+    assert_same(trainable, [decayed(row, 1 - step / 30_000) for row in kept + children])
+    assert event.balances()
+    assert not densifier.statistics["seen"].any()
+
+
+def test_rounds_and_their_end() -> None:
+    densifier = MRNF(stop=1000)
+    trainable, _ = begun(densifier, 0)
+    due = [step for step in range(1, 1100) if densifier.refine(step, trainable, torch.Generator()) is not None]
+    assert due == [200, 400, 600, 800]
+
+
+def test_what_leaves_the_scene_by_size_goes() -> None:
+    densifier = MRNF()
+    trainable = placed(densifier, 0)
+    half_size = bounds(trainable.values.means.detach())[1]
+    trainable.values.log_scales.data[3, 1] = np.log(101 * half_size)
+    trainable.values.log_scales.data[4, 2] = np.log(0.9e-10)
+    trainable.values.log_scales.data[5] = np.log(99 * half_size)
+    assert densifier.to_prune(trainable.values).nonzero().squeeze(-1).tolist() == [3, 4]
+
+
+def test_the_bounds_hold_the_central_four_fifths() -> None:
+    means = torch.tensor([[i, 10.0 * i, -i] for i in range(101)], dtype=torch.float64)
+    center, half_size, middle = bounds(means[torch.randperm(101, generator=torch.Generator().manual_seed(0))])
+    assert center.tolist() == [50, 500, -50]
+    assert (half_size, middle) == (400, 80)
+
+
+def test_noise_moves_the_faint_that_were_seen_and_is_limited() -> None:
+    densifier, gaussians = MRNF(), random_gaussians(300, 2)
+    gaussians.opacity_logits[:100], gaussians.opacity_logits[100:] = -9.0, 2.0
+    trainable = TrainableGaussians(gaussians, LearningRates(), 4.0)
+    densifier.begin(gaussians, DensifyContext(4.0))
+    densifier.statistics["seen"][:200] = True
+    densifier.statistics["seen"][50:100] = False
+    trainable.set_step(1)
+    before = trainable.values.means.detach().clone()
+    densifier.after_step(1, trainable, torch.Generator().manual_seed(0))
+    moved = trainable.values.means.detach() - before
+    weight = (1 - torch.sigmoid(torch.tensor(-9.0, dtype=torch.float64))) ** 150 * 50 * trainable.position_rate
+    assert float(moved[:50].std()) == pytest.approx(float(weight), rel=0.15)
+    assert not moved[50:100].any()
+    assert moved[100:].abs().max() < 1e-30
+    wild = MRNF(noise_rate=1e9)
+    wild.begin(gaussians, DensifyContext(4.0))
+    wild.statistics["seen"][:] = True
+    before = trainable.values.means.detach().clone()
+    size = bounds(before)[2]
+    wild.after_step(1, trainable, torch.Generator().manual_seed(0))
+    assert float((trainable.values.means.detach() - before).abs().max()) == pytest.approx(size)

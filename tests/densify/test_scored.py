@@ -13,7 +13,7 @@ from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.trainable import TrainableGaussians
 from gsbench.raster.reference import ReferenceRasterizer
 from gsbench.train.loss import torch_photometric_loss
-from tests.densify.test_absgs import growth
+from tests.densify.test_adc_variants import absgs_growth
 from tests.densify.test_rounds import EXTENT, assert_same, to_rows
 from tests.densify.test_scores import BLACK, COUNT, Room, alphas, at, started
 
@@ -58,7 +58,7 @@ def test_fast_gs_round(seed: int, step: int) -> None:
     clones = several & (signed >= 2e-4)
     large = np.array([np.exp(row["log_scales"]).max() > 0.001 * EXTENT for row in rows])
     drawn = torch.randn(2 * int((splits & large).sum()), 3, generator=rng, dtype=torch.float64).numpy()
-    grown, cloned, split = growth(rows, np.where(clones, 1.0, 0), np.where(splits, 1.0, 0), iter(drawn))
+    grown, cloned, split = absgs_growth(rows, np.where(clones, 1.0, 0), np.where(splits, 1.0, 0), iter(drawn))
     assert (event.cloned, event.split_gradient) == (cloned, split)
     assert split > 0
 

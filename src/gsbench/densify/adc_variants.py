@@ -1,0 +1,392 @@
+"""Variants of ADC: other criteria of growth, and another way to split."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Annotated, ClassVar, Literal, NamedTuple
+
+import torch
+from annotated_types import Ge, Interval, Lt
+from pydantic import NonNegativeInt, PositiveFloat, PositiveInt
+from torch import Tensor
+
+from gsbench.densify.adc import ADC, OPACITY_RESET, Grown
+from gsbench.densify.base import NEVER, Refinement, Rule, Statistic
+from gsbench.densify.budget import admit
+from gsbench.densify.operations import faded, quantile, standard_normal
+from gsbench.errors import InputError
+from gsbench.events import Cause
+from gsbench.gaussians.model import Gaussians
+from gsbench.raster.base import RenderOutput
+from gsbench.settings import OpenFraction, Switch
+
+
+@dataclass
+class AbsGS(ADC):
+    """ADC with two gradients and a ceiling on opacities, as in the code of Ye et al. (arXiv 2404.10484).
+
+    Small Gaussians are cloned if their signed mean gradient reaches ``gradient_threshold``. Large ones are split if
+    their absolute mean gradient, in which the pixels of a Gaussian do not cancel, reaches ``split_threshold``. Every
+    ``ceiling_interval`` iterations, all opacities above ``opacity_ceiling`` are lowered to it, so that no Gaussian
+    hides all that is behind it.
+    """
+
+    STATISTICS: ClassVar[dict[str, torch.dtype]] = {"absolute_sum": torch.float32}  # NDC, since the last refinement
+    needs_absolute_gradient = True
+
+    SWITCHES: ClassVar[Mapping[str, Switch]] = {
+        "opacity_ceiling": Switch({"ceiling_interval": NEVER}, "the ceiling on opacities"),
+        "small_split_size": Switch({"split_size": ADC.split_size}, "the smaller size above which a Gaussian is split"),
+        "opacity_reset": OPACITY_RESET,
+    }
+
+    split_size: PositiveFloat = 0.001
+    split_threshold: PositiveFloat = 4e-4
+    opacity_ceiling: OpenFraction = 0.8
+    ceiling_interval: PositiveInt = 500
+
+    def observe(self, step: int, render: RenderOutput) -> None:
+        super().observe(step, render)
+        if step < self.stop:
+            assert render.screen_gradient_abs is not None  # because of needs_absolute_gradient
+            self.statistics["absolute_sum"] += torch.where(render.visible, render.screen_gradient_abs.norm(dim=-1), 0.0)
+
+    def mean_absolute_gradient(self) -> Tensor:
+        """Absolute mean gradient [N] NDC over the iterations in which a Gaussian was visible; 0 if it never was."""
+        return self.statistics["absolute_sum"] / self.statistics["visible_count"].clamp_min(1)
+
+    def rules(self, refinement: Refinement) -> list[Rule]:
+        """The rules of ADC, with the ceiling inserted before the opacity reset."""
+        rules, step = super().rules(refinement), refinement.step
+        if step < self.stop and step % self.ceiling_interval == 0:
+            rules.insert(len(rules) - (self.reset_opacity in rules), self.lower_opacity)
+        return rules
+
+    def candidates(self, refinement: Refinement) -> tuple[Tensor, Tensor]:
+        over, large = super().candidates(refinement)
+        return torch.where(large, self.reaches(self.mean_absolute_gradient(), self.split_threshold), over), large
+
+    def choose(self, refinement: Refinement, candidates: Tensor, gain: int) -> tuple[Tensor, int]:
+        """Choose the candidates farthest above the threshold that applies to them."""
+        _, large = self.candidates(refinement)
+        signed = self.mean_gradient() / self.gradient_threshold
+        excess = torch.where(large, self.mean_absolute_gradient() / self.split_threshold, signed)  # [N]
+        return admit(candidates, excess, gain, self.allowance(refinement))
+
+    def lower_opacity(self, refinement: Refinement) -> None:
+        """Lower all opacities above the ceiling to it."""
+        self.limit_opacity(refinement, self.opacity_ceiling)
+
+
+@dataclass
+class PixelGS(ADC):
+    """ADC with the growth condition of Zhang et al. (arXiv 2403.15530).
+
+    The mean gradient is sum_k m_ik f_ik |g_ik| / sum_k m_ik, where m_ik is the number of pixels that Gaussian i is
+    blended into in view k, g_ik its gradient and z_ik its depth there. So views that see only an edge of a large
+    Gaussian no longer lower its mean. The factor f_ik = min(1, (z_ik / (``near_fraction`` extent))^2) reduces growth
+    near cameras. Only growth uses this mean; the optimiser's gradients are not changed.
+    """
+
+    STATISTICS: ClassVar[dict[str, torch.dtype]] = {
+        "weighted_gradient_sum": torch.float32,  # NDC px, since the last refinement
+        "pixel_sum": torch.int64,  # px
+    }
+
+    SWITCHES: ClassVar[Mapping[str, Switch]] = {
+        "near_scaling": Switch({"near_fraction": None}, "less growth near the cameras"),
+        "opacity_reset": OPACITY_RESET,
+    }
+
+    near_fraction: PositiveFloat | None = 0.37  # of the scene extent; None: f = 1
+    needs_footprint = True
+
+    def observe(self, step: int, render: RenderOutput) -> None:
+        super().observe(step, render)
+        if step >= self.stop:
+            return
+        footprint = render.require_footprint()
+        weights = footprint.pixels * self.nearness(footprint.depths)  # [N] px
+        self.statistics["weighted_gradient_sum"] += weights * self.screen_gradient(render)
+        self.statistics["pixel_sum"] += footprint.pixels
+
+    def nearness(self, depths: Tensor) -> Tensor:
+        """The factor f in [0, 1] for view depths [N]."""
+        if self.near_fraction is None:
+            return torch.ones_like(depths)
+        return (depths / (self.near_fraction * self.context.extent)).square().clamp_max(1)
+
+    def mean_gradient(self) -> Tensor:
+        """Mean gradient [N] NDC over the views since the last refinement, weighted by pixels; 0 without pixels."""
+        return self.statistics["weighted_gradient_sum"] / self.statistics["pixel_sum"].clamp_min(1)
+
+
+@dataclass
+class QuantileADC(ADC):
+    """ADC with a growth rate, after the AdaptiveStrategy proposed for gsplat (its pull request 941).
+
+    In each round the Gaussians with the largest mean gradients grow, as many as raise the count by ``growth_rate``.
+    Gaussians that no view has seen do not grow. The ``prune_share`` with the lowest opacities are pruned, and huge
+    Gaussians are pruned as in ADC.
+    """
+
+    growth_rate: PositiveFloat = 0.05
+    prune_share: Annotated[float, Interval(ge=0, lt=1)] = 0.01
+
+    def candidates(self, refinement: Refinement) -> tuple[Tensor, Tensor]:
+        _, large = super().candidates(refinement)
+        mean = self.mean_gradient()
+        count = int(self.growth_rate / self.strictness * len(mean)) // max(1, self.split_children - 1)
+        largest = torch.zeros_like(large)
+        largest[mean.sort(descending=True, stable=True).indices[:count]] = True
+        return largest & (mean > 0), large
+
+    def forecast(self, refinement: Refinement) -> int:
+        # The opacity threshold is a quantile over all Gaussians after growth, so each child needs its own entry.
+        grown = self.grown(refinement)
+        index = torch.arange(len(grown.number), device=grown.number.device).repeat_interleave(grown.number)
+        pruned = self.faint(grown.opacity_logits[index]) | self.huge(refinement.step, grown.log_scales)[index]
+        return len(index) - int(pruned.sum())
+
+    def faint(self, opacity_logits: Tensor) -> Tensor:
+        if len(opacity_logits) == 0:
+            return torch.zeros_like(opacity_logits, dtype=torch.bool)
+        share = min(self.prune_share * self.cull, 1.0)
+        return opacity_logits < quantile(opacity_logits.detach().sort().values, share)
+
+
+class Saddles(NamedTuple):
+    """Candidates for growth, with the result of `SteepGS.steepest`."""
+
+    indices: Tensor  # [C], rising
+    values: Tensor  # [C], least eigenvalues
+    directions: Tensor  # [C, 3], their eigenvectors
+    large: Tensor  # mask [N] of all large Gaussians
+
+    def mask(self) -> Tensor:
+        """Mask [N] of the candidates."""
+        mask = torch.zeros_like(self.large)
+        mask[self.indices] = True
+        return mask
+
+
+@dataclass
+class SteepGS(ADC):
+    """ADC that splits a candidate only where a split lowers the loss (Wang et al., CVPR 2025, arXiv 2505.05587).
+
+    Replace a Gaussian by two halves at small offsets +-d. To second order the loss changes by d S d / 2, where S is the
+    splitting matrix: the sum over pixels of (d loss / d s) times the second derivative of s by the mean, with s the
+    opacity times the density at the pixel. So a split lowers the loss only if S has a negative eigenvalue, and most
+    along the eigenvector of the least eigenvalue. Halves of equal weight are best.
+
+    A candidate of ADC grows only if the least eigenvalue of its S, averaged over the iterations in which it was
+    visible, is below ``eigenvalue_threshold``, in units of the loss per squared scene extent (None: no condition). Two
+    children replace it, on either side along the eigenvector, with ``opacity_factor`` times its opacity. If it is
+    large, their scales are divided by ``split_shrink``, and each offset has the length of a draw from the parent's
+    density. If it is small, their scales are the parent's, and the offset is the present learning rate of the means.
+    Under a cap, the least eigenvalues come first. ``split_children`` and ``revised_opacity`` have no effect.
+    """
+
+    STATISTICS: ClassVar[Mapping[str, torch.dtype | Statistic]] = {
+        "splitting_sum": Statistic(torch.float32, (3, 3))  # per world unit squared, since the last refinement
+    }
+    needs_splitting_matrix = True
+
+    SWITCHES: ClassVar[Mapping[str, Switch]] = {
+        "saddle": Switch({"eigenvalue_threshold": None}, "the condition that a split lowers the loss"),
+        "halving": Switch({"opacity_factor": 1.0}, "halves of half the opacity"),
+        "opacity_reset": OPACITY_RESET,
+    }
+
+    eigenvalue_threshold: Annotated[float, Lt(0)] | None = -1e-6
+    opacity_factor: Annotated[float, Interval(gt=0, le=1)] = 0.5
+
+    def observe(self, step: int, render: RenderOutput) -> None:
+        super().observe(step, render)
+        if step < self.stop:
+            self.statistics["splitting_sum"] += render.require_splitting_matrix()
+
+    def steepest(self, index: Tensor) -> tuple[Tensor, Tensor]:
+        """The least eigenvalue [S] of the mean splitting matrix of the Gaussians at ``index`` [S], and its eigenvector
+        [S, 3].
+
+        Eigenvalues are in units of the loss per squared extent. The largest component of each eigenvector is positive.
+        """
+        seen = self.statistics["visible_count"][index].clamp_min(1)  # [S]
+        mean = self.statistics["splitting_sum"][index].double() / seen[:, None, None]  # [S, 3, 3]
+        values, vectors = torch.linalg.eigh(mean)  # in rising order
+        directions = vectors[..., 0]
+        largest = directions.gather(-1, directions.abs().argmax(-1, keepdim=True))  # [S, 1]
+        return values[:, 0] * self.context.extent**2, directions * largest.sign()
+
+    def saddles(self, refinement: Refinement) -> Saddles:
+        """The candidates of ADC whose split lowers the loss."""
+        over, large = super().candidates(refinement)
+        index = over.nonzero().squeeze(-1)  # [C]
+        values, directions = self.steepest(index)
+        if self.eigenvalue_threshold is not None:
+            lowering = values < self.eigenvalue_threshold
+            index, values, directions = index[lowering], values[lowering], directions[lowering]
+        return Saddles(index, values, directions, large)
+
+    def candidates(self, refinement: Refinement) -> tuple[Tensor, Tensor]:
+        saddles = self.saddles(refinement)
+        return saddles.mask(), saddles.large
+
+    def grown(self, refinement: Refinement) -> Grown:
+        values = refinement.gaussians.values
+        over, large = self.candidates(refinement)
+        return Grown(
+            torch.where(over, 2, 1),
+            values.log_scales - math.log(self.split_shrink) * (over & large).unsqueeze(-1),
+            torch.where(over, faded(values.opacity_logits, self.opacity_factor), values.opacity_logits),
+        )
+
+    def grow_by_gradient(self, refinement: Refinement) -> None:
+        """Replace each candidate by two halves."""
+        gaussians = refinement.gaussians
+        saddles = self.saddles(refinement)
+        gains = torch.zeros(len(gaussians), dtype=torch.float64, device=gaussians.device)
+        gains[saddles.indices] = -saddles.values
+        selected, blocked = admit(saddles.mask(), gains, 1, self.allowance(refinement))
+        indices = selected.nonzero().squeeze(-1)  # [S]
+        parents, is_large = gaussians.values.detach().select(indices), saddles.large[indices].unsqueeze(-1)
+        direction = saddles.directions[selected[saddles.indices]].to(parents.means)  # [S, 3]
+        noise = standard_normal((2 * len(parents), 3), refinement.rng, parents.means)
+        lengths = (noise * parents.scales.repeat(2, 1)).norm(dim=-1, keepdim=True)  # [2 S, 1]
+        lengths = torch.where(is_large.repeat(2, 1), lengths, gaussians.position_rate)
+        children = Gaussians.concatenate([parents, parents])
+        children.means = children.means + lengths * torch.cat([direction, -direction])
+        children.log_scales = children.log_scales - math.log(self.split_shrink) * is_large.repeat(2, 1)
+        children.opacity_logits = faded(children.opacity_logits, self.opacity_factor)
+        self.edit(refinement, ~selected, children, indices.repeat(2), Cause.SPLIT_GRADIENT)
+        refinement.event.split_gradient += len(parents)
+        refinement.event.blocked_by_cap += blocked
+
+
+GATHER_ROUNDS = 2  # gradients are gathered from so many rounds before the window (200 iterations in the authors' code)
+
+
+@dataclass
+class ResGS(ADC):
+    """ADC with the residual split of Lyu et al. (ICCV 2025, arXiv 2412.07494).
+
+    Each candidate stays, with its opacity multiplied by ``parent_opacity``, and gets one child. The child's mean is
+    drawn from the parent's density, its scales are divided by ``split_shrink``, its opacity is the parent's former one,
+    and its level is the parent's plus one. So the child adds the detail that the parent lacks.
+
+    The window has phases, which end at the fractions ``phase_ends`` of it, and each phase has ``stages_a_phase`` equal
+    stages. A Gaussian of level l grows in stage s > l at ``gradient_threshold`` times ``level_factor``^(l - s), so that
+    Gaussians of low levels catch up. For ``warm_up`` of the window after the end of a phase, no gradients are gathered
+    and nothing grows. From the fraction ``fade_start`` of the window until iteration ``fade_stop``, all opacities are
+    multiplied by ``fade`` every ``fade_interval`` iterations. There is no opacity reset, and no pruning by size.
+    """
+
+    STATISTICS: ClassVar[dict[str, torch.dtype]] = {"level": torch.int32}  # how many residual splits made a Gaussian
+
+    SWITCHES: ClassVar[Mapping[str, Switch]] = {
+        "absolute_gradient": Switch({"gradient": "signed"}, "the absolute gradient, in which pixels do not cancel"),
+        "fading": Switch({"fade": 1.0}, "opacities that fade"),
+        "levels": Switch({"level_factor": 1.0}, "lower thresholds for those that earlier stages passed over"),
+    }
+
+    gradient: Literal["signed", "absolute"] = "absolute"
+    gradient_threshold: PositiveFloat = 6.7e-4
+    parent_opacity: OpenFraction = 0.3
+    level_factor: Annotated[float, Ge(1)] = 2 ** (1 / 3)
+    phase_ends: Sequence[OpenFraction] = field(default_factory=lambda: [0.16, 0.47])
+    stages_a_phase: PositiveInt = 3
+    warm_up: Annotated[float, Interval(ge=0, lt=1)] = 0.044
+    fade: Annotated[float, Interval(gt=0, le=1)] = 0.8
+    fade_start: OpenFraction = 0.16
+    fade_interval: PositiveInt = 500
+    fade_stop: NonNegativeInt = 25_000
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if list(self.phase_ends) != sorted(set(self.phase_ends)):
+            raise InputError(f"densify.phase_ends must rise, got {list(self.phase_ends)}")
+
+    def iteration_at(self, fraction: float) -> int:
+        """The iteration of the round nearest to the given fraction of the window."""
+        return self.start + round(fraction * (self.stop - self.start) / self.interval) * self.interval
+
+    def warming_up(self, step: int) -> bool:
+        """Return whether ``step`` is in the pause after the end of a phase."""
+        length = self.iteration_at(self.warm_up) - self.start
+        return any(0 < step - self.iteration_at(end) < length for end in self.phase_ends)
+
+    def stage(self, step: int) -> int:
+        """The stage (1, 2, …) of the round at ``step``."""
+        ends = [self.iteration_at(end) for end in self.phase_ends]
+        phase = sum(step > end for end in ends)
+        length = self.iteration_at(self.warm_up) - self.start
+        begin = self.start if phase == 0 else ends[phase - 1] + length
+        stage_length = max(((*ends, self.stop)[phase] - begin) // self.stages_a_phase, 1)
+        # The authors' loop begins to count one iteration late in the first phase and one early in the others.
+        offset = 1 if phase == 0 else -1
+        done = max(0, (step - begin - offset) // stage_length)
+        return self.stages_a_phase * phase + 1 + min(done, self.stages_a_phase)
+
+    def observe(self, step: int, render: RenderOutput) -> None:
+        if step > self.start - GATHER_ROUNDS * self.interval and not self.warming_up(step):
+            super().observe(step, render)
+
+    def rules(self, refinement: Refinement) -> list[Rule]:
+        step, rules = refinement.step, [rule for rule in super().rules(refinement) if rule != self.reset_opacity]
+        if self.warming_up(step):
+            rules = []
+        fading = self.iteration_at(self.fade_start) <= step < self.fade_stop
+        if fading and step % self.fade_interval == 0:
+            rules += [self.fade_all] if step < self.stop else [self.prune, self.fade_all]
+        return rules
+
+    def candidates(self, refinement: Refinement) -> tuple[Tensor, Tensor]:
+        _, large = super().candidates(refinement)
+        behind = (self.stage(refinement.step) - self.statistics["level"]).clamp_min(0)  # [N] levels
+        mean = self.mean_gradient() * self.level_factor ** behind.to(torch.float64)  # instead of a lower threshold
+        return self.reaches(mean, self.gradient_threshold), large
+
+    def forecast(self, refinement: Refinement) -> int:
+        values = refinement.gaussians.values
+        over, _ = self.candidates(refinement)
+        parents = torch.where(over, faded(values.opacity_logits, self.parent_opacity), values.opacity_logits)
+        children = over & ~self.faint(values.opacity_logits)
+        return int((~self.faint(parents)).sum()) + int(children.sum())
+
+    def grow_by_gradient(self, refinement: Refinement) -> None:
+        """Give each candidate a child, then make the candidate fainter."""
+        gaussians, before = refinement.gaussians, len(refinement.gaussians)
+        over, _ = self.candidates(refinement)
+        selected, blocked = self.choose(refinement, over, 1)
+        levels = self.statistics["level"][selected] + 1
+        refinement.event.split_gradient += self.split(
+            refinement,
+            selected,
+            gaussians.values.log_scales.detach()[selected] - math.log(self.split_shrink),
+            1,
+            Cause.SPLIT_GRADIENT,
+            keep_parent=True,
+        )
+        refinement.event.blocked_by_cap += blocked
+        self.statistics["level"][before:] = levels
+        parents = torch.zeros(len(gaussians), dtype=torch.bool, device=gaussians.device)
+        parents[:before] = selected
+        logits = gaussians.values.opacity_logits.detach()
+        fainter = torch.where(parents, faded(logits, self.parent_opacity), logits)
+        gaussians.overwrite("opacity_logits", fainter, where=parents)
+
+    def huge(self, step: int, log_scales: Tensor) -> Tensor:
+        """An empty mask [N]: the authors do not prune by size."""
+        return torch.zeros_like(log_scales[:, 0], dtype=torch.bool)
+
+    def reset_statistics(self, refinement: Refinement) -> None:
+        """Set all statistics but the levels to zero."""
+        levels = self.statistics["level"]
+        super().reset_statistics(refinement)
+        self.statistics["level"] = levels
+
+    def fade_all(self, refinement: Refinement) -> None:
+        """Multiply all opacities by ``fade``: Gaussians that are not needed become faint and are pruned."""
+        logits = refinement.gaussians.values.opacity_logits.detach()
+        refinement.gaussians.overwrite("opacity_logits", faded(logits, self.fade))

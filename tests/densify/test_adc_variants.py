@@ -1,0 +1,544 @@
+"""Variants of ADC against restatements, one Gaussian at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+import torch
+
+from gsbench.densify import ADC, AbsGS, DensifyContext, PixelGS, QuantileADC, Refinement, ResGS, SteepGS
+from gsbench.errors import InputError
+from gsbench.gaussians.paper_values import LearningRates
+from gsbench.gaussians.trainable import TrainableGaussians
+from gsbench.raster.base import Footprint, RenderOutput
+from tests.densify import restatement
+from tests.densify.test_rounds import EXTENT, assert_same, noise_of, observe, prepared, to_rows
+from tests.gaussians.helpers import random_gaussians
+
+
+def absgs_growth(
+    rows: list[restatement.Row], signed: np.ndarray, absolute: np.ndarray, noise: object
+) -> tuple[list[restatement.Row], int, int]:
+    """Small (largest scale at most .001 of the extent): a copy where signed >= .0002; large: split where absolute >=
+    .0004, into two of 1 / 1.6."""
+    largest = [np.exp(row["log_scales"]).max() for row in rows]
+    clones = [i for i, size in enumerate(largest) if size <= 0.001 * EXTENT and signed[i] >= 0.0002]
+    chosen = [i for i, size in enumerate(largest) if size > 0.001 * EXTENT and absolute[i] >= 0.0004]
+    copies = [restatement.newborn(rows[i], rows[i]["means"].copy(), rows[i]["log_scales"].copy()) for i in clones]
+    scales = {i: np.log(np.exp(rows[i]["log_scales"]) / 1.6) for i in chosen}
+    return restatement.split_all(rows + copies, chosen, scales, noise), len(clones), len(chosen)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("step", [600, 3100])
+@pytest.mark.parametrize("seed", range(3))
+def test_absgs_round(seed: int, step: int) -> None:
+    densifier = AbsGS()
+    trainable, _ = prepared(densifier, seed)
+    trainable.values.log_scales.data[::4] -= 4.0  # a quarter below the size of a split
+    draw = np.random.default_rng(seed)
+    signed, absolute = draw.uniform(0, 4e-4, 60), draw.uniform(0, 8e-4, 60)
+    densifier.statistics["gradient_sum"] = torch.from_numpy(signed)
+    densifier.statistics["absolute_sum"] = torch.from_numpy(absolute)
+    densifier.statistics["visible_count"][:] = 1
+    rows, expected = to_rows(trainable), {}
+    foreseen = densifier.forecast(Refinement(step, trainable, torch.Generator(), event=None))  # type: ignore[arg-type]
+    event = densifier.refine(step, trainable, torch.Generator().manual_seed(seed))
+    noise = iter(noise_of(seed, [event.split_gradient]))
+    rows, cloned, split = absgs_growth(rows, signed, absolute, noise)
+    assert (event.cloned, event.split_gradient) == (cloned, split)
+    assert min(cloned, split) > 0
+    assert_same(trainable, restatement.prune(rows, step, EXTENT, expected))
+    assert expected == {name: getattr(event, name) for name in expected}
+    assert event.balances()
+    assert event.after == foreseen
+
+
+def test_both_gradients_are_gathered() -> None:
+    densifier = AbsGS()
+    _, mean = prepared(densifier, 0)  # shows it the same for both
+    np.testing.assert_allclose(densifier.mean_gradient(), mean, rtol=1e-6)
+    np.testing.assert_allclose(densifier.mean_absolute_gradient(), mean, rtol=1e-6)
+    assert densifier.needs_absolute_gradient
+
+
+def test_every_500_iterations_opacities_are_lowered_to_the_ceiling() -> None:
+    densifier = AbsGS()
+    trainable, _ = prepared(densifier, 1)
+    before = trainable.values.opacities.detach().clone()
+    event = densifier.refine(500, trainable, torch.Generator())  # no round yet
+    assert (before > 0.8).any()
+    torch.testing.assert_close(trainable.values.opacities.detach(), before.clamp_max(0.8))
+    assert not trainable.adam["opacity_logits"].first.any()
+    assert not event.opacity_reset
+    assert densifier.refine(15_000, trainable, torch.Generator()) is None
+    densifier.refine(3000, trainable, torch.Generator())
+    assert float(trainable.values.opacities.detach().max()) == pytest.approx(0.01)
+
+
+def test_a_hard_cap_takes_those_farthest_above_their_own_threshold() -> None:
+    densifier = AbsGS(max_gaussians=62, cap="hard", prune_opacity=0.0)
+    trainable, _ = prepared(densifier, 1)
+    trainable.values.log_scales.data[:30] = -9.0
+    signed, absolute = torch.full((60,), 3e-4), torch.full((60,), 5e-4)  # 1.5 and 1.25 times theirs
+    signed[7], absolute[50] = 9e-4, 2e-3
+    densifier.statistics |= {"gradient_sum": signed, "absolute_sum": absolute}
+    densifier.statistics["visible_count"][:] = 1
+    event = densifier.refine(600, trainable, torch.Generator())
+    assert (event.cloned, event.split_gradient) == (1, 1)
+
+
+COUNT = 60
+VIEWS = 4
+
+
+class Views:
+    """Made-up gradients [V, N, 2], pixels, depths and radii [V, N] of a few views."""
+
+    def __init__(self, seed: int) -> None:
+        rng = np.random.default_rng(seed)
+        self.gradients = rng.exponential(2e-4, (VIEWS, COUNT, 2))
+        self.pixels = rng.integers(0, 400, (VIEWS, COUNT)) * (rng.random((VIEWS, COUNT)) < 0.7)
+        self.depths = rng.uniform(-1, 1.5 * EXTENT, (VIEWS, COUNT))
+        self.radii = np.where(self.pixels > 0, 3, rng.integers(0, 2, (VIEWS, COUNT)))
+
+    def show(self, densifier: ADC, trainable: TrainableGaussians) -> None:
+        densifier.begin(trainable.values.detach(), DensifyContext(EXTENT))
+        for view in range(VIEWS):
+            points = torch.zeros(COUNT, 2, dtype=torch.float64, requires_grad=True)
+            points.grad = torch.from_numpy(self.gradients[view])
+            none = torch.empty(0)
+            radii = torch.from_numpy(self.radii[view].astype(np.int32))
+            covered = torch.from_numpy(self.pixels[view].astype(np.int32))
+            footprint = Footprint(covered, torch.from_numpy(self.depths[view]), none, none)
+            render = RenderOutput(none, none, radii, points, points.grad, lambda values=None, f=footprint: f)
+            densifier.observe(view + 1, render)
+
+    def mean_gradient(self, fraction: float | None) -> np.ndarray:
+        """The growth condition of the paper, term by term."""
+        means = np.zeros(COUNT)
+        for i in range(COUNT):
+            above = below = 0.0
+            for k in range(VIEWS):
+                m = self.pixels[k, i]
+                f = 1.0
+                if fraction is not None:
+                    f = min(max((self.depths[k, i] / (fraction * EXTENT)) ** 2, 0), 1)
+                above += m * f * np.hypot(*self.gradients[k, i])
+                below += m
+            means[i] = above / below if below else 0
+        return means
+
+
+def started(seed: int, densifier: ADC) -> tuple[TrainableGaussians, Views]:
+    gaussians = random_gaussians(COUNT, seed, log_scale=(-6.0, 0.3))
+    trainable = TrainableGaussians(gaussians, LearningRates(), EXTENT)
+    for tensor in trainable.values.tensors().values():
+        tensor.grad = torch.full_like(tensor, 1e-3)
+    trainable.optimizer_step()
+    views = Views(seed)
+    views.show(densifier, trainable)
+    return trainable, views
+
+
+@pytest.mark.parametrize("fraction", [0.37, 1.0, None])
+@pytest.mark.parametrize("seed", range(3))
+def test_pixel_gs_round(seed: int, fraction: float | None) -> None:
+    densifier = PixelGS(near_fraction=fraction)
+    trainable, views = started(seed, densifier)
+    rows, expected = to_rows(trainable), {}
+    foreseen = densifier.forecast(Refinement(3100, trainable, torch.Generator(), event=None))  # type: ignore[arg-type]
+    gradient = views.mean_gradient(fraction)
+    np.testing.assert_allclose(densifier.mean_gradient(), gradient, rtol=1e-5)
+    event = densifier.refine(3100, trainable, torch.Generator().manual_seed(seed))
+    noise = iter(noise_of(seed, [event.split_gradient]))
+    rows = restatement.prune(restatement.adc_growth(rows, gradient, EXTENT, noise, expected), 3100, EXTENT, expected)
+    assert_same(trainable, rows)
+    assert expected == {name: getattr(event, name) for name in expected}
+    assert event.cloned > 0
+    assert event.split_gradient > 0
+    assert event.balances()
+    assert event.after == foreseen
+    assert not densifier.statistics["pixel_sum"].any()  # gathered anew
+
+
+def test_views_of_equal_footprints_count_as_in_adc() -> None:
+    """Weights that are all alike cancel; views without a pixel do not count at all."""
+    views, densifier, baseline = Views(5), PixelGS(near_fraction=None), ADC()
+    views.pixels[:] = 7
+    views.radii[:] = 1
+    trainable = TrainableGaussians(random_gaussians(COUNT), LearningRates(), EXTENT)
+    for each in (densifier, baseline):
+        views.show(each, trainable)
+    torch.testing.assert_close(densifier.mean_gradient(), baseline.mean_gradient())
+    views.pixels[1:] = 0
+    views.show(densifier, trainable)
+    np.testing.assert_allclose(densifier.mean_gradient(), np.hypot(*views.gradients[0].T), rtol=1e-6)
+
+
+def test_large_gaussians_at_the_edge_of_views_are_not_held_back() -> None:
+    """The paper's motive: one view in which much of it is seen, three that see an edge and have no gradient."""
+    views, densifier, baseline = Views(0), PixelGS(near_fraction=None), ADC()
+    views.gradients[:] = 0
+    views.gradients[0] = 3e-4
+    views.pixels[:], views.pixels[0], views.radii[:] = 2, 600, 50
+    trainable = TrainableGaussians(random_gaussians(COUNT), LearningRates(), EXTENT)
+    for each in (densifier, baseline):
+        views.show(each, trainable)
+    assert (baseline.mean_gradient() < 2e-4).all()
+    assert (densifier.mean_gradient() > 4e-4).all()
+
+
+def test_a_hard_cap_takes_those_of_the_largest_weighted_gradient() -> None:
+    densifier = PixelGS(max_gaussians=COUNT + 5, cap="hard", prune_opacity=0.0)
+    trainable, views = started(1, densifier)
+    event = densifier.refine(600, trainable, torch.Generator())
+    assert event.after == COUNT + 5
+    parents = densifier.lineage.state_dict()["parents"][COUNT:].unique()
+    assert sorted(parents.tolist()) == sorted(np.argsort(-views.mean_gradient(0.37), kind="stable")[:5].tolist())
+
+
+def test_a_render_that_does_not_say_is_refused() -> None:
+    densifier = PixelGS()
+    densifier.begin(random_gaussians(2), DensifyContext(1.0))
+    points = torch.zeros(2, 2, requires_grad=True)
+    points.grad = torch.zeros(2, 2)
+    with pytest.raises(RuntimeError, match="footprint"):
+        densifier.observe(1, RenderOutput(torch.empty(0), torch.empty(0), torch.ones(2, dtype=torch.int32), points))
+
+
+@pytest.mark.parametrize("step", [600, 3100])
+@pytest.mark.parametrize("rate", [0.1, 0.5, 3.0])
+def test_quantile_round(rate: float, step: int) -> None:
+    """The share with the largest gradients grows as in ADC, nobody that was never seen; then the faintest go."""
+    densifier = QuantileADC(growth_rate=rate, prune_share=0.05)
+    trainable, _ = prepared(densifier, 4)
+    draws = np.random.default_rng(4)
+    gradient = draws.uniform(0, 1e-6, 60) * (draws.random(60) < 0.8)
+    densifier.statistics["gradient_sum"] = torch.from_numpy(gradient)
+    densifier.statistics["visible_count"][:] = 1
+    rows, expected = to_rows(trainable), {}
+    foreseen = densifier.forecast(Refinement(step, trainable, torch.Generator(), event=None))  # type: ignore[arg-type]
+    event = densifier.refine(step, trainable, torch.Generator().manual_seed(4))
+    places = min(int(60 * rate), int((gradient > 0).sum()))
+    chosen = np.zeros(60)
+    chosen[np.argsort(-gradient, kind="stable")[:places]] = 1
+    assert event.cloned + event.split_gradient == places
+    noise = iter(noise_of(4, [event.split_gradient]))
+    rows = restatement.adc_growth(rows, chosen, EXTENT, noise, expected)
+    limit = np.quantile([row["opacity_logits"] for row in rows], 0.05)
+    faint = [row["opacity_logits"] < limit for row in rows]
+    huge = [step > 3000 and np.exp(row["log_scales"]).max() > 0.1 * EXTENT for row in rows]
+    assert_same(trainable, [row for row, f, h in zip(rows, faint, huge, strict=True) if not f and not h])
+    assert event.pruned_opacity == sum(faint) > 0
+    assert event.balances()
+    assert event.after == foreseen
+
+
+def test_the_governor_moves_the_rate() -> None:
+    densifier = QuantileADC(max_gaussians=80, cap="governor", start=500, stop=1200, prune_share=0.0)
+    trainable, _ = prepared(densifier, 2)
+    densifier.statistics["gradient_sum"] += 1e-6
+    event = densifier.refine(1100, trainable, torch.Generator())
+    assert event.target == event.after == 80
+
+
+def least(matrix: np.ndarray) -> tuple[float, np.ndarray]:
+    values, vectors = np.linalg.eigh(matrix)
+    vector = vectors[:, 0]
+    return float(values[0]), vector * np.sign(vector[np.abs(vector).argmax()])
+
+
+def steep_gs_growth(
+    rows: list[restatement.Row],
+    gradient: np.ndarray,
+    matrices: np.ndarray,
+    noise: Iterator[np.ndarray],
+    rate: float,
+    threshold: float = -1e-6,
+    opacity: float = 0.5,
+) -> tuple[list[restatement.Row], int]:
+    """Two halves on either side along the least eigenvector for each that reaches .0002 and has an eigenvalue below.
+
+    Large: scales / 1.6, at the length of a draw each; small: as large as before, a step of the means away.
+    """
+    chosen = [
+        i for i in range(len(rows)) if gradient[i] >= 0.0002 and least(matrices[i])[0] * EXTENT * EXTENT < threshold
+    ]
+    children = []
+    for side in (1, -1):
+        for i in chosen:
+            scales, draw = np.exp(rows[i]["log_scales"]), next(noise)
+            large = scales.max() > 0.01 * EXTENT
+            length = np.sqrt(((draw * scales) ** 2).sum()) if large else rate
+            new = np.log(scales / 1.6) if large else rows[i]["log_scales"].copy()
+            child = restatement.newborn(rows[i], rows[i]["means"] + side * length * least(matrices[i])[1], new)
+            share = opacity / (1 + np.exp(-rows[i]["opacity_logits"]))
+            child["opacity_logits"] = np.log(share / (1 - share))
+            children.append(child)
+    return [row for i, row in enumerate(rows) if i not in chosen] + children, len(chosen)
+
+
+def given(densifier: SteepGS, seed: int, count: int = 60) -> tuple[np.ndarray, np.ndarray]:
+    """Statistics of three visible iterations: mean gradients [N] and symmetric matrices [N, 3, 3], per iteration."""
+    draw = np.random.default_rng(seed)
+    gradient = draw.uniform(0, 4e-4, count)
+    matrices = draw.normal(0, 1e-5, (count, 3, 3)) + 1e-5 * np.eye(3)
+    matrices += matrices.transpose(0, 2, 1)
+    densifier.statistics["gradient_sum"] = torch.from_numpy(3 * gradient)
+    densifier.statistics["splitting_sum"] = torch.from_numpy(3 * matrices)
+    densifier.statistics["visible_count"][:] = 3
+    return gradient, matrices
+
+
+@pytest.mark.parametrize("step", [600, 3100])
+@pytest.mark.parametrize("seed", range(3))
+def test_steep_gs_round(seed: int, step: int) -> None:
+    densifier = SteepGS()
+    trainable, _ = prepared(densifier, seed)
+    trainable.values.log_scales.data[::4] -= 3.0  # small ones, too
+    trainable.set_step(step)
+    gradient, matrices = given(densifier, seed)
+    rows, expected = to_rows(trainable), {}
+    foreseen = densifier.forecast(Refinement(step, trainable, torch.Generator(), event=None))  # type: ignore[arg-type]
+    rate = trainable.position_rate
+    event = densifier.refine(step, trainable, torch.Generator().manual_seed(seed))
+    noise = iter(noise_of(seed, [event.split_gradient]))
+    rows, chosen = steep_gs_growth(rows, gradient, matrices, noise, rate)
+    assert 0 < chosen < (gradient >= 0.0002).sum()
+    assert event.split_gradient == chosen
+    assert_same(trainable, restatement.prune(rows, step, EXTENT, expected))
+    assert expected == {name: getattr(event, name) for name in expected}
+    assert event.balances()
+    assert event.after == foreseen
+    assert not densifier.statistics["splitting_sum"].any()
+    assert densifier.statistics["splitting_sum"].shape == (len(trainable), 3, 3)
+
+
+def test_the_eigenvalue_is_one_of_the_mean_matrix_in_units_of_the_squared_extent() -> None:
+    densifier = SteepGS()
+    prepared(densifier, 0)
+    densifier.statistics["visible_count"][:] = 2
+    densifier.statistics["splitting_sum"][:] = torch.diag(torch.tensor([4e-8, -6e-8, 2e-8]))
+    values, directions = densifier.steepest(torch.tensor([0, 1]))
+    assert values.tolist() == pytest.approx([-3e-8 * EXTENT**2] * 2)
+    assert directions.tolist() == [[0.0, 1.0, 0.0]] * 2
+
+
+def test_each_ingredient_can_be_taken_out() -> None:
+    densifier = SteepGS(eigenvalue_threshold=None, opacity_factor=1.0)
+    trainable, _ = prepared(densifier, 1)
+    gradient, matrices = given(densifier, 1)
+    rows, rate = to_rows(trainable), trainable.position_rate
+    event = densifier.refine(600, trainable, torch.Generator().manual_seed(1))
+    assert event.split_gradient == (gradient >= 0.0002).sum()
+    noise = iter(noise_of(1, [event.split_gradient]))
+    rows, _ = steep_gs_growth(rows, gradient, matrices, noise, rate, threshold=np.inf, opacity=1.0)
+    assert_same(trainable, restatement.prune(rows, 600, EXTENT, {}))
+
+
+def test_under_a_hard_cap_those_come_first_whom_a_split_helps_most() -> None:
+    densifier = SteepGS(max_gaussians=63, cap="hard", prune_opacity=0.0)
+    trainable, _ = prepared(densifier, 2)
+    gradient, matrices = given(densifier, 2)
+    order = [i for i in np.argsort([least(m)[0] for m in matrices]) if gradient[i] >= 0.0002]
+    before = trainable.values.sh_dc.detach().clone()
+    event = densifier.refine(600, trainable, torch.Generator())
+    assert (event.split_gradient, event.after) == (3, 63)
+    assert event.blocked_by_cap > 0
+    kept = {tuple(row) for row in trainable.values.sh_dc.detach()[:57].tolist()}
+    gone = {i for i in range(60) if tuple(before[i].tolist()) not in kept}
+    assert gone == set(order[:3])
+
+
+def test_a_round_solves_for_the_eigenvectors_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    densifier = SteepGS()
+    trainable, _ = prepared(densifier, 1)
+    gradient, _ = given(densifier, 1)
+    solve, sizes = torch.linalg.eigh, []
+
+    def counting(matrices: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        sizes.append(len(matrices))
+        return solve(matrices)
+
+    monkeypatch.setattr(torch.linalg, "eigh", counting)
+    densifier.refine(600, trainable, torch.Generator())
+    assert sizes == [(gradient >= 0.0002).sum()]
+
+
+def test_the_matrices_of_visible_iterations_add_up() -> None:
+    densifier = SteepGS()
+    trainable, _ = prepared(densifier, 0)
+    count = len(trainable)
+    before = densifier.statistics["splitting_sum"].clone()
+    probe = torch.zeros(count, 3, 3, requires_grad=True)
+    probe.grad = torch.arange(9.0).reshape(3, 3).expand(count, 3, 3)
+    points = torch.zeros(count, 2, dtype=torch.float64, requires_grad=True)
+    points.grad = torch.zeros(count, 2, dtype=torch.float64)
+    radii = torch.ones(count, dtype=torch.int32)
+    render = RenderOutput(torch.empty(0), torch.empty(0), radii, points, splitting_probe=probe)
+    densifier.observe(7, render)
+    densifier.observe(8, render)
+    torch.testing.assert_close(densifier.statistics["splitting_sum"] - before, 2 * probe.grad)
+    densifier.observe(densifier.stop, render)
+    torch.testing.assert_close(densifier.statistics["splitting_sum"] - before, 2 * probe.grad)
+    render.splitting_probe = None
+    with pytest.raises(RuntimeError, match="splitting_matrix=True"):
+        densifier.observe(9, render)
+
+
+WINDOW = {"start": 700, "stop": 12_000}  # of the authors
+
+
+def opacity(row: restatement.Row) -> float:
+    return 1 / (1 + np.exp(-row["opacity_logits"]))
+
+
+def with_opacity(row: restatement.Row, value: float, moments: bool = True) -> restatement.Row:
+    changed = row | {"opacity_logits": np.log(value / (1 - value))}
+    return (
+        changed if moments else changed | {f"{moment} opacity_logits": np.zeros(()) for moment in ("first", "second")}
+    )
+
+
+def residual_split(
+    rows: list[restatement.Row], gradient: np.ndarray, levels: np.ndarray, stage: int, noise: object
+) -> tuple[list[restatement.Row], int]:
+    """Who reaches .00067 times 2^((level - stage) / 3), or .00067 at the stage and above, keeps .3 of its opacity and
+    gets a child: drawn from it, 1.6 times smaller, as opaque as it was."""
+    parents, children = [], []
+    for i, row in enumerate(rows):
+        threshold = 0.00067 * (2 ** ((levels[i] - stage) / 3) if levels[i] < stage else 1)
+        if gradient[i] < threshold:
+            parents.append(row)
+            continue
+        scales = np.exp(row["log_scales"])
+        offset = restatement.rotation(row["quaternions"]) @ (scales * next(noise))  # type: ignore[call-overload]
+        children.append(restatement.newborn(row, row["means"] + offset, np.log(scales / 1.6)))
+        parents.append(with_opacity(row, 0.3 * opacity(row), moments=False))
+    return parents + children, len(children)
+
+
+@pytest.mark.parametrize(("step", "stage"), [(800, 1), (2400, 3), (4100, 5)])
+@pytest.mark.parametrize("seed", range(2))
+def test_res_gs_round(seed: int, step: int, stage: int) -> None:
+    densifier = ResGS(**WINDOW)  # type: ignore[arg-type]
+    trainable, _ = prepared(densifier, seed)
+    draw = np.random.default_rng(seed)
+    gradient, levels = draw.uniform(0, 1e-3, 60), draw.integers(0, 8, 60)
+    densifier.statistics["gradient_sum"] = torch.from_numpy(gradient)
+    densifier.statistics["visible_count"][:] = 1
+    densifier.statistics["level"] = torch.from_numpy(levels.astype(np.int32))
+    rows = to_rows(trainable)
+    foreseen = densifier.forecast(Refinement(step, trainable, torch.Generator(), event=None))  # type: ignore[arg-type]
+    event = densifier.refine(step, trainable, torch.Generator().manual_seed(seed))
+    noise = torch.randn(event.split_gradient, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    grown, count = residual_split(rows, gradient, levels, stage, iter(noise.numpy()))
+    assert event.split_gradient == count > 0
+    kept = [row for row in grown if opacity(row) >= 0.005]
+    assert_same(trainable, kept)
+    assert (event.pruned_opacity, event.pruned_size, event.cloned) == (len(grown) - len(kept), 0, 0)
+    assert event.balances()
+    assert event.after == foreseen
+    below = [0.00067 * (2 ** ((level - stage) / 3) if level < stage else 1) for level in levels]
+    children = [level + 1 for level, value, least in zip(levels, gradient, below, strict=True) if value >= least]
+    everybody = [*levels, *children]
+    expected = [level for level, row in zip(everybody, grown, strict=True) if opacity(row) >= 0.005]
+    assert densifier.statistics["level"].tolist() == expected  # and a round does not forget them
+    assert not densifier.statistics["gradient_sum"].any()
+
+
+def test_the_stages_are_those_of_the_authors_loop() -> None:
+    """Their counters, one iteration after another: three parts of each phase, changes at 2,500 and 6,000, a pause of
+    500 iterations after each."""
+    changes, level, warm, last, ahead = [2500, 6000], 1, 0, 700, 2500
+    count = (ahead - last) // 3
+    stages, paused, reached = {}, {}, 0
+    for step in range(1, 12_000):
+        stages[step], paused[step] = level, warm != 0
+        if step in changes:
+            reached += 1
+            warm, last = 500, step + 500
+            ahead = changes[reached] if reached < 2 else 12_000
+            level, count = 3 * reached + 1, (ahead - last) // 3
+        if warm:
+            warm -= 1
+        if count and not warm and 700 < step < 12_000:
+            count -= 1
+            if count == 0:
+                level += 1
+                count = (ahead - last) // 3
+    densifier = ResGS(**WINDOW)  # type: ignore[arg-type]
+    for step in range(800, 12_000, 100):
+        assert densifier.warming_up(step) == paused[step], step
+        if not paused[step]:
+            assert densifier.stage(step) == stages[step], step
+    assert {stages[step] for step in range(800, 12_000, 100)} == set(range(1, 10))
+
+
+def test_from_the_end_of_the_first_phase_on_all_opacities_fade_every_500_iterations() -> None:
+    densifier = ResGS(**WINDOW)  # type: ignore[arg-type]
+    faded, pruned = [], []
+    for step in range(500, 26_000, 500):
+        trainable, _ = prepared(densifier, 3)
+        densifier.statistics["gradient_sum"].zero_()
+        before = trainable.values.opacities.detach().clone()
+        event = densifier.refine(step, trainable, torch.Generator())
+        if event is None:
+            continue
+        kept = before[before >= 0.005] if event.pruned_opacity else before
+        ratio = trainable.values.opacities.detach() / kept
+        assert not event.opacity_reset
+        if (ratio < 0.9).any():
+            torch.testing.assert_close(ratio, torch.full_like(ratio, 0.8))
+            assert not trainable.adam["opacity_logits"].first.any()
+            faded.append(step)
+            if step >= 12_000:
+                pruned.append(event.pruned_opacity)
+    assert faded == list(range(2500, 25_000, 500))  # their level has gone up when they ask: 45 times
+    assert min(pruned) > 0
+
+
+def test_gradients_are_gathered_from_500_on_but_not_in_the_pauses() -> None:
+    densifier = ResGS(**WINDOW)  # type: ignore[arg-type]
+    trainable, _ = prepared(densifier, 0)
+    rng = np.random.default_rng(0)
+    for step in (500, 2501, 2999, 6001):
+        observe(densifier, trainable, rng, step)
+        assert not densifier.statistics["visible_count"].any(), step
+    for step in (501, 2500, 3000, 6500):
+        observe(densifier, trainable, rng, step)
+        assert densifier.statistics["visible_count"].any(), step
+        densifier.statistics["visible_count"].zero_()
+
+
+def test_in_a_short_window_there_is_no_pause_and_phases_must_rise() -> None:
+    densifier = ResGS(start=200, stop=1000)
+    assert [densifier.stage(step) for step in range(300, 1000, 100)] == sorted(
+        densifier.stage(step) for step in range(300, 1000, 100)
+    )
+    assert not any(densifier.warming_up(step) for step in range(1000))
+    with pytest.raises(InputError, match=r"densify\.phase_ends must rise"):
+        ResGS(phase_ends=[0.5, 0.2])
+
+
+def test_a_governed_round_ends_at_its_target() -> None:
+    densifier = ResGS(max_gaussians=90, cap="governor", start=500, stop=1200)
+    trainable, _ = prepared(densifier, 2)
+    trainable.values.opacity_logits.data[:] = 1.0
+    densifier.statistics["gradient_sum"] = 1e-3 * torch.rand(60, generator=torch.Generator().manual_seed(0))
+    densifier.statistics["visible_count"][:] = 1
+    event = densifier.refine(1100, trainable, torch.Generator())
+    assert event.target == event.after == 90
+
+
+def test_a_hard_cap_admits_the_largest_gradients() -> None:
+    densifier = ResGS(max_gaussians=63, cap="hard", **WINDOW)  # type: ignore[arg-type]
+    trainable, _ = prepared(densifier, 2)
+    trainable.values.opacity_logits.data[:] = 1.0
+    densifier.statistics["gradient_sum"] = torch.arange(60, dtype=torch.float64)
+    densifier.statistics["visible_count"][:] = 1
+    event = densifier.refine(800, trainable, torch.Generator())
+    assert (event.split_gradient, event.after) == (3, 63)
+    assert event.blocked_by_cap == 56

@@ -1,0 +1,341 @@
+"""Improved-GS and GNS against restatements, one Gaussian at a time."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from gsbench.densify import GNS, DensifyContext, EdgeAware, LongAxis, Refinement
+from gsbench.densify.scores import draw
+from gsbench.gaussians.model import Gaussians
+from gsbench.gaussians.paper_values import LearningRates
+from gsbench.gaussians.trainable import TrainableGaussians
+from gsbench.raster.base import RenderOutput
+from tests.densify import restatement
+from tests.densify.test_rounds import EXTENT, assert_same, observe, prepared, to_rows
+from tests.densify.test_scores import COUNT, Room, alphas, at, find_edges, over_mean, started
+from tests.gaussians.helpers import random_gaussians
+
+
+def halves(rows: list[restatement.Row], mean_gradient: np.ndarray) -> list[restatement.Row]:
+    """d = 0.45: centres at 3 d s along the longest axis; that axis times 0.55, the others times sqrt(1 - 0.2025)."""
+    chosen = [i for i in range(len(rows)) if mean_gradient[i] >= 0.0008]
+    children = []
+    for side in (1, -1):
+        for i in chosen:
+            scales = np.exp(rows[i]["log_scales"])
+            longest = int(np.argmax(scales))
+            axis = restatement.rotation(rows[i]["quaternions"]) @ np.eye(3)[longest]
+            new = scales * 0.7975**0.5
+            new[longest] = 0.55 * scales[longest]
+            child = restatement.newborn(rows[i], rows[i]["means"] + side * 1.35 * scales[longest] * axis, np.log(new))
+            opacity = 0.6 / (1 + np.exp(-rows[i]["opacity_logits"]))
+            child["opacity_logits"] = np.log(opacity / (1 - opacity))
+            children.append(child)
+    return [row for i, row in enumerate(rows) if i not in chosen] + children
+
+
+@pytest.mark.parametrize("step", [600, 3100])
+@pytest.mark.parametrize("seed", range(3))
+def test_long_axis_round(seed: int, step: int) -> None:
+    densifier = LongAxis(gradient="absolute", gradient_threshold=0.0008)
+    trainable, _ = prepared(densifier, seed)
+    gradient = np.random.default_rng(seed).uniform(0, 0.0016, len(trainable))
+    densifier.statistics["gradient_sum"] = torch.from_numpy(gradient)
+    densifier.statistics["visible_count"][:] = 1
+    rows, expected = to_rows(trainable), {}
+    foreseen = densifier.forecast(Refinement(step, trainable, torch.Generator(), event=None))  # type: ignore[arg-type]
+    event = densifier.refine(step, trainable, torch.Generator())
+    grown = halves(rows, gradient)
+    assert event.split_gradient == len(grown) - len(rows) > 0
+    assert event.cloned == 0
+    assert_same(trainable, restatement.prune(grown, step, EXTENT, expected))
+    assert expected == {name: getattr(event, name) for name in expected}
+    assert event.balances()
+    assert event.after == foreseen
+
+
+def test_a_hard_cap_holds() -> None:
+    densifier = LongAxis(max_gaussians=70, cap="hard", gradient_threshold=1e-6)
+    trainable, _ = prepared(densifier, 1)
+    event = densifier.refine(600, trainable, torch.Generator())
+    assert event.before + event.split_gradient == 70
+    assert event.blocked_by_cap > 0
+    assert event.balances()
+
+
+def opacity(row: restatement.Row) -> float:
+    return 1 / (1 + np.exp(-row["opacity_logits"]))
+
+
+def expected_scores(gaussians: object, views: list[int]) -> np.ndarray:
+    room, total = Room(), np.zeros(COUNT)
+    for view in views:
+        weights = alphas(gaussians, room.cameras[view])  # type: ignore[arg-type]
+        total += over_mean((weights * find_edges(room.images[view])).sum((1, 2))) / len(views)
+    return total
+
+
+@pytest.mark.parametrize(("step", "views"), [(700, 2), (3400, 3), (6400, 3), (9400, 2)])
+def test_the_edge_aware_score_of_each_gaussian(step: int, views: int) -> None:
+    """The mean over the views drawn, each over its own mean; 400 iterations after the first two resets, over all."""
+    densifier = EdgeAware(score_views=2)
+    trainable, _ = started(densifier, step)
+    with torch.no_grad():
+        scores = densifier.scores(trainable.values, step, torch.Generator().manual_seed(step))
+    drawn = torch.randperm(3, generator=torch.Generator().manual_seed(step))[:views].tolist()
+    np.testing.assert_allclose(scores, expected_scores(trainable.values.detach(), drawn), rtol=1e-6, atol=1e-9)
+
+
+def test_in_the_last_500_iterations_the_score_is_the_gradient_and_more_are_candidates() -> None:
+    densifier = EdgeAware(gradient_threshold=3e-4)
+    trainable, gradient = started(densifier, 0)
+    for step, threshold in ((14_500, 3e-4), (14_600, 2e-4)):
+        over, _ = densifier.candidates(at(step, trainable, torch.Generator()))
+        np.testing.assert_array_equal(over, gradient >= threshold)
+    np.testing.assert_allclose(densifier.scores(trainable.values, 14_600, torch.Generator()), gradient)
+    full = EdgeAware(gradient_threshold=3e-4, max_gaussians=COUNT)
+    trainable, _ = started(full, 0)
+    over, _ = full.candidates(at(14_600, trainable, torch.Generator()))
+    np.testing.assert_array_equal(over, gradient >= 3e-4)  # no room: the threshold stays
+
+
+@pytest.mark.parametrize("step", [600, 3100, 14_900])
+@pytest.mark.parametrize("seed", range(2))
+def test_edge_aware_round(seed: int, step: int) -> None:
+    """Who is drawn becomes two halves along the longest axis; the faint go but in the last round, the huge stay."""
+    densifier = EdgeAware(gradient_threshold=3e-4, max_gaussians=COUNT + 9, cap="hard")
+    trainable, gradient = started(densifier, seed)
+    trainable.values.opacity_logits.data[3] = -9.0
+    rows = to_rows(trainable)
+    event = densifier.refine(step, trainable, torch.Generator().manual_seed(seed))
+    over = gradient >= (2e-4 if step > 14_500 else 3e-4)
+    assert event.split_gradient == 9
+    assert event.blocked_by_cap == over.sum() - 9
+    rng = torch.Generator().manual_seed(seed)
+    with torch.no_grad():
+        twin, _ = started(densifier, seed)
+        twin.values.opacity_logits.data[3] = -9.0
+        scores = densifier.scores(twin.values, step, rng)
+    drawn = draw(torch.from_numpy(over) & (scores > 0), scores, 9, rng).numpy()
+    assert not (drawn & ~over).any()
+    grown = halves(rows, np.where(drawn, 1.0, 0.0))
+    kept = [row for row in grown if step == 14_900 or opacity(row) >= 0.005]
+    assert_same(trainable, kept)
+    assert (event.pruned_opacity, event.pruned_size) == (len(grown) - len(kept), 0)
+    assert (len(kept) < len(grown)) == (step != 14_900)
+    assert max(np.exp(row["log_scales"]).max() for row in kept) > 0.1 * EXTENT
+    assert event.balances()
+
+
+def test_a_candidate_that_covers_no_edge_is_not_split_though_there_is_room() -> None:
+    densifier = EdgeAware(gradient_threshold=1e-9, max_gaussians=10 * COUNT, cap="hard", prune_opacity=0.0)
+    trainable, gradient = started(densifier, 1)
+    scores = expected_scores(trainable.values.detach(), [0, 1, 2])
+    assert 0 < (scores == 0).sum() < COUNT
+    event = densifier.refine(700, trainable, torch.Generator().manual_seed(0))
+    assert event.split_gradient == ((scores > 0) & (gradient >= 1e-9)).sum()
+    assert event.blocked_by_cap == ((scores == 0) & (gradient >= 1e-9)).sum()
+
+
+@pytest.mark.parametrize("room", [0, 9])
+def test_where_nothing_can_grow_no_view_is_rendered(room: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without room all candidates are told as blocked; without candidates none is."""
+    densifier = EdgeAware(max_gaussians=COUNT + room, cap="hard")
+    trainable, _ = started(densifier, 0)
+    monkeypatch.delattr(EdgeAware, "scores")
+    candidates = torch.zeros(COUNT, dtype=torch.bool)
+    candidates[: 0 if room else 5] = True
+    chosen, blocked = densifier.choose(at(600, trainable, torch.Generator()), candidates, 1)
+    assert not chosen.any()
+    assert blocked == candidates.sum()
+
+
+def test_the_growth_control_is_a_root() -> None:
+    densifier = EdgeAware(max_gaussians=10_000, start=500, stop=15_000)
+    trainable, _ = started(densifier, 0)
+    rng = torch.Generator()
+    allowed = [densifier.allowance(at(step, trainable, rng)) for step in (600, 7500, 14_500, 14_900)]
+    assert allowed == [int(10_000 * np.sqrt(x)) - COUNT for x in (100 / 14_000, 0.5, 1, 1)]
+    densifier.max_gaussians = COUNT
+    assert densifier.allowance(at(7500, trainable, rng)) == 0
+    event = densifier.refine(7500, trainable, rng)
+    assert event.split_gradient == 0
+    assert event.blocked_by_cap > 0
+
+
+def test_the_prunings_of_the_schedule() -> None:
+    """At iteration 300 below .02; at 3,300 and 6,300, after the round, the faintest fifth; resets go to .05."""
+    densifier, events = EdgeAware(max_gaussians=60), {}
+    for step in (299, 300, 3000, 3200, 3300, 6300, 9300, 12_300, 15_300):
+        trainable, _ = prepared(densifier, 2)
+        rows = to_rows(trainable)
+        densifier.statistics["gradient_sum"].zero_()  # nobody grows
+        event = events[step] = densifier.refine(step, trainable, torch.Generator())
+        if step == 3000:
+            assert max(opacity(row) for row in to_rows(trainable)) == pytest.approx(0.05)
+            continue
+        if step == 300:
+            rows = [row for row in rows if opacity(row) >= 0.02]
+        elif event is not None:
+            rows = [row for row in rows if opacity(row) >= 0.005]
+            if step in (3300, 6300):
+                fifth = np.quantile([opacity(row) for row in rows], 0.2)
+                rows = [row for row in rows if opacity(row) >= fifth]
+        assert_same(trainable, rows)
+        assert event is None or (event.balances() and event.after == len(rows) < event.before)
+    assert [step for step, event in events.items() if event is None] == [299, 15_300]
+
+
+def test_gradients_are_gathered_from_iteration_500_on() -> None:
+    densifier = EdgeAware()
+    trainable, _ = prepared(densifier, 0)  # shows it iterations 1 to 3
+    assert not densifier.statistics["visible_count"].any()
+    observe(densifier, trainable, np.random.default_rng(0), 501)
+    assert densifier.statistics["visible_count"].any()
+
+
+def begun(**options: object) -> tuple[GNS, Gaussians]:
+    densifier, gaussians = GNS(**options), random_gaussians(50, 1)  # type: ignore[arg-type]
+    gaussians.opacity_logits.copy_(torch.linspace(-6, 5, 50, dtype=torch.float64))
+    densifier.begin(gaussians, DensifyContext(4.0))
+    return densifier, gaussians
+
+
+def seen(densifier: GNS, step: int) -> None:
+    points = torch.zeros(50, 2, dtype=torch.float64, requires_grad=True)
+    points.grad = torch.zeros(50, 2, dtype=torch.float64)
+    radii = torch.ones(50, dtype=torch.int32)
+    densifier.observe(step, RenderOutput(torch.empty(0), torch.empty(0), radii, points, points.grad))
+
+
+def restated(densifier: GNS, logits: np.ndarray, weight: float, soft: bool) -> float:
+    if not soft:
+        return 3 * weight * (logits.mean() + 20) ** 2
+    opacities = 1 / (1 + np.exp(-logits))
+    return weight * ((logits + 20) / np.maximum(0.05, 1 - opacities)).mean() ** 2
+
+
+@pytest.mark.parametrize(("step", "soft"), [(15_001, True), (15_951, True), (16_001, False), (22_951, False)])
+def test_the_pressure_and_its_gradient(step: int, soft: bool) -> None:
+    """Against the formula and its central differences, also through the divisor."""
+    densifier, gaussians = begun(max_gaussians=20)
+    densifier.step = step - 1
+    gaussians = gaussians.map(lambda tensor: tensor.clone().requires_grad_(True))
+    term = densifier.regularizer(gaussians)
+    assert term is not None
+    logits = gaussians.opacity_logits.detach().numpy()
+    assert term.item() == pytest.approx(restated(densifier, logits, 2e-4, soft), rel=1e-12)
+    (gradient,) = torch.autograd.grad(term, gaussians.opacity_logits)
+    for i in (0, 25, 40, 49):
+        moved = [logits + sign * 1e-6 * np.eye(50)[i] for sign in (1, -1)]
+        up, down = (restated(densifier, m, 2e-4, soft) for m in moved)
+        assert float(gradient[i]) == pytest.approx((up - down) / 2e-6, rel=1e-5)
+
+
+@pytest.mark.parametrize("sinks", [0.0, 2.0])
+def test_the_weight_follows_an_aim_that_falls_to_nothing(sinks: float) -> None:
+    """The authors' schedule, iteration by iteration, for opacities that stay once the first has set the aim.
+
+    Where they sank, the weight falls first, rests while the aim passes, and rises.
+    """
+    densifier, gaussians = begun(max_gaussians=20)
+    last = float(gaussians.opacities.sort(descending=True).values[19])
+    weight, aim, acted = 2e-4, None, []
+    for step in range(14_990, 23_010):
+        densifier.step = step - 1
+        term = densifier.regularizer(gaussians)
+        if not (15_000 <= step <= 23_000 and (step - 1) % 50 == 0):
+            assert term is None, step
+            continue
+        if aim is None:
+            aim = 0.8 * last
+        elif (step - 1) % 100 == 0:
+            goal = max(0, (1 - (step - 15_000) / 7000) * aim)
+            weight *= 0.8 if last < 0.9 * goal else 1.2 if last > 1.1 * goal else 1
+        acted.append(step)
+        assert densifier.weight == pytest.approx(weight, rel=1e-12)
+        assert float(term) == pytest.approx(
+            restated(densifier, gaussians.opacity_logits.numpy(), weight, step < 16_000), rel=1e-9
+        )
+        if len(acted) == 1:
+            gaussians.opacity_logits.sub_(sinks)
+            last = float(gaussians.opacities.sort(descending=True).values[19])
+    assert acted == list(range(15_001, 23_001, 50))
+
+
+@pytest.mark.parametrize(("budget", "place"), [(20, 19), (17, 16), (50, 49), (70, 49)])
+def test_the_aim_starts_from_the_last_gaussian_within_the_budget(budget: int, place: int) -> None:
+    densifier, gaussians = begun(max_gaussians=budget)
+    densifier.step = 15_000
+    densifier.regularizer(gaussians)
+    assert densifier.aim == pytest.approx(0.8 * sorted(gaussians.opacities.tolist(), reverse=True)[place])
+
+
+def test_it_grows_to_three_times_the_budget_and_selects_down_to_it() -> None:
+    densifier = GNS(max_gaussians=40)
+    trainable, _ = started(densifier, 0)
+    rng = torch.Generator().manual_seed(0)
+    assert densifier.allowance(at(14_500, trainable, rng)) == 120 - COUNT
+    assert densifier.refine(15_000, trainable, rng) is not None  # the learning rate
+    assert trainable.adam["opacity_logits"].rate == pytest.approx(4 * 0.05)
+    assert densifier.refine(15_050, trainable, rng) is None
+    assert densifier.refine(15_950, trainable, rng) is None  # nobody is pruned yet
+    trainable.values.opacity_logits.data[:10] = -8.0  # .0003
+    event = densifier.refine(16_000, trainable, rng)
+    assert (event.pruned_opacity, event.after) == (10, COUNT - 10)
+    trainable.values.opacity_logits.data[:9] = -8.0
+    event = densifier.refine(16_050, trainable, rng)
+    assert event.after == 41
+    opaque = trainable.values.opacities.detach().clone()
+    opaque[0] = opaque[1] = 0
+    trainable.values.opacity_logits.data[:2] = -40.0
+    event = densifier.refine(16_051, trainable, rng)  # within 5 %: the rest is drawn
+    assert (event.pruned_opacity, event.after) == (1, 40)
+    least = trainable.values.opacities.detach().sort().values
+    assert float(least[0]) < 1e-9 < float(least[1])
+    assert densifier.regularizer(trainable.values) is None
+    assert [densifier.refine(step, trainable, rng) for step in (16_100, 17_050, 23_000)] == [None] * 3
+    assert trainable.adam["opacity_logits"].rate == pytest.approx(4 * 0.05)
+    assert densifier.refine(17_051, trainable, rng).balances()
+    assert trainable.adam["opacity_logits"].rate == pytest.approx(0.05)
+
+
+def test_at_the_end_of_its_time_the_budget_is_met_whatever_the_opacities(caplog: pytest.LogCaptureFixture) -> None:
+    densifier = GNS(max_gaussians=20)
+    trainable, _ = started(densifier, 0)
+    event = densifier.refine(23_000, trainable, torch.Generator().manual_seed(0))
+    assert (event.pruned_opacity, event.after) == (COUNT - 20, 20)
+    assert event.balances()
+    assert f"ended with {COUNT} Gaussians, and {COUNT - 20} of them were removed at random" in caplog.text
+
+
+def test_a_selection_that_has_met_its_budget_warns_of_nothing(caplog: pytest.LogCaptureFixture) -> None:
+    densifier = GNS(max_gaussians=COUNT - 1)
+    trainable, _ = started(densifier, 0)
+    assert densifier.refine(16_050, trainable, torch.Generator().manual_seed(0)).after == COUNT - 1
+    assert caplog.text == ""
+
+
+def test_the_selection_survives_saving() -> None:
+    densifier, gaussians = begun(max_gaussians=20)
+    for step in range(15_000, 15_200):
+        densifier.regularizer(gaussians)
+        seen(densifier, step)
+    twin, _ = begun(max_gaussians=20)
+    twin.load_state_dict(densifier.state_dict(), DensifyContext(4.0))
+    for step in range(15_200, 15_400):
+        first, second = (d.regularizer(gaussians) for d in (densifier, twin))
+        assert (first is None) == (second is None) == ((step - 1) % 50 != 0)
+        assert first is None or float(first) == float(second)  # type: ignore[arg-type]
+        seen(densifier, step)
+        seen(twin, step)
+    assert twin.weight == densifier.weight != 2e-4
+
+
+def test_the_rate_of_a_parameter_is_kept_in_its_state() -> None:
+    trainable = TrainableGaussians(random_gaussians(4), LearningRates(), 1.0)
+    trainable.set_rate("opacity_logits", 0.2)
+    again = TrainableGaussians.load(trainable.state_dict(), LearningRates(), 1.0)
+    assert again.adam["opacity_logits"].rate == 0.2
