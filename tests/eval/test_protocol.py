@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -76,7 +77,10 @@ def test_missing_weights_are_named_and_nothing_stands_in_for_them() -> None:
 @pytest.mark.shared
 def test_lpips_variants_see_the_range_that_their_name_says(shared: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     squeeze = find_metric("lpips_squeeze")
-    raw = replace(squeeze, key="lpips_squeeze_raw", options={"net": "squeeze", "raw": True})
+    raw = replace(squeeze, key="lpips_squeeze_raw")
+    assert evaluator_module.MEASURES["lpips_vgg_raw"].keywords == {"net": "vgg", "raw": True}
+    like_vgg_raw = partial(evaluator_module.LpipsMetric, net="squeeze", raw=True)
+    monkeypatch.setitem(evaluator_module.MEASURES, raw.key, like_vgg_raw)
     monkeypatch.setattr(facts, "METRICS", (squeeze, raw))
     monkeypatch.setattr(evaluator_module, "METRICS", (squeeze, raw))
     evaluator = Evaluator(PAPER, lpips=["squeeze", "squeeze_raw"], flip=False, weights=shared / "weights")

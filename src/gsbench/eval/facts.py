@@ -4,9 +4,7 @@ A metric of your own needs no entry here: ``eval.extra.NAME._target_=mine.MyMetr
 """
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
-from typing import Any
+from dataclasses import dataclass, fields
 
 from gsbench.errors import InputError
 from gsbench.runs.trial_record import MetricRecord
@@ -28,8 +26,6 @@ class MetricFacts:
     worthwhile: float | None = None  # the smallest difference worth resolving, about what papers claim as improvements
     perceptual: bool = False  # meant to agree with human vision
     setting: str = ""  # the setting that requests it; empty: it is always computed
-    target: str = field(default="", repr=False)  # import path of the class that computes it
-    options: Mapping[str, Any] = field(default_factory=dict, repr=False)  # of that class
     lowest: float | None = None  # lower bound of its values; None: none or unknown
     highest: float | None = None  # upper bound
     words: str = ""  # what it measures
@@ -40,87 +36,35 @@ class MetricFacts:
         return f"{self.label} ({self.unit})" if self.unit else self.label
 
 
-MEASURES = "gsbench.eval.measures"  # the module of the classes
+def _lpips(variant: str, label: str, words: str) -> MetricFacts:
+    return MetricFacts(f"{LPIPS}{variant}", label, -1, 3, "", 0.005, True, "eval.lpips", 0.0, words=words)
 
 
-def _lpips(variant: str, label: str, net: str, raw: bool = False) -> MetricFacts:
-    """LPIPS by the network ``net``, fed [-1, 1] as it is defined, or [0, 1] (``raw``) as in 3DGS's evaluation."""
-    return MetricFacts(
-        f"{LPIPS}{variant}",
-        label,
-        -1,
-        3,
-        "",
-        0.005,
-        True,
-        setting="eval.lpips",
-        target=f"{MEASURES}.LpipsMetric",
-        options={"net": net, "raw": raw},
-        lowest=0.0,
-        words=f"distance of what {net} sees{', fed [0, 1]' if raw else ''}",
-    )
-
-
-def _structural(key: str, label: str, direction: int, class_name: str, highest: float, words: str) -> MetricFacts:
+def _structural(key: str, label: str, direction: int, highest: float, words: str) -> MetricFacts:
     """A metric of structure without weights, computed if ``eval.more`` names it."""
-    return MetricFacts(
-        key,
-        label,
-        direction,
-        4,
-        "",
-        0.002,
-        True,
-        setting=MORE,
-        target=f"{MEASURES}.{class_name}",
-        lowest=0.0,
-        highest=highest,
-        words=words,
-    )
+    return MetricFacts(key, label, direction, 4, "", 0.002, True, MORE, 0.0, highest, words)
 
 
-METRICS = (
+METRICS = (  # `gsbench.eval.evaluator.MEASURES` has the class of each
+    MetricFacts("psnr", "PSNR", 1, 2, "dB", 0.1, lowest=0.0, words="mean squared error, logarithmic"),
     MetricFacts(
-        "psnr", "PSNR", 1, 2, "dB", 0.1, target=f"{MEASURES}.Psnr", lowest=0.0, words="mean squared error, logarithmic"
+        "ssim", "SSIM", 1, 3, "", 0.005, False, "", -1.0, 1.0, "means, contrast and structure in windows of 11 px"
     ),
+    _lpips("vgg_raw", "LPIPS VGG raw", "distance of what vgg sees, fed [0, 1]"),
+    _lpips("vgg", "LPIPS VGG", "distance of what vgg sees"),
+    _lpips("alex", "LPIPS Alex", "distance of what alex sees"),
+    _lpips("squeeze", "LPIPS Squeeze", "distance of what squeeze sees"),
     MetricFacts(
-        "ssim",
-        "SSIM",
-        1,
-        3,
-        "",
-        0.005,
-        target=f"{MEASURES}.Ssim",
-        lowest=-1.0,
-        highest=1.0,
-        words="means, contrast and structure in windows of 11 px",
+        "flip", "FLIP", -1, 3, "", 0.005, True, "eval.flip", 0.0, 1.0, "difference one sees when two images alternate"
     ),
-    _lpips("vgg_raw", "LPIPS VGG raw", "vgg", raw=True),
-    _lpips("vgg", "LPIPS VGG", "vgg"),
-    _lpips("alex", "LPIPS Alex", "alex"),
-    _lpips("squeeze", "LPIPS Squeeze", "squeeze"),
-    MetricFacts(
-        "flip",
-        "FLIP",
-        -1,
-        3,
-        "",
-        0.005,
-        True,
-        setting="eval.flip",
-        target=f"{MEASURES}.Flip",
-        lowest=0.0,
-        highest=1.0,
-        words="difference that one sees when two images alternate",
-    ),
-    _structural("ms_ssim", "MS-SSIM", 1, "MsSsim", 1.0, "SSIM's structure at five scales"),
-    _structural("iw_ssim", "IW-SSIM", 1, "IwSsim", 1.0, "the same, weighted by the information that a place carries"),
-    _structural("fsim", "FSIMc", 1, "Fsim", 1.0, "edges and lines: phase congruency, contrast and colour there"),
-    _structural("gmsd", "GMSD", -1, "Gmsd", 0.5, "how unevenly the gradients agree"),
+    _structural("ms_ssim", "MS-SSIM", 1, 1.0, "SSIM's structure at five scales"),
+    _structural("iw_ssim", "IW-SSIM", 1, 1.0, "the same, weighted by the information that a place carries"),
+    _structural("fsim", "FSIMc", 1, 1.0, "edges and lines: phase congruency, contrast and colour there"),
+    _structural("gmsd", "GMSD", -1, 0.5, "how unevenly the gradients agree"),
 )
 # A fact about the trained model instead of its pictures, measured separately in the evaluation.
 FPS = MetricFacts(
-    "fps", "speed", 1, 2, "frames/s", setting="eval.fps", lowest=0.0, words="renders of the test views at one size"
+    "fps", "speed", 1, 2, "frames/s", None, False, "eval.fps", 0.0, words="renders of the test views at one size"
 )
 ALL = (*METRICS, FPS)  # in the order of tables
 

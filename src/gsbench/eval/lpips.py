@@ -48,12 +48,16 @@ class Fire(nn.Module):
         return torch.cat([self.expand1x1(squeezed), self.expand3x3(squeezed)], dim=1).relu_()  # [B, 2 * expanded, H, W]
 
 
+def _convolution(channels: int, width: int, size: int, stride: int = 1, padding: int = 0) -> list[nn.Module]:
+    return [nn.Conv2d(channels, width, size, stride, padding), nn.ReLU(inplace=True)]
+
+
 def _vgg16() -> nn.Sequential:
     layers: list[nn.Module] = []
     channels = 3
     for width, repeats in ((64, 2), (128, 2), (256, 3), (512, 3), (512, 3)):
         for _ in range(repeats):
-            layers += [nn.Conv2d(channels, width, 3, padding=1), nn.ReLU(inplace=True)]
+            layers += _convolution(channels, width, 3, padding=1)
             channels = width
         layers.append(nn.MaxPool2d(2))
     return nn.Sequential(*layers)
@@ -61,26 +65,20 @@ def _vgg16() -> nn.Sequential:
 
 def _alexnet() -> nn.Sequential:
     return nn.Sequential(
-        nn.Conv2d(3, 64, 11, stride=4, padding=2),
-        nn.ReLU(inplace=True),
+        *_convolution(3, 64, 11, stride=4, padding=2),
         nn.MaxPool2d(3, 2),
-        nn.Conv2d(64, 192, 5, padding=2),
-        nn.ReLU(inplace=True),
+        *_convolution(64, 192, 5, padding=2),
         nn.MaxPool2d(3, 2),
-        nn.Conv2d(192, 384, 3, padding=1),
-        nn.ReLU(inplace=True),
-        nn.Conv2d(384, 256, 3, padding=1),
-        nn.ReLU(inplace=True),
-        nn.Conv2d(256, 256, 3, padding=1),
-        nn.ReLU(inplace=True),
+        *_convolution(192, 384, 3, padding=1),
+        *_convolution(384, 256, 3, padding=1),
+        *_convolution(256, 256, 3, padding=1),
         nn.MaxPool2d(3, 2),
     )
 
 
 def _squeezenet1_1() -> nn.Sequential:
     return nn.Sequential(
-        nn.Conv2d(3, 64, 3, stride=2),
-        nn.ReLU(inplace=True),
+        *_convolution(3, 64, 3, stride=2),
         nn.MaxPool2d(3, 2, ceil_mode=True),
         Fire(64, 16, 64),
         Fire(128, 16, 64),
