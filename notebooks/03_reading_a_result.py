@@ -29,7 +29,7 @@ from gsbench.analysis import load_experiment, to_frame
 from gsbench.analysis.images import choose_views
 from gsbench.analysis.judgement import judge
 from gsbench.analysis.pairing import pair_trials
-from gsbench.analysis.planning import seeds_needed
+from gsbench.analysis.statistics import seeds_needed
 from gsbench.analysis.table_formats import to_markdown
 from gsbench.analysis.tables import build_table
 from gsbench.cli import run

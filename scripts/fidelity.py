@@ -22,7 +22,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from gsbench.analysis.configurations import facts_of, shipped_arms
+from gsbench.analysis.differences import facts_of, shipped_arms
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "fidelity.md"

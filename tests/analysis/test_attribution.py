@@ -13,15 +13,16 @@ import pytest
 import yaml
 
 from gsbench.analysis.cells import with_variants
-from gsbench.analysis.configurations import departures, shipped_arms
 from gsbench.analysis.differences import (
     ELSEWHERE,
     NO_RECORD,
+    departures,
     ingredients,
     ingredients_between,
     ingredients_sentence,
     is_mixed,
     representatives,
+    shipped_arms,
 )
 from gsbench.analysis.pairing import choose_pairs, controls_of
 from gsbench.analysis.report.build import build_report

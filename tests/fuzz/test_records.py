@@ -83,7 +83,7 @@ def test_every_kind_of_file_is_among_the_damaged(places: dict[str, Path]) -> Non
 READS_ITSELF = {
     "analysis/paper.py", "datasets/catalog.py",  # of the package
     "launch/batch.py", "init/base.py",  # text of this very process
-    "analysis/configurations.py",  # arms of the package; those of trials are read by TrialFolder
+    "analysis/differences.py",  # arms of the package; those of trials are read by TrialFolder
     "claims/stopping.py",  # text of this process
     "system/install.py",  # what pip wrote of the package
     "claims/archive.py",  # archives, which anybody may have made

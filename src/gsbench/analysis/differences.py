@@ -6,15 +6,19 @@ recorded configurations and code.
 """
 
 import itertools
+import re
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
-from gsbench.analysis.configurations import canonical, departures
-from gsbench.analysis.results import Arm, TrialResult, group_by, seeds_words
+import yaml
+
+from gsbench.analysis.results import Arm, TrialResult, canonical, group_by, seeds_words
 from gsbench.runs.code import SHOWN
+from gsbench.system.install import conf_dir
 from gsbench.words import counted, listed
 
 Versions = dict[str, list[TrialResult]]  # version -> the trials that it made
@@ -55,9 +59,14 @@ WITHOUT_EFFECT = (
     *("init.weights", "init.download", "init.threads", "densify.time_limit_minutes"),
 )
 
-
 UNSET = canonical(None)
 CODE = "code of "  # prefix of a user's modules among the keys of ``TrialResult.code``
+
+FACTS = ("Source", "Compared", "Tests", "Otherwise", "Departs from adc by")
+# A fact is one comment line; indented comment lines continue it.
+FACT = re.compile(rf"^# (?P<key>{'|'.join(FACTS)}): (?P<text>.*(?:\n#   .*)*)$", re.MULTILINE)
+
+_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 def differing_conditions(trials: Sequence[TrialResult], code: bool = True) -> dict[str, list[str]]:
@@ -235,3 +244,45 @@ def _class_ingredients(config: Mapping[str, Any]) -> tuple[str, ...]:
     if target == "gsbench.densify.External":
         return (BY_PROGRAM.format(config.get("densify.name")),)
     return departures().get(str(target), (f"rule {target}",))
+
+
+@cache
+def shipped_arms() -> dict[str, Mapping[str, Any]]:
+    """The settings of each densifier that gsbench ships, by name, without ``densify/external``."""
+    return {path.stem: _with_defaults(path.stem) for path in sorted(_arms_folder().glob("*.yaml"))}
+
+
+@cache
+def facts_of(name: str) -> dict[str, str]:
+    """The facts at the end of the file of the shipped arm ``name``, by their key (`FACTS`)."""
+    content = (_arms_folder() / f"{name}.yaml").read_text(encoding="utf-8")
+    return {match["key"]: match["text"].replace("\n#   ", " ") for match in FACT.finditer(content)}
+
+
+@cache
+def departures() -> dict[str, tuple[str, ...]]:
+    """The ingredients in which each shipped densifier class (by import path) departs from ADC."""
+    by_class = {}
+    for name in shipped_arms():
+        content = _own_settings(name)
+        if "_target_" in content:  # without it, the arm has the class of the arm in its defaults
+            text = facts_of(name).get("Departs from adc by", "")
+            by_class[content["_target_"]] = tuple(filter(None, text.split(", ")))
+    return by_class
+
+
+@cache
+def _with_defaults(name: str) -> dict[str, Any]:
+    """The settings of an arm, which override those of the arms in its ``defaults``."""
+    content = _own_settings(name)
+    parents = [parent for parent in content.pop("defaults", []) if parent != "_self_"]
+    return {key: value for parent in parents for key, value in _with_defaults(parent).items()} | content
+
+
+def _own_settings(name: str) -> dict[str, Any]:
+    settings: dict[str, Any] = yaml.load((_arms_folder() / f"{name}.yaml").read_text(encoding="utf-8"), Loader=_LOADER)
+    return settings
+
+
+def _arms_folder() -> Path:
+    return conf_dir() / "densify"

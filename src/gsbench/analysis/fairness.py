@@ -7,7 +7,6 @@ import statistics
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from gsbench.analysis.configurations import canonical
 from gsbench.analysis.differences import (
     CODE,
     differing_keys,
@@ -19,7 +18,7 @@ from gsbench.analysis.differences import (
 )
 from gsbench.analysis.pairing import pair_trials
 from gsbench.analysis.quantities import COSTS, Reader, relative_change
-from gsbench.analysis.results import Arm, TrialResult, group_by, read_experiment
+from gsbench.analysis.results import Arm, TrialResult, canonical, group_by, read_experiment
 from gsbench.analysis.table_formats import Column, Row, Table, TableEntry
 from gsbench.records import read_if_sound
 from gsbench.runs.experiments import SearchPoint, TuningRecord

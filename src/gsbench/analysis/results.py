@@ -4,6 +4,7 @@ A trial's folder is ``<runs>/<experiment>/<scene>/<init>-<densify>/<hash8>-seed<
 last: a folder that has it is complete. Nothing here needs torch, so tables over thousands of trials start quickly.
 """
 
+import json
 import math
 import os
 import re
@@ -13,13 +14,13 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar
 
-from gsbench.analysis.configurations import Configurations, canonical, load_flat_config
 from gsbench.errors import InputError
 from gsbench.files import require_no_links
 from gsbench.parsing import DamagedError, one_line
 from gsbench.runs.declaration import QUESTIONS, trial_key, unix_time
 from gsbench.runs.declaration import Arm as Arm
 from gsbench.runs.experiments import experiment_home, trial_folders
+from gsbench.runs.keys import NOT_HASHED, flatten
 from gsbench.runs.layout import CONFIG, FAILED, PER_VIEW, RESULTS, SEED
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import FROM_RENDERS, TrialRecord, UnfinishedError, split_text
@@ -29,7 +30,65 @@ K = TypeVar("K", bound=Hashable)
 T = TypeVar("T")
 
 MEAN_TOLERANCE = 1e-6  # relative: per-view values must average to the trial's metric
+GROUPS = ("scene", "init", "densify")  # groups that every trial's configuration has
+ENCODER = json.JSONEncoder(sort_keys=True, separators=(",", ":"))
 TRIAL_FOLDER = re.compile(rf"(?P<hash>[0-9a-f]{{8}}){SEED}(?P<seed>\d+)")
+
+
+class Configurations:
+    """The settings that determine results, of all trials of an experiment. Each file is read once for all seeds.
+
+    ``trial`` is the key that the seeds of a trial share (`TrialResult.key`). ``known`` has, by this key, the settings
+    of trials that have not run and thus have no file.
+    """
+
+    def __init__(self, known: Mapping[str, Mapping[str, Any]] | None = None) -> None:
+        self._known: dict[str, Mapping[str, Any]] = dict(known or {})
+        self._texts: dict[str, Mapping[str, str]] = {}
+
+    def texts(self, trial: str, folder: Path) -> Mapping[str, str]:
+        """The settings of `shared` as text that is equal for equal values."""
+        if trial not in self._texts:
+            self._texts[trial] = {key: canonical(value) for key, value in self.shared(trial, folder).items()}
+        return self._texts[trial]
+
+    def shared(self, trial: str, folder: Path) -> Mapping[str, Any]:
+        """The settings of a trial, read from ``folder`` or from another seed before; {} if they cannot be read."""
+        if trial not in self._known:
+            self.read(trial, [folder])
+        return self._known[trial]
+
+    def read(self, trial: str, folders: Iterable[Path]) -> str:
+        """Read the settings of a trial from its first readable folder; return "", or the last folder's fault."""
+        fault = ""
+        for folder in folders:
+            try:
+                config = load_flat_config(folder)
+            except FileNotFoundError:
+                fault = f"{CONFIG} is not there"
+            except DamagedError as error:
+                fault = f"{error.path.name} {error.reason}"
+            else:
+                hashed = {key: value for key, value in config.items() if key.split(".")[0] not in NOT_HASHED}
+                self._known[trial] = hashed
+                return ""
+        self._known.setdefault(trial, {})
+        return fault
+
+
+def load_flat_config(folder: Path) -> dict[str, Any]:
+    """The configuration of the trial in ``folder`` with dotted keys; raises FileNotFoundError and DamagedError."""
+    values = TrialFolder(folder).settings()
+    if not isinstance(values, dict) or not all(isinstance(values.get(group), dict) for group in GROUPS):
+        raise DamagedError(folder / CONFIG, f"is damaged: it lacks one of the groups {', '.join(GROUPS)}")
+    return flatten(values)
+
+
+def canonical(value: object) -> str:
+    """JSON text that is equal for equal values."""
+    if type(value) is int or (type(value) is float and math.isfinite(value)):
+        return repr(value)  # the same text as JSON's, but faster: most settings are numbers
+    return ENCODER.encode(value)
 
 
 @dataclass(frozen=True)

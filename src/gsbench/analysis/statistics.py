@@ -1,4 +1,4 @@
-"""Tests of paired differences, about these scenes and about scenes like these.
+"""Tests of paired differences, about these scenes and about scenes like these, and planning from pilot trials.
 
 Differences are matrices [S, K] of S scenes, each with K pairs of trainings. The views of a trial share its training, so
 a trial is the smallest independent unit.
@@ -8,6 +8,11 @@ units, and each scene has its own variance (Welch 1947; Satterthwaite 1946). *Sc
 scenes on: the sign test of the number of scenes that gain, with the exact interval of the median effect. It assumes
 nothing about the distribution of effects; tests of the mean effect fail if one scene in eight differs much from the
 others.
+
+Planning: the paired difference of scene s and seed k is ``mean + scene effect + noise``. The scene effect has one
+deviation between scenes, the noise another one between trainings of a scene. Both are estimated from pilot trials by
+the analysis of variance (Searle, Casella and McCulloch 1992, *Variance components*, section 3.6). More seeds shrink
+only the noise; a statement about scenes like these needs more scenes.
 """
 
 import math
@@ -20,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from gsbench.errors import InputError
 from gsbench.runs.declaration import ERROR_RATE
 
 ALPHA = ERROR_RATE
@@ -34,6 +40,10 @@ SPENDING_POWER = 1.5  # exponent of the error-spending function of looks
 DRAWS = 100_000  # simulated sequences of trainings, for the error rates of looks
 FIRST_LOOK = 2  # seeds: one training of each arm does not show how trainings differ
 EACH_UP_TO = 12  # seeds up to which each seed is a look; more looks would save little and make bounds less precise
+
+POWER = 0.8  # of planned designs: that of the two-sided tests with the error rate ``ALPHA``
+MAX_SCENES, MAX_SEEDS = 30, 40  # the largest designs that are considered
+DESIGN_DRAWS = 2000  # simulated variances of a design; they give its power to about 0.005
 
 Array = NDArray[np.floating]
 
@@ -282,3 +292,111 @@ def look_levels(scenes: int, looks: tuple[int, ...], alpha: float) -> tuple[floa
         levels.append(level)
         seeds_before = seeds
     return tuple(levels)
+
+
+@dataclass(frozen=True)
+class Components:
+    """Deviations of paired differences: of the effect ``between`` scenes, and of trainings ``within`` a scene.
+
+    ``between`` is None for a single scene; it is 0 if scenes differ by no more than trainings explain.
+    """
+
+    between: float | None
+    within: float
+    scenes: int
+    trials: int  # pairs
+
+
+@dataclass(frozen=True)
+class Design:
+    """A design of two arms on ``scenes`` scenes, with ``seeds`` seeds each."""
+
+    scenes: int
+    seeds: int
+
+    @property
+    def trials(self) -> int:
+        return 2 * self.scenes * self.seeds
+
+
+def estimate_components(differences: Sequence[NDArray[np.float64]]) -> Components:
+    """Estimate the two deviations from the paired differences of pilot trials, an array for each scene.
+
+    Raises InputError if no scene has two pairs.
+    """
+    degrees = sum(len(values) - 1 for values in differences)
+    if degrees == 0:
+        raise InputError("planning needs pilot trials with at least two seeds of one scene")
+    within = math.sqrt(sum(float(((values - values.mean()) ** 2).sum()) for values in differences) / degrees)
+    counts = np.array([len(values) for values in differences], dtype=float)
+    total = int(counts.sum())
+    between = None
+    if len(differences) > 1:
+        means = np.array([values.mean() for values in differences])
+        overall = float(np.concatenate(list(differences)).mean())
+        pairs_per_scene = (total - float((counts**2).sum()) / total) / (len(counts) - 1)  # n_0 of unbalanced data
+        square = float((counts * (means - overall) ** 2).sum()) / (len(counts) - 1)
+        between = math.sqrt(max(0.0, (square - within**2) / pairs_per_scene))
+    return Components(between, within, len(differences), total)
+
+
+def power(design: Design, difference: float, components: Components, like_these: bool) -> float:
+    """The chance to see ``difference`` in the mean of these scenes, or by the sign test of scenes ``like_these``.
+
+    Raises InputError for scenes like these if the pilot had only one scene.
+    """
+    if not like_these:
+        return power_of_mean(components.within, design, difference)
+    if components.between is None:
+        raise InputError("one scene cannot show how an effect differs between scenes: run pilot trials on two")
+    needed = sign_test_needs(design.scenes, ALPHA)
+    if needed is None:
+        return 0.0
+    spread = math.hypot(components.between, components.within / math.sqrt(design.seeds))
+    chance = float(special.ndtr(abs(difference) / spread)) if spread else 1.0  # that one scene's mean has the sign
+    return float(special.bdtrc(needed - 1, design.scenes, chance))
+
+
+def power_of_mean(deviation: float, design: Design, difference: float) -> float:
+    """The chance that the t test of these scenes sees ``difference`` if trainings differ by ``deviation``.
+
+    The test estimates each scene's variance and its own degrees of freedom. Given these, the power is that of a normal
+    mean; the result is its average over simulated variances. The far tail of the wrong sign is left out.
+    """
+    if deviation == 0:
+        return 1.0 if difference else 0.0
+    shift = abs(difference) / deviation * math.sqrt(design.scenes * design.seeds)
+    return float(special.ndtr(shift - _thresholds(design)).mean())
+
+
+@cache
+def _thresholds(design: Design) -> NDArray[np.float64]:
+    """The significant means [DESIGN_DRAWS], in true standard errors, for simulated variances of the scenes."""
+    freedom = design.seeds - 1
+    variances = np.random.default_rng(0).chisquare(freedom, (DESIGN_DRAWS, design.scenes)) / freedom
+    error, degrees = error_and_degrees(variances, design.seeds)
+    return special.stdtrit(degrees, 1 - ALPHA / 2) * error * math.sqrt(design.scenes * design.seeds)
+
+
+def seeds_needed(deviation: float, scenes: int, difference: float) -> int | None:
+    """Seeds of each arm on these ``scenes`` that see ``difference`` with a power of `POWER`; None above `MAX_SEEDS`."""
+    designs = (Design(scenes, seeds) for seeds in range(2, MAX_SEEDS + 1))
+    return next((one.seeds for one in designs if power_of_mean(deviation, one, difference) >= POWER), None)
+
+
+def designs_needed(difference: float, components: Components, like_these: bool) -> list[Design]:
+    """The designs that see ``difference`` with a power of `POWER`: by number of scenes, the fewest seeds.
+
+    A number of scenes is left out if it needs more than ``MAX_SEEDS`` seeds, or no fewer seeds than fewer scenes do. A
+    statement about scenes like these starts at ``MIN_SCENES``.
+    """
+    if difference == 0 or not math.isfinite(difference):
+        raise InputError(f"the difference to resolve must be a number other than 0, got {difference}")
+    chosen: list[Design] = []
+    for scenes in range(MIN_SCENES if like_these else 1, MAX_SCENES + 1):
+        most = chosen[-1].seeds - 1 if chosen else MAX_SEEDS
+        for design in (Design(scenes, seeds) for seeds in range(2, most + 1)):
+            if power(design, difference, components, like_these) >= POWER:
+                chosen.append(design)
+                break
+    return chosen

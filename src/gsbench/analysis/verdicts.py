@@ -15,10 +15,9 @@ from dataclasses import dataclass, replace
 from gsbench.analysis.cells import short_reason
 from gsbench.analysis.declaration import ActiveDeclaration
 from gsbench.analysis.judgement import Verdict, judge
-from gsbench.analysis.planning import seeds_needed
 from gsbench.analysis.quantities import Quantity, asked_quantity, choose_quantities
 from gsbench.analysis.results import Arm, TrialResult, group_by
-from gsbench.analysis.statistics import ALPHA, TOO_SMALL, Outcome
+from gsbench.analysis.statistics import ALPHA, TOO_SMALL, Outcome, seeds_needed
 from gsbench.runs.declaration import Declaration, Question
 from gsbench.words import counted, some_of
 

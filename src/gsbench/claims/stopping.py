@@ -12,10 +12,9 @@ from typing import Any, Generic, TypeVar
 import yaml
 
 from gsbench.analysis.cells import with_variants
-from gsbench.analysis.configurations import Configurations
 from gsbench.analysis.judgement import Verdict, judge
 from gsbench.analysis.pairing import choose_pairs
-from gsbench.analysis.results import Arm, TrialResult, group_by, read_experiment
+from gsbench.analysis.results import Arm, Configurations, TrialResult, group_by, read_experiment
 from gsbench.analysis.statistics import FIRST_LOOK, plan_looks
 from gsbench.analysis.verdicts import in_words
 from gsbench.config.compose import Trial

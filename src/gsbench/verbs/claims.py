@@ -10,7 +10,7 @@ from typing import Any
 
 from gsbench.analysis.cells import with_variants
 from gsbench.analysis.pairing import BASELINE, choose_pairs, pair
-from gsbench.analysis.planning import Components, designs_needed, estimate_components
+from gsbench.analysis.statistics import Components, designs_needed, estimate_components
 from gsbench.analysis.quantities import Quantity, quantity
 from gsbench.analysis.results import load_experiment, read_experiment
 from gsbench.analysis.statistics import MIN_SCENES

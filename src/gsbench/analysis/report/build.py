@@ -1,42 +1,62 @@
 """The report as one HTML file: it needs no network and no other file, and can be read without JavaScript."""
 
+import logging
+import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from pathlib import Path
+from statistics import fmean
+
+import numpy as np
+from numpy.typing import NDArray
 
 from gsbench.analysis import verdicts
-from gsbench.analysis.cells import with_variants
 from gsbench.analysis.declaration import active_declaration
-from gsbench.analysis.images import png_uri, read_image
-from gsbench.analysis.pairing import BASELINE, choose_pairs, controls_of
+from gsbench.analysis.differences import short_version
+from gsbench.analysis.fairness import caveats, fairness_table
+from gsbench.analysis.images import ViewComparison, choose_views, png_uri, read_image
+from gsbench.analysis.judgement import Verdict
+from gsbench.analysis.pairing import BASELINE, pair_trials
 from gsbench.analysis.paper import layout_of, load_paper, paper_tables
-from gsbench.analysis.report.sections import (
-    compare_arms,
-    event_charts,
-    event_table,
-    provenance,
-    search_summary,
-    training_charts,
-    volume_charts,
+from gsbench.analysis.quantities import COSTS, relative_change
+from gsbench.analysis.report.charts import ForestRow, forest_plot, line_chart
+from gsbench.analysis.results import Arm, Experiment, TrialResult, group_by
+from gsbench.analysis.table_formats import Column, Row, Table, TableEntry, fill
+from gsbench.analysis.tables import build_table, compared_pairs
+from gsbench.analysis.verdicts import PairVerdicts
+from gsbench.errors import InputError
+from gsbench.eval.facts import find_metric
+from gsbench.events import RefineEvent
+from gsbench.parsing import DamagedError
+from gsbench.runs import layout
+from gsbench.runs.experiments import read_tuning
+from gsbench.words import counted, signed
+
+log = logging.getLogger(__name__)
+
+COSTS_COMPARED = ("gaussians", "train_time")
+EVENT_CAUSES = (*RefineEvent.GROWN, "relocated", *RefineEvent.PRUNED)
+CURVES = (  # key of metrics.jsonl, title, y axis
+    ("num_gaussians", "Gaussians during training", "Gaussians"),
+    ("loss", "Training loss (of single views, averaged over trials)", "loss"),
+    ("psnr", "PSNR of test views during training", "PSNR (dB)"),
 )
-from gsbench.analysis.results import Experiment, TrialResult, group_by
-from gsbench.analysis.table_formats import Table, fill
-from gsbench.analysis.tables import build_table
-from gsbench.runs.layout import FIGURES
-from gsbench.words import signed
+VOLUME_AXES = ("volume (cubed scene units)", "share")
+LOG10_SPHERE = math.log10(4 / 3 * math.pi)
+BIN_WIDTH = 0.25  # decades of volume
+
+Curve = list[tuple[float, float]]
 
 
 def build_report(experiment: Experiment, baseline: str = BASELINE) -> str:
     """The report as HTML, made from the experiment's files alone; every densifier is compared with ``baseline``."""
-    trials = with_variants(experiment.trials)
+    trials, pairs = compared_pairs(experiment, baseline)
     arms = sorted({trial.arm for trial in trials})
     declared = active_declaration(experiment.folder, trials)
-    search = search_summary(experiment.folder)
-    # The points of a search were chosen by results, so no test of them is valid.
-    pairs = [] if search else choose_pairs(arms, baseline, controls_of(trials))
     judged = verdicts.judge_pairs(trials, pairs, declared)
     quantity = next((one.declared for one in judged if one.declared is not None), None)
-    layout = layout_of(experiment.name)
-    tables = [build_table(experiment)] if layout is None else paper_tables(experiment, layout)
+    paper_table = layout_of(experiment.name)
+    tables = [build_table(experiment)] if paper_table is None else paper_tables(experiment, paper_table)
     volumes, volume_notes = volume_charts(trials, arms)
     return fill(
         "report.html.j2",
@@ -49,8 +69,8 @@ def build_report(experiment: Experiment, baseline: str = BASELINE) -> str:
         declared=declared.sentences(quantity.name) if declared and quantity else [],
         families=verdicts.families(judged),
         tables=[_without_verdicts(table) for table in tables],
-        contradictions=[] if layout is None else load_paper().contradictions,
-        search=search,
+        contradictions=[] if paper_table is None else load_paper().contradictions,
+        search=search_summary(experiment.folder),
         say=verdicts,
         signed=_signed,
         training=training_charts(trials, arms),
@@ -77,7 +97,7 @@ def trial_figures(trials: Sequence[TrialResult]) -> list[tuple[str, str]]:
     sources: dict[tuple[str, str, str], list[str]] = {}  # {(name, scene, data URI): arms and seeds}
     for group in group_by(trials, lambda trial: (trial.scene, trial.arm)).values():
         trial = group[0]
-        for path in sorted((trial.path / FIGURES).glob("*.png")):
+        for path in sorted((trial.path / layout.FIGURES).glob("*.png")):
             key = path.stem.replace("_", " "), trial.scene, png_uri(read_image(path))
             sources.setdefault(key, []).append(f"{trial.init}-{trial.densify}, seed {trial.seed}")
     return [(f"{name}: {scene}, {'; '.join(arms)}", uri) for (name, scene, uri), arms in sources.items()]
@@ -85,3 +105,246 @@ def trial_figures(trials: Sequence[TrialResult]) -> list[tuple[str, str]]:
 
 def _signed(value: float | None, decimals: int) -> str:
     return "unknown" if value is None else signed(value, f".{decimals}f")
+
+
+@dataclass(frozen=True)
+class ArmComparison:
+    """All results about one pair of arms; ``judged`` are its verdicts."""
+
+    judged: PairVerdicts
+    caveats: str  # what may have made the difference besides the idea
+    fairness: Table
+    costs: tuple[str, ...]
+    forests: tuple[str, ...]
+    views: tuple[ViewComparison, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def title(self) -> str:
+        return f"{self.judged.second} against {self.judged.first}"
+
+    @property
+    def has_like_these(self) -> bool:
+        """Return whether there are enough scenes for a statement about scenes like these."""
+        return any(one.like_these is not None for one in self.judged.verdicts)
+
+
+def compare_arms(trials: Sequence[TrialResult], judged: PairVerdicts) -> ArmComparison:
+    """Costs, forest plots and views of two arms; notes say what could not be read."""
+    first, second = judged.first, judged.second
+    views, faults = choose_views(pair_trials(trials, first, second))
+    return ArmComparison(
+        judged,
+        caveats(trials, first, second),
+        fairness_table(trials, first, second),
+        tuple(_costs(trials, first, second)),
+        tuple(_forest(verdict) for verdict in judged.verdicts),
+        tuple(views),
+        tuple(dict.fromkeys([*judged.notes, *faults])),
+    )
+
+
+def _costs(trials: Sequence[TrialResult], first: Arm, second: Arm) -> list[str]:
+    """Say how counts and training times changed over the scenes that both arms have."""
+    baseline, other = _trials_of(trials, first), _trials_of(trials, second)
+    lines = []
+    for key in COSTS_COMPARED:
+        name, read = COSTS[key]
+        change = relative_change(baseline, other, read)
+        if change is not None:
+            spread = _spread_of_times([*baseline, *other]) if key == "train_time" else ""
+            lines.append(f"{name[0].upper()}{name[1:]} {change}{spread}")
+    return lines
+
+
+def _spread_of_times(trials: Sequence[TrialResult]) -> str:
+    """Say how far the training times of equal trials differ: a smaller change of times means nothing."""
+    cells = group_by(trials, lambda trial: (trial.arm, trial.scene)).values()
+    times = [[t for trial in cell if (t := COSTS["train_time"][1](trial))] for cell in cells]
+    spread = max((max(own) / min(own) - 1 for own in times if own), default=0.0)
+    return f"; times of equal trials differ by up to {spread:.0%}" if spread else ""
+
+
+def _forest(verdict: Verdict) -> str:
+    rows = [ForestRow(scene.scene, scene.mean, scene.interval) for scene in verdict.scenes]
+    if len(rows) > 1:
+        rows.append(ForestRow("mean of scenes", verdict.mean or 0.0, verdict.interval))
+    better = "right of zero is better" if verdict.quantity.direction > 0 else "left of zero is better"
+    return forest_plot(f"{verdict.quantity.name}: {better}", rows, "difference", verdict.quantity.direction)
+
+
+def training_charts(trials: Sequence[TrialResult], arms: Sequence[Arm]) -> list[str]:
+    """Curves by arm, averaged over scenes and seeds at the steps that all trials have."""
+    keys = [key for key, _, _ in CURVES]
+    means = {arm: _mean_curves(_trials_of(trials, arm), layout.CURVES, keys) for arm in arms}
+    charts = [
+        line_chart(title, [(str(arm), curves[key]) for arm, curves in means.items()], "iteration", y_label)
+        for key, title, y_label in CURVES
+    ]
+    return [chart for chart in charts if chart]
+
+
+def event_table(trials: Sequence[TrialResult], arms: Sequence[Arm]) -> Table | None:
+    """A row per cause of growth or pruning, with the mean number of Gaussians per arm; None if nothing was logged."""
+    rows = []
+    for cause in EVENT_CAUSES:
+        means = [fmean(float(trial.record.events.get(cause, 0)) for trial in _trials_of(trials, arm)) for arm in arms]
+        if any(means):
+            rows.append(Row((cause.replace("_", " "),), tuple(TableEntry(f"{mean:,.0f}") for mean in means)))
+    columns = tuple(Column("", str(arm), ("events", str(arm))) for arm in arms)
+    return Table("Gaussians by cause, mean of a trial", ("cause",), columns, tuple(rows)) if rows else None
+
+
+def event_charts(trials: Sequence[TrialResult], arms: Sequence[Arm]) -> list[str]:
+    """Events by cause over the iterations of each arm."""
+    means = {arm: _mean_curves(_trials_of(trials, arm), layout.EVENTS, EVENT_CAUSES) for arm in arms}
+    causes = [cause for cause in EVENT_CAUSES if any(count for own in means.values() for _, count in own[cause])]
+    charts = []
+    for arm, own in means.items():
+        series = [(cause.replace("_", " "), own[cause]) for cause in causes]
+        charts.append(line_chart(f"Refinement over time: {arm}", series, "iteration", "Gaussians"))
+    return [chart for chart in charts if chart]
+
+
+def _trials_of(trials: Sequence[TrialResult], arm: Arm) -> list[TrialResult]:
+    return [trial for trial in trials if trial.arm == arm]
+
+
+def _mean_curves(trials: Sequence[TrialResult], name: str, keys: Sequence[str]) -> dict[str, Curve]:
+    """The mean curve over trials of each key in the trials' file ``name``; each file is read once."""
+    curves_by_key: dict[str, list[Curve]] = {key: [] for key in keys}
+    for trial in trials:
+        rows = trial.folder.rows(name)
+        for key, curves in curves_by_key.items():
+            curves.append([(float(row["step"]), float(row[key])) for row in rows if key in row])
+    return {key: mean_by_step(curves) for key, curves in curves_by_key.items()}
+
+
+def mean_by_step(curves: Sequence[Curve]) -> Curve:
+    """The mean curve over the steps that every non-empty curve has."""
+    filled = [dict(curve) for curve in curves if curve]
+    if not filled:
+        return []
+    shared = sorted(set.intersection(*(set(curve) for curve in filled)))
+    return [(step, fmean(curve[step] for curve in filled)) for step in shared]
+
+
+def volume_charts(trials: Sequence[TrialResult], arms: Sequence[Arm]) -> tuple[list[str], list[str]]:
+    """(charts, notes): histograms of the Gaussians' volumes, for final models and for logged iterations."""
+    threshold = _threshold(trials)
+    final: list[tuple[str, Curve]] = []
+    notes = []
+    for arm in arms:
+        try:
+            models = [trial.path / layout.POINT_CLOUD for trial in _trials_of(trials, arm)]
+            volumes = np.concatenate([log10_volumes(model) for model in models])
+        except InputError as error:
+            notes.append(f"{arm}: no histogram, {error}")
+            continue
+        final.append((str(arm), histogram(volumes)))
+        if threshold:
+            notes.append(f"{arm}: {np.mean(volumes > math.log10(threshold)):.2%} of volumes exceed {threshold:g}.")
+    charts = [line_chart("Volumes of the trained Gaussians", final, *VOLUME_AXES, log=True, marker=threshold)]
+    for arm in arms:
+        histograms = _logged_histograms(_trials_of(trials, arm))
+        logged = [(f"iteration {step}", curve) for step, curve in histograms.items()]
+        title = f"Volumes during training: {arm}"
+        charts.append(line_chart(title, logged, *VOLUME_AXES, log=True, marker=threshold))
+    return [chart for chart in charts if chart], notes
+
+
+def log10_volumes(path: Path) -> NDArray[np.float64]:
+    """log10 of the volumes ``4/3 π s1 s2 s3`` [N] of a 3DGS PLY, whose scales are natural logarithms.
+
+    Raises `InputError` for a file that cannot be read as a 3DGS PLY.
+    """
+    from plyfile import PlyData, PlyParseError  # here, since only reports read point clouds
+
+    try:
+        vertices = PlyData.read(path)["vertex"]
+        logs = np.sum([np.asarray(vertices[f"scale_{axis}"], dtype=np.float64) for axis in range(3)], axis=0)
+    except (OSError, ValueError, KeyError, PlyParseError) as error:
+        raise InputError(f"{path} is not a readable 3DGS PLY ({error})") from None
+    return np.asarray(LOG10_SPHERE + logs / math.log(10))
+
+
+def histogram(volumes: NDArray[np.float64]) -> Curve:
+    """(volume, share) of each filled bin of a quarter decade, from the finite log10 ``volumes`` [N]."""
+    finite = volumes[np.isfinite(volumes)]
+    bins, counts = np.unique(np.floor(finite / BIN_WIDTH), return_counts=True)
+    return list(zip((10 ** ((bins + 0.5) * BIN_WIDTH)).tolist(), (counts / len(finite)).tolist(), strict=True))
+
+
+def _logged_histograms(trials: Sequence[TrialResult]) -> dict[int, Curve]:
+    """The logged histograms by iteration, pooled over trials, as (volume at the bin's centre, share)."""
+    pooled: dict[int, dict[float, float]] = {}
+    for trial in trials:
+        for row in trial.folder.histograms():
+            for low, high, count in zip(row.log10_edges, row.log10_edges[1:], row.counts, strict=False):
+                bins, volume = pooled.setdefault(row.step, {}), 10 ** ((low + high) / 2)
+                bins[volume] = bins.get(volume, 0.0) + count
+    return {
+        step: [(volume, count / total) for volume, count in sorted(bins.items()) if count]
+        for step, bins in sorted(pooled.items())
+        if (total := sum(bins.values()))
+    }
+
+
+def _threshold(trials: Sequence[TrialResult]) -> float | None:
+    """The absolute volume threshold (cubed scene units), if all arms that have one have the same; else None."""
+    configs = [group[0].config for group in group_by(trials, lambda trial: trial.arm).values()]
+    thresholds = {
+        config["densify.volume_threshold"]
+        for config in configs
+        if config.get("densify.threshold_mode", "absolute") == "absolute" and "densify.volume_threshold" in config
+    }
+    is_shared = len(thresholds) == 1 and all(isinstance(value, int | float) for value in thresholds)
+    return float(thresholds.pop()) if is_shared else None
+
+
+def provenance(trials: Sequence[TrialResult]) -> Table:
+    """One row per trial: its folder, conditions, hashes, code, machine and versions."""
+    facts_by_trial = {
+        trial.label: {
+            "raster": trial.record.raster,
+            "protocol": trial.record.protocol,
+            "iterations": str(trial.record.iterations),
+            **{f"{key} hash": str(value)[:12] for key, value in trial.record.hashes.items()},
+            "code": ", ".join(f"{part} {short_version(version)}" for part, version in trial.code.items()),
+            "machine": trial.machine or "",
+            "versions": ", ".join(f"{key} {value}" for key, value in trial.record.versions.items()),
+        }
+        for trial in trials
+    }
+    names = dict.fromkeys(name for facts in facts_by_trial.values() for name in facts)
+    columns = tuple(Column("", name, ("provenance", name)) for name in names)
+    rows = tuple(
+        Row((label,), tuple(TableEntry(facts.get(name, "")) for name in names))
+        for label, facts in facts_by_trial.items()
+    )
+    return Table("Trials", ("trial",), columns, rows, wrapped=True)
+
+
+def search_summary(home: Path) -> tuple[str, str] | None:
+    """A line on the experiment's search, and its chart as SVG; None if there is no search or it cannot be read."""
+    try:
+        record = read_tuning(home)
+    except FileNotFoundError:
+        return None
+    except DamagedError as error:
+        log.warning("left out: %s", error)
+        return None
+    done = [(number, point, point.value) for number, point in enumerate(record.points, 1) if point.value is not None]
+    failed = len(record.points) - len(done)
+    count = f"{len(record.points)} of {counted(record.wanted, 'point')}, each {counted(len(record.seeds), 'seed')}"
+    count += f"; {failed} failed" if failed else ""
+    if not done:
+        return f"{count}; none has a result yet.", ""
+    facts = find_metric(record.metric)
+    name, decimals = (facts.name, facts.decimals + 1) if facts else (record.metric, 4)
+    number, best, best_value = max(done, key=lambda numbered: record.direction * numbered[2])
+    settings = ", ".join(f"{key} = {value}" for key, value in best.settings.items())
+    line = f"Best {name}: {best_value:.{decimals}f} at {settings} (point {number}). {count}. "
+    line += "Judged by validation views; no test view was looked at."
+    values = [(float(number), value) for number, _, value in done]
+    return line, line_chart("The search", [("each point", values)], "point", name)
