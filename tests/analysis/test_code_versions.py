@@ -9,10 +9,10 @@ from typing import Any
 import pytest
 
 from gsbench.analysis.differences import find_superseded
-from gsbench.analysis.explain import explain_cell
 from gsbench.analysis.results import load_experiment, read_experiment
 from gsbench.analysis.tables import build_table
 from gsbench.errors import InputError
+from gsbench.verbs.results import explain_cell
 from tests.analysis.test_tables import one_trial
 
 OLD, NEW = "1" * 64, "2" * 64

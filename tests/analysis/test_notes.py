@@ -9,9 +9,8 @@ from pathlib import Path
 import pytest
 
 from gsbench.analysis.fairness import counts_sentence
-from gsbench.analysis.notes import held_out_notes, points_notes
 from gsbench.analysis.results import TrialResult, load_experiment
-from gsbench.analysis.tables import build_table
+from gsbench.analysis.tables import build_table, held_out_notes, points_notes
 from gsbench.runs.declaration import Arm
 from tests.analysis.synthetic import Plan, write_runs
 

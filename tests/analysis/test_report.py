@@ -17,9 +17,16 @@ from plyfile import PlyData
 
 from gsbench.analysis.images import choose_views, texture_energy
 from gsbench.analysis.pairing import pair_trials
-from gsbench.analysis.report.build import build_report, trial_figures
+from gsbench.analysis.report.build import (
+    _logged_histograms,
+    _threshold,
+    build_report,
+    histogram,
+    log10_volumes,
+    mean_by_step,
+    trial_figures,
+)
 from gsbench.analysis.report.charts import Axis, ForestRow, forest_plot, line_chart
-from gsbench.analysis.report.sections import _logged_histograms, _threshold, histogram, log10_volumes, mean_by_step
 from gsbench.analysis.results import Experiment, load_experiment
 from gsbench.analysis.statistics import Interval
 from gsbench.analysis.verdicts import by_scene_lines, headline, judge_pairs

@@ -15,8 +15,7 @@ import pytest
 from gsbench import cli
 from gsbench.analysis.cells import with_variants
 from gsbench.analysis.fairness import fairness_table
-from gsbench.analysis.report.build import build_report
-from gsbench.analysis.report.sections import search_summary
+from gsbench.analysis.report.build import build_report, search_summary
 from gsbench.analysis.results import load_experiment
 from gsbench.analysis.tables import build_table
 from gsbench.app.tuning import TuneSettings

@@ -22,9 +22,8 @@ from random import Random
 from typing import Any
 
 from gsbench.analysis.cells import to_frame
-from gsbench.analysis.explain import explain_cell
 from gsbench.analysis.fairness import tuning_lines
-from gsbench.analysis.report.sections import event_charts, search_summary, training_charts, volume_charts
+from gsbench.analysis.report.build import event_charts, search_summary, training_charts, volume_charts
 from gsbench.analysis.results import load_experiment, read_views
 from gsbench.analysis.table_formats import to_html_page
 from gsbench.analysis.tables import build_table
@@ -36,6 +35,7 @@ from gsbench.launch.states import states_of_experiment
 from gsbench.runs.declaration import read_declarations
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.tracking.trial import TrackedTrial, read_state
+from gsbench.verbs.results import explain_cell
 from gsbench.verbs.trials import lines_of
 from tests.finished import record_of
 from tests.fuzz.corrupt import corrupt

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from gsbench.errors import GsbenchError
-from gsbench.view.visitors import is_own_page, refuse_other_pages
+from gsbench.view.server import is_own_page, refuse_other_pages
 
 WELCOME = [
     (["127.0.0.1:8080"], []),

@@ -6,11 +6,11 @@ from typing import get_args
 
 from gsbench.analysis.cells import with_variants
 from gsbench.analysis.fairness import caveats, fairness_table
-from gsbench.analysis.notes import cloud_notes, machine_notes
 from gsbench.analysis.report.charts import ForestRow, forest_plot
 from gsbench.analysis.results import TrialResult, group_by, seeds_words
 from gsbench.analysis.statistics import Outcome, plan_looks
 from gsbench.analysis.table_formats import Table, fill
+from gsbench.analysis.tables import cloud_notes, machine_notes
 from gsbench.analysis.verdicts import like_these_words, outlying_words
 from gsbench.claims.check import NOT_TESTABLE, ClaimVerdict
 from gsbench.claims.file import ClaimsFile

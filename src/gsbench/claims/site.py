@@ -14,11 +14,10 @@ from pathlib import Path
 from gsbench.analysis.cells import swept_settings
 from gsbench.analysis.declaration import active_declaration
 from gsbench.analysis.judgement import Verdict, judge
-from gsbench.analysis.notes import compared_pairs
 from gsbench.analysis.report.build import build_report
 from gsbench.analysis.results import Experiment
 from gsbench.analysis.table_formats import Table, fill
-from gsbench.analysis.tables import build_table
+from gsbench.analysis.tables import build_table, compared_pairs
 from gsbench.analysis.verdicts import headline, judge_pairs
 from gsbench.claims.archive import unpack_archive
 from gsbench.errors import InputError

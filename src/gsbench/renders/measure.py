@@ -1,15 +1,23 @@
-"""The work of ``gsbench evaluate``: measuring renders of any program, and importing them into an experiment."""
+"""The work of ``gsbench evaluate``: measuring renders of any program, and importing them into an experiment.
+
+Renders are compared with the photographs of a trial, of a scene as a trial would see it, or of a folder. An imported
+trial has only metrics and pictures: no model, no times, and an unknown number of iterations. Tables show unknown values
+as missing, and say which arms were evaluated from renders.
+"""
 
 import argparse
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import torch
+import yaml
+from PIL import Image
 
-from gsbench.analysis.results import read_experiment
-from gsbench.config.command_words import typed_permissions
+from gsbench.analysis.results import TrialResult, read_experiment, read_views
+from gsbench.config.command_words import options, typed_permissions
 from gsbench.config.compose import compose_one
 from gsbench.config.trust import PERMISSIONS
 from gsbench.errors import InputError
@@ -17,16 +25,59 @@ from gsbench.eval.evaluator import Evaluator, summarize
 from gsbench.eval.facts import METRICS
 from gsbench.eval.options import EvalConfig
 from gsbench.eval.pictures import Matching, PicturePair, match_by_order, match_pictures, measure
-from gsbench.files import storage_errors
+from gsbench.files import atomic, file_sha256, storage_errors, write_text
 from gsbench.logs import progress
-from gsbench.pipeline.parts import build_metrics, make_evaluator
-from gsbench.renders.import_renders import check_destination, find_destination, import_trial
-from gsbench.renders.reference_images import ReferenceImages, find_reference_images, reference_images_of
-from gsbench.scene.readers import list_images
+from gsbench.pipeline.parts import Parts, build_metrics, make_evaluator
+from gsbench.pipeline.steps.evaluate import summary_of, write_per_view
+from gsbench.pipeline.trial import TrialSteps, versions
+from gsbench.runs import keys
+from gsbench.runs.code import ROOMS, states_of
+from gsbench.runs.keys import EVALUATE, sha256_of
+from gsbench.runs.layout import CONFIG, GROUND_TRUTH, IN_RUNS, MASKS, PER_VIEW, RENDERS, RESULTS, SEED, STORE
+from gsbench.runs.store import Store
+from gsbench.runs.trial_folder import TrialFolder
+from gsbench.runs.trial_record import FROM_RENDERS, RENDERS_ALONE, Code, TrialRecord
+from gsbench.scene.images import image_size, png_name, read_image
+from gsbench.scene.readers import fingerprint, list_images
+from gsbench.settings import is_folder_name
 from gsbench.system.own_modules import allow_modules
 from gsbench.system.resources import available_threads
 from gsbench.train.device import select_device
-from gsbench.words import counted, some_of
+from gsbench.view.trials import find_trial
+from gsbench.words import counted, did_you_mean, some_of
+
+KEPT_GROUPS = ("scene", "eval", "tracking", "launch")  # groups of the configuration that apply to renders too
+CAMERAS_ONLY = ("init=random", "init.count=100")  # the fastest initialiser; its points are not used
+
+
+@dataclass(frozen=True)
+class ReferenceImages:
+    """Photographs by the names of their views, in the order of an evaluation.
+
+    ``what`` describes them in messages. ``data`` is the fingerprint of their capture, and ``resolution`` (width,
+    height) its size in px. ``config`` is the configuration of a trial that is tested on them. ``scene`` is None for a
+    plain folder of pictures, ``init`` is None if they come from no trial.
+    """
+
+    photographs: Mapping[str, Path]
+    what: str
+    data: str
+    resolution: tuple[int, int]
+    config: Mapping[str, Any]
+    scene: str | None = None
+    init: str | None = None
+    masks: Mapping[str, Path] = field(default_factory=dict)  # mask files of the views that ignore some pixels
+
+
+@dataclass(frozen=True)
+class Destination:
+    """The trial that renders become: experiment, scene, arm (initialiser and densifier) and seed."""
+
+    experiment: str
+    scene: str
+    init: str
+    densify: str
+    seed: int
 
 
 def measure_renders(options: argparse.Namespace, runs: Path) -> None:
@@ -129,3 +180,221 @@ def _as_dict(
         "left_out": list(matching.left_out),
         "entered": None if folder is None else str(folder),
     }
+
+
+def find_reference_images(place: str, settings: Sequence[str], runs: Path) -> ReferenceImages:
+    """The photographs of ``place``: a folder, a trial (folder or EXPERIMENT:SCENE:DENSIFY), or the name of a scene.
+
+    ``settings`` are overrides of the configuration. Raises `InputError` if ``place`` is none of these.
+    """
+    folder = Path(place).expanduser()
+    if folder.is_dir():
+        home = folder.parent if folder.name in (GROUND_TRUTH, RENDERS) else folder
+        return (
+            reference_images_of(find_trial(str(home), runs))
+            if (home / RESULTS).is_file()
+            else _folder(folder, settings)
+        )
+    if ":" in place:
+        return reference_images_of(find_trial(place, runs))
+    scenes = options("scene")
+    if place not in scenes:
+        raise InputError(
+            f"--truth {place} is no folder, no trial EXPERIMENT:SCENE:DENSIFY and no scene"
+            f"{did_you_mean(place, scenes)} (scenes: {', '.join(scenes)})"
+        )
+    return _scene(place, settings)
+
+
+def reference_images_of(trial: TrialResult) -> ReferenceImages:
+    """The reference images of a finished trial, with the names and in the order of its own evaluation."""
+    photographs = {view: trial.path / GROUND_TRUTH / png_name(view) for view in read_views(trial)}
+    if trial.record.resolution is None or "data" not in trial.record.hashes:
+        raise InputError(f"{trial.label} does not say what it was tested on: run this trial again")
+    what = f"the test views of {trial.label}"
+    return ReferenceImages(
+        photographs,
+        what,
+        trial.record.hashes["data"],
+        trial.record.resolution,
+        TrialFolder(trial.path).configuration(),
+        trial.scene,
+        trial.init,
+        _masks(trial.path / MASKS, photographs),
+    )
+
+
+def _scene(name: str, settings: Sequence[str]) -> ReferenceImages:
+    """The test views of a scene as a trial with these settings sees them: undistorted, at its size.
+
+    If the scene comes with cameras, the fastest initialiser is used, unless the settings choose one.
+    """
+    config = compose_one([f"scene={name}", *settings]).values
+    if not any(word.startswith("init=") for word in settings) and config["scene"]["kind"] != "photos":
+        config = compose_one([f"scene={name}", *CAMERAS_ONLY, *settings]).values
+    store = Store(Path(config["runs"]).expanduser().resolve() / STORE)
+    trial = TrialSteps(Parts(config), store)
+    for step in trial.steps():
+        if step.stage in (keys.CAPTURE, keys.INIT, keys.GROUND_TRUTH):
+            entry = store.get(step)
+            if step.stage is keys.GROUND_TRUTH:
+                folder = entry.path
+    scene = trial.views.scene
+    photographs = {view.name: folder / png_name(view.name) for view in scene.test}
+    sizes = [(view.camera.width, view.camera.height) for view in [*scene.train, *scene.test]]
+    masks = _masks(folder / MASKS, photographs)
+    what = f"the test views of {name}"
+    return ReferenceImages(photographs, what, trial.capture.fingerprint, max(sizes), config, name, masks=masks)
+
+
+def _masks(folder: Path, views: Iterable[str]) -> dict[str, Path]:
+    """The existing masks in ``folder``, by view."""
+    files = {view: folder / png_name(view) for view in views}
+    return {view: file for view, file in files.items() if file.is_file()}
+
+
+def _folder(folder: Path, settings: Sequence[str]) -> ReferenceImages:
+    names = list_images(folder)
+    if not names:
+        raise InputError(f"--truth {folder} holds no pictures")
+    photographs = {name: folder / name for name in names}
+    resolution = max(image_size(path) for path in photographs.values())
+    config = compose_one(list(settings)).values
+    return ReferenceImages(photographs, f"the pictures in {folder}", fingerprint(folder, names), resolution, config)
+
+
+def find_destination(word: str, scene: str | None, seed: int, truth: ReferenceImages, runs: Path) -> Destination:
+    """The destination that ``EXPERIMENT:ARM`` names; ARM is a name, or INIT-NAME.
+
+    If ARM names no initialiser, it is taken from the experiment's trials of the scene, else from the trial of
+    ``truth``. Raises `InputError` if several are possible.
+    """
+    experiment, _, arm = word.partition(":")
+    scene_name = scene or truth.scene
+    if not is_folder_name(experiment) or not is_folder_name(arm):
+        raise InputError(f"--as {word} is not EXPERIMENT:ARM, such as table1:sfm-mine")
+    if experiment.casefold() in IN_RUNS:
+        raise InputError(f"--as {word}: {experiment} is gsbench's own folder of {runs}: name an experiment")
+    if seed < 0:
+        raise InputError(f"--seed {seed}: must be 0 or more")
+    if scene is not None and not is_folder_name(scene):
+        raise InputError(f"--scene {scene}: must be a plain folder name")
+    if scene is not None and truth.scene not in (None, scene):
+        raise InputError(f"--scene {scene}: the photographs are {truth.what}, of the scene {truth.scene}: leave it out")
+    if scene_name is None:
+        raise InputError("--as: a folder of photographs has no scene's name: give it with --scene")
+    init, dash, name = arm.partition("-")
+    if not dash:
+        init, name = truth.init or "", arm
+        trials = _trials(runs / experiment, scene_name)
+        inits = sorted({trial.init for trial in trials if not trial.from_renders}) or sorted({t.init for t in trials})
+        if len(inits) > 1:
+            raise InputError(
+                f"{experiment} has {', '.join(inits)} on {scene_name}: say which, as in "
+                f"--as {experiment}:{inits[0]}-{arm}"
+            )
+        init = inits[0] if inits else init or "renders"
+    return Destination(experiment, scene_name, init, name, seed)
+
+
+def check_destination(destination: Destination, truth: ReferenceImages, runs: Path) -> None:
+    """Raise `InputError` if the experiment's trials of the scene were tested on other photographs."""
+    for trial in _trials(runs / destination.experiment, destination.scene):
+        conditions = trial.conditions
+        size = "x".join(map(str, truth.resolution))
+        if conditions["data"] != truth.data or conditions["resolution"] != size:
+            raise InputError(
+                f"{destination.experiment} tests {destination.scene} on other photographs (such as {trial.label}, "
+                f"{conditions['resolution']} px) than {truth.what} ({size} px), so nothing could be compared: give "
+                f"--truth {destination.experiment}:{destination.scene}:{trial.init}-{trial.densify}"
+            )
+
+
+def import_trial(
+    destination: Destination,
+    truth: ReferenceImages,
+    pairs: Sequence[PicturePair],
+    per_view: Mapping[str, Mapping[str, float]],
+    evaluator: Evaluator,
+    source: Mapping[str, str],
+    runs: Path,
+) -> Path:
+    """Write the trial's folder and return it. The same renders always go to the same folder.
+
+    ``source`` says where the renders came from. Raises `InputError` if the destination already holds other renders.
+    """
+    renders = {pair.view: file_sha256(pair.picture) for pair in pairs}
+    identity = sha256_of({"renders": renders, "data": truth.data, "protocol": evaluator.protocol.id})
+    arm = runs / destination.experiment / destination.scene / f"{destination.init}-{destination.densify}"
+    folder = arm / f"{identity[:8]}{SEED}{destination.seed}"
+    if taken := [other for other in arm.glob(f"*{SEED}{destination.seed}") if other != folder]:
+        raise InputError(
+            f"seed {destination.seed} of {destination.init}-{destination.densify} on {destination.scene} is taken "
+            f"({taken[0]}): give another --seed, or remove that folder"
+        )
+    for name, files in (
+        (RENDERS, {png_name(pair.view): pair.picture for pair in pairs}),
+        (GROUND_TRUTH, {png_name(pair.view): pair.photograph for pair in pairs}),
+        (MASKS, {png_name(pair.view): pair.mask for pair in pairs if pair.mask is not None}),
+    ):
+        if files:
+            (folder / name).mkdir(parents=True, exist_ok=True)
+        for target, file in files.items():
+            with atomic(folder / name / target, sync=False) as temporary:
+                Image.fromarray(read_image(file)).save(temporary, format="PNG")
+    config = _config(destination, truth, runs)
+    write_text(folder / CONFIG, yaml.safe_dump(config, sort_keys=False))
+    write_per_view(folder / PER_VIEW, per_view)
+    TrialFolder(folder).write_finished(config, _results(destination, truth, identity, per_view, evaluator, source))
+    return folder
+
+
+def _results(
+    destination: Destination,
+    truth: ReferenceImages,
+    identity: str,
+    per_view: Mapping[str, Mapping[str, float]],
+    evaluator: Evaluator,
+    source: Mapping[str, str],
+) -> TrialRecord:
+    evaluation = summary_of(evaluator, per_view)
+    unknown = dict.fromkeys(("gaussians", "train_time", "init_points", "total_time", "peak_memory_mb"), RENDERS_ALONE)
+    return TrialRecord(
+        status="complete",
+        experiment=destination.experiment,
+        scene=destination.scene,
+        init=destination.init,
+        densify=destination.densify,
+        seed=destination.seed,
+        evaluated_from=FROM_RENDERS,
+        raster="unknown",
+        protocol=evaluator.protocol.id,
+        iterations=0,
+        metrics=evaluation.metrics,
+        unavailable=evaluation.unavailable | unknown,
+        awaited=evaluation.awaited,
+        metric_facts=evaluation.facts,
+        num_init_points=None,
+        num_gaussians=None,
+        seconds={},
+        peak_memory_mb=None,
+        test_views=len(per_view),
+        resolution=truth.resolution,
+        renders=dict(source),
+        hashes={"config": identity, "data": truth.data},
+        code=Code(stages={EVALUATE.name: EVALUATE.version}, rooms=states_of(ROOMS[EVALUATE.name])),
+        versions=versions(),
+    )
+
+
+def _config(destination: Destination, truth: ReferenceImages, runs: Path) -> dict[str, Any]:
+    groups = {group: truth.config[group] for group in KEPT_GROUPS}
+    own = truth.config["init"] if truth.config["init"]["name"] == destination.init else {"name": destination.init}
+    names: dict[str, Any] = {"name": destination.experiment, "seed": destination.seed, "runs": str(runs)}
+    groups["scene"] = dict(groups["scene"]) | {"name": destination.scene}
+    return names | groups | {"init": own, "densify": {"name": destination.densify, "evaluated_from": FROM_RENDERS}}
+
+
+def _trials(home: Path, scene: str) -> list[TrialResult]:
+    """The experiment's trials of a scene; none if the experiment does not exist yet."""
+    return [trial for trial in read_experiment(home).trials if trial.scene == scene] if home.is_dir() else []

@@ -10,10 +10,9 @@ from typing import Any
 
 from gsbench.analysis.cells import with_variants
 from gsbench.analysis.pairing import BASELINE, choose_pairs, pair
-from gsbench.analysis.statistics import Components, designs_needed, estimate_components
 from gsbench.analysis.quantities import Quantity, quantity
 from gsbench.analysis.results import load_experiment, read_experiment
-from gsbench.analysis.statistics import MIN_SCENES
+from gsbench.analysis.statistics import MIN_SCENES, Components, designs_needed, estimate_components
 from gsbench.app.command import compose_trials, run_trials
 from gsbench.claims.ablation import (
     choose_switches,

@@ -2,30 +2,39 @@
 
 One trial fills the page; two are shown side by side from the same camera. Because all pictures are drawn here, the page
 shows what was evaluated in any browser.
+
+Only the viewer's own page and local programs that are not web pages may connect. A browser lets any web page connect to
+servers of this machine. It sends the page's origin (``Origin``) and the name under which the page called the server
+(``Host``), which reveals a foreign name that resolves to this machine (DNS rebinding).
 """
 
+import http
 import logging
 import math
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
+from unittest import mock
+from urllib.parse import urlsplit
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from gsbench.errors import InputError
+from gsbench.errors import GsbenchError, InputError
 from gsbench.events import Cause
 from gsbench.gaussians.model import MAX_SH_DEGREE
 from gsbench.gaussians.paper_values import VOLUME_THRESHOLD
 from gsbench.scene.types import Camera, View
 from gsbench.view.picture import Layers, Picture, TrialPainter, photograph_at, side_by_side
-from gsbench.view.visitors import refuse_other_pages
 
 log = logging.getLogger(__name__)
 
 HOST = "127.0.0.1"  # only this machine can connect
+LOOPBACK = (HOST, "localhost", "::1")
+SERVE = "websockets.asyncio.server.serve"  # the function with which viser starts its server
 FREE_VIEW = "free"
 MOVING_HEIGHT = 240  # px while the camera moves
 HEIGHTS = ("270", "540", "810")  # px when it rests
@@ -290,3 +299,46 @@ def check_port(port: int) -> None:
             probe.bind((HOST, port))
         except OSError as error:
             raise InputError(f"port {port} cannot be used ({error.strerror}); give another --port") from None
+
+
+def is_own_page(hosts: list[str], origins: list[str]) -> bool:
+    """Return whether ``Host`` and ``Origin`` headers belong to the viewer's own page or to a program without a page.
+
+    Any port is allowed, since connections may be forwarded, but both headers must have the same port.
+    """
+    if len(hosts) != 1 or len(origins) > 1:
+        return False
+    try:
+        if urlsplit(f"//{hosts[0]}").hostname not in LOOPBACK:
+            return False
+    except ValueError:  # not an address, for example with an open bracket
+        return False
+    return not origins or origins[0] == f"http://{hosts[0]}"
+
+
+@contextmanager
+def refuse_other_pages() -> Iterator[None]:
+    """Make the server that viser starts within the block refuse foreign pages, for files and for connections.
+
+    Raises GsbenchError if viser did not start its server through `SERVE`.
+    """
+    import websockets.asyncio.server
+    from websockets.datastructures import Headers
+    from websockets.http11 import Response
+
+    serve, started = websockets.asyncio.server.serve, []
+
+    def guarded(*words: Any, process_request: Callable[..., Any] | None = None, **settings: Any) -> Any:
+        def process(connection: Any, request: Any) -> Any:
+            if not is_own_page(request.headers.get_all("Host"), request.headers.get_all("Origin")):
+                return Response(http.HTTPStatus.FORBIDDEN, "FORBIDDEN", Headers(), b"")
+            return None if process_request is None else process_request(connection, request)
+
+        started.append(True)
+        return serve(*words, process_request=process, **settings)
+
+    # viser has no parameter for a check of requests, so the function that it calls is replaced while it starts.
+    with mock.patch(SERVE, guarded):
+        yield
+    if not started:
+        raise GsbenchError("this version of viser cannot be kept from strange web pages: install viser 1.0 or 1.1")

@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 
 from gsbench.errors import InputError
-from gsbench.renders.import_renders import Destination, find_destination
-from gsbench.renders.reference_images import ReferenceImages
+from gsbench.renders.measure import Destination, ReferenceImages, find_destination
 
 COURTYARD = ReferenceImages({}, "the test views of a trial", "0" * 64, (96, 72), {}, "courtyard", "sfm")
 FOLDER = ReferenceImages({}, "the pictures in a folder", "0" * 64, (96, 72), {})

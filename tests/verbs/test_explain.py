@@ -6,9 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from gsbench.analysis.explain import explain_cell
 from gsbench.errors import InputError
-from gsbench.verbs.results import explain
+from gsbench.verbs.results import explain, explain_cell
 from tests.analysis.synthetic import Plan, write_runs
 
 
