@@ -14,8 +14,8 @@ from gsbench.analysis.declaration import active_declaration
 from gsbench.analysis.judgement import Verdict, judge
 from gsbench.analysis.results import read_experiment
 from gsbench.config.compose import Trial
+from gsbench.launch.jobs import Outcome, outcome_of_results
 from gsbench.launch.record import add_to_plan, declare
-from gsbench.launch.serial import Outcome, outcome_of_results
 from gsbench.runs.declaration import read_declarations
 from gsbench.runs.layout import CONFIG, RESULTS
 from gsbench.runs.trial_record import record_from

@@ -21,8 +21,8 @@ from gsbench.analysis.tables import build_table
 from gsbench.app.tuning import TuneSettings
 from gsbench.config.compose import Trial
 from gsbench.errors import GsbenchError
+from gsbench.launch.jobs import Outcome, outcome_of_error, outcome_of_results
 from gsbench.launch.record import add_to_plan, declare
-from gsbench.launch.serial import Outcome, outcome_of_error, outcome_of_results
 from gsbench.runs.declaration import Arm
 from gsbench.runs.experiments import TuningRecord, read_tuning
 from gsbench.runs.layout import CONFIG, RESULTS

@@ -11,8 +11,7 @@ import pytest
 
 from gsbench.config.compose import compose_one
 from gsbench.errors import InputError
-from gsbench.launch.jobs import clouds_first, collect, job_folder
-from gsbench.launch.serial import Outcome
+from gsbench.launch.jobs import Outcome, clouds_first, collect, job_folder
 
 
 @pytest.fixture

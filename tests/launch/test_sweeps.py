@@ -23,12 +23,11 @@ from gsbench.config.compose import Trial, compose_one
 from gsbench.config.trust import check_target
 from gsbench.errors import InputError
 from gsbench.files import DiskFullError, explain_storage
-from gsbench.launch import serial
+from gsbench.launch import jobs
 from gsbench.launch.batch import run_batch
-from gsbench.launch.dry_run import FinishedTrials, describe_plan
+from gsbench.launch.jobs import Outcome
 from gsbench.launch.record import add_to_plan, forget, read_plan
-from gsbench.launch.serial import Outcome
-from gsbench.launch.states import states_of_experiment
+from gsbench.launch.states import FinishedTrials, describe_plan, states_of_experiment
 from gsbench.runs import made_of
 from gsbench.runs.keys import TRAIN, Step, config_hash
 from gsbench.runs.store import Store
@@ -464,13 +463,13 @@ def fake_trial(monkeypatch: pytest.MonkeyPatch):  # type: ignore[no-untyped-def]
             raise error
         folder = TrialFolder.of(trial.values).path
         if error is not None and not isinstance(error, BusyError):
-            from gsbench.launch.serial import outcome_of_error
+            from gsbench.launch.jobs import outcome_of_error
 
             return outcome_of_error(folder, error)
         finish(trial.values)
         return Outcome(folder, "done", "psnr 1")
 
-    monkeypatch.setattr(serial, "run_one", run_one)
+    monkeypatch.setattr(jobs, "run_one", run_one)
     return behaviour, order
 
 

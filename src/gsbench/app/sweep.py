@@ -29,8 +29,8 @@ from gsbench.config.hydra_entry import explained
 from gsbench.errors import GsbenchError
 from gsbench.files import checked_runs_folder, make_runs_folder
 from gsbench.launch.batch import begin_for_another_launcher
+from gsbench.launch.jobs import Outcome, outcome_of_error
 from gsbench.launch.record import declare_questions
-from gsbench.launch.serial import Outcome, outcome_of_error
 from gsbench.runs.layout import RESULTS
 
 log = logging.getLogger(__name__)

@@ -14,8 +14,8 @@ from gsbench.config.compose import Trial
 from gsbench.config.schema import COMPONENTS
 from gsbench.errors import InputError
 from gsbench.files import FORBIDDEN, checked_runs_folder, make_runs_folder, storage_errors
+from gsbench.launch.jobs import Outcome, outcome_of_results, run_local, run_serial, run_slurm
 from gsbench.launch.record import add_to_plan, declare, declared_metrics
-from gsbench.launch.serial import Outcome, outcome_of_results, run_serial
 from gsbench.runs.code import OWN
 from gsbench.runs.keys import STAGES
 from gsbench.runs.layout import STORE
@@ -41,15 +41,9 @@ def run_batch(trials: Sequence[Trial]) -> list[Outcome]:
 
 def _run(trials: Sequence[Trial], launcher: str) -> list[Outcome]:
     if launcher == "slurm":
-        from gsbench.launch.slurm import run_slurm
-
         return run_slurm(trials)
     with Mirror() as mirror:
-        if launcher == "serial":
-            return run_serial(trials, mirror)
-        from gsbench.launch.jobs import run_local
-
-        return run_local(trials, mirror)
+        return (run_serial if launcher == "serial" else run_local)(trials, mirror)
 
 
 def begin_for_another_launcher(trials: Sequence[Trial]) -> None:

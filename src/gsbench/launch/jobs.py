@@ -1,7 +1,7 @@
-"""Trials as jobs of submitit, and running them in processes of this machine (`gsbench.launch.slurm`: in a cluster).
+"""Running trials: one after the other in this process, in processes of this machine, or in Slurm.
 
-A job runs one trial and returns its outcome. Whether a trial is done is decided by its files alone, since a scheduler
-may report a process wrongly.
+For the last two, a trial is a job of submitit, which returns the trial's outcome. Whether a trial is done is decided by
+its files alone, since a scheduler may report a process wrongly.
 """
 
 from __future__ import annotations
@@ -15,16 +15,26 @@ from collections.abc import Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from gsbench.config.compose import Trial
-from gsbench.files import require_no_links
-from gsbench.launch.serial import Outcome, outcome_of_results
-from gsbench.launch.states import forget_submission
+from gsbench.errors import GsbenchError, InputError
+from gsbench.files import DiskFullError, require_no_links
+from gsbench.launch.states import (
+    ask_queue,
+    current_user,
+    forget_submission,
+    read_queue,
+    read_submission,
+    record_submission,
+)
+from gsbench.logs import set_up_logging
 from gsbench.runs.keys import sha256_of
-from gsbench.runs.layout import JOBS
+from gsbench.runs.layout import JOBS, LOG
 from gsbench.runs.trial_folder import TrialFolder
+from gsbench.runs.trial_record import TrialRecord
 from gsbench.system.isolate import error_tail
+from gsbench.system.locks import BusyError, hold
 from gsbench.system.own_modules import adopt_modules, allowed_modules
 from gsbench.system.resources import assign_gpu, assign_threads, take_slot
 from gsbench.system.stopping import SIGNALS, SIGNALS_WITHOUT_INTERRUPT, Stopped, interrupts_ignored, stop_on_signals
@@ -32,10 +42,79 @@ from gsbench.tracking import Mirror
 from gsbench.words import counted
 
 if TYPE_CHECKING:
-    from submitit import Executor, Job
+    from submitit import Executor, Job, SlurmExecutor
     from submitit.helpers import DelayedSubmission
 
+
 log = logging.getLogger(__name__)
+
+Status = Literal["done", "failed", "queued"]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The end of a trial: ``message`` has its metrics, or why it failed.
+
+    ``bad_input`` says that the user's files or settings are the cause. A "queued" trial was left to Slurm, in the job
+    that ``message`` names; it may be running by now.
+    """
+
+    folder: Path
+    status: Status
+    message: str = ""
+    bad_input: bool = False
+
+    @property
+    def label(self) -> str:
+        return TrialFolder(self.folder).label
+
+
+def outcome_of_results(folder: Path, results: TrialRecord) -> Outcome:
+    """The outcome of a complete trial."""
+    metrics = "  ".join(f"{key} {value:.4g}" for key, value in results.metrics.items())
+    return Outcome(folder, "done", metrics)
+
+
+def outcome_of_error(folder: Path, error: Exception) -> Outcome:
+    """The outcome of a trial that raised ``error``."""
+    if isinstance(error, GsbenchError):
+        return Outcome(folder, "failed", str(error), isinstance(error, InputError))
+    text = f"{type(error).__name__}: {error}".splitlines()[0]
+    return Outcome(folder, "failed", f"{text}; the traceback is in {folder / LOG}")
+
+
+def run_serial(trials: Sequence[Trial], mirror: Mirror) -> list[Outcome]:
+    """Run the trials. A trial that another process is running comes last, so that two sweeps share the work."""
+    outcomes: list[Outcome] = []
+    busy: list[Trial] = []
+    for number, trial in enumerate(trials, 1):
+        if len(trials) > 1:
+            log.info("%d of %d: %s", number, len(trials), trial.files.label)
+        try:
+            outcomes.append(run_one(trial, mirror, wait=len(trials) == 1))
+        except BusyError as error:
+            log.info("%s; later", error)
+            busy.append(trial)
+    return outcomes + [run_one(trial, mirror, wait=True) for trial in busy]
+
+
+def run_one(trial: Trial, mirror: Mirror, wait: bool) -> Outcome:
+    """Run and mirror one trial.
+
+    Errors become its outcome, except BusyError, DiskFullError, and exceptions that end the program.
+    """
+    mirror.follow(trial.folder, trial.values["tracking"])
+    try:
+        from gsbench.pipeline.trial import run_trial  # here, because a sweep that is done needs no torch
+
+        return outcome_of_results(trial.folder, run_trial(trial, wait))
+    except (BusyError, DiskFullError):
+        raise
+    except Exception as error:  # noqa: BLE001 - a failed trial does not stop the others
+        return outcome_of_error(trial.folder, error)
+
+
+# ---- processes of this machine
 
 SECONDS_BETWEEN_POLLS = 1.0
 DAYS = 24 * 60  # minutes
@@ -53,8 +132,6 @@ class TrialJob:
     def __call__(self) -> Outcome:
         sys.path[:] = [*self.path, *(entry for entry in sys.path if entry not in self.path)]
         adopt_modules(self.own)
-        from gsbench.logs import set_up_logging
-
         set_up_logging()
         launch = self.values["launch"]
         # submitit's own handler requeues the job; it is called below, after the trial has saved a checkpoint.
@@ -68,8 +145,6 @@ class TrialJob:
                     slot = stack.enter_context(take_slot(TrialFolder.of(self.values).runs, launch["parallel"]))
                     assign_gpu(slot, self.visible_gpus)
                 assign_threads(self.values["threads"], launch["parallel"])
-                from gsbench.launch.serial import run_one
-
                 # With launch=local, the sweep's own process mirrors all of its trials.
                 mirror = stack.enter_context(Mirror(idle=launch["name"] == "local"))
                 outcome = run_one(Trial(self.values, ()), mirror, wait=True)
@@ -181,3 +256,111 @@ def job_of(trial: Trial) -> TrialJob:
     """The trial as a job with the environment of this process."""
     path = [entry for entry in sys.path if entry]
     return TrialJob(trial.values, path, allowed_modules(), os.environ.get("CUDA_VISIBLE_DEVICES"))
+
+
+# ---- tasks of a Slurm array job: submitted once, then awaited, or left to Slurm (``launch.wait=false``)
+
+SUBMIT_LOCK = ".submit.lock"  # in the folder of the jobs' output, so that two commands do not submit a trial twice
+SECONDS_BETWEEN_QUEUE_CHECKS = 20.0
+CHECKS_UNTIL_LOST = 2  # a job without a result is lost if it is missing in the queue so many times in a row
+
+
+def run_slurm(trials: Sequence[Trial]) -> list[Outcome]:
+    """Run the trials in Slurm; those that an earlier command submitted are awaited, not submitted again.
+
+    Returns when all have ended; with ``launch.wait=false``, after submitting, with outcomes of status "queued".
+    """
+    values = trials[0].values
+    executor = make_executor(values["launch"], job_folder(values))
+    with hold(Path(executor.folder) / SUBMIT_LOCK, f"submitting trials of {values['name']}"):
+        jobs = _submit(trials, executor)
+    array = sorted({job.job_id.split("_")[0] for job in jobs.values()})
+    if not values["launch"].get("wait", True):
+        print(f"Slurm job {', '.join(array)}: {counted(len(jobs), 'trial')}; see gsbench status {values['name']}")
+        return [Outcome(folder, "queued", job.job_id) for folder, job in jobs.items()]
+    log.info("%s in Slurm, job %s; logs: %s", counted(len(jobs), "trial"), ", ".join(array), executor.folder)
+    try:
+        return _wait(jobs, trials)
+    except KeyboardInterrupt:
+        log.info(
+            "the jobs stay in Slurm: the same command waits for them again, `scancel %s` ends them", " ".join(array)
+        )
+        raise
+
+
+def make_executor(launch: dict[str, Any], folder: Path) -> SlurmExecutor:
+    """The submitit executor for the settings ``launch``; raises InputError if Slurm is missing."""
+    import submitit
+
+    try:
+        slurm = submitit.SlurmExecutor(folder, max_num_timeout=launch["max_requeues"])
+    except RuntimeError:
+        raise InputError("launch=slurm: there is no srun here; start gsbench on a login node of the cluster") from None
+    wanted = {
+        "job_name": "gsbench",
+        "partition": launch["partition"],
+        "account": launch["account"],
+        "qos": launch["qos"],
+        "time": launch["timeout_min"],
+        "cpus_per_task": launch["cpus_per_trial"],
+        "gpus_per_node": launch["gpus_per_trial"] or None,
+        "mem": None if launch["mem_gb"] is None else f"{launch['mem_gb']}GB",
+        "signal_delay_s": launch["signal_seconds"],
+        "array_parallelism": launch["parallel"],
+        "setup": launch["setup"] or None,
+        "additional_parameters": launch["sbatch"] or None,
+    }
+    slurm.update_parameters(**{key: value for key, value in wanted.items() if value is not None})
+    return slurm
+
+
+def _submit(trials: Sequence[Trial], executor: SlurmExecutor) -> dict[Path, Job[Outcome]]:
+    """The job of each trial by the trial's folder: its job in the queue, or else a task of a new array job."""
+    import submitit
+
+    folders = [trial.folder for trial in trials]
+    queue = ask_queue(folders)
+    if queue is None:
+        raise InputError("Slurm does not list its jobs (squeue failed), so nothing was submitted: try again later")
+    jobs: dict[Path, Job[Outcome]] = {}
+    to_submit: dict[Path, Trial] = {}
+    for folder, trial in zip(folders, trials, strict=True):
+        submission = read_submission(folder)
+        if submission and submission.job in queue:
+            jobs[folder] = submitit.SlurmJob(executor.folder, submission.job)
+        else:
+            to_submit[folder] = trial
+    if to_submit:
+        try:
+            submitted = executor.submit_array([job_of(trial) for trial in to_submit.values()])
+        except Exception as error:
+            raise InputError(f"Slurm refused the job: {' '.join(str(error).split())[:300]}") from error
+        for folder, job in zip(to_submit, submitted, strict=True):
+            record_submission(folder, job.job_id, job.paths.stderr)
+            jobs[folder] = job
+    return jobs
+
+
+def _wait(jobs: dict[Path, Job[Outcome]], trials: Sequence[Trial]) -> list[Outcome]:
+    outcomes: list[Outcome] = []
+    submissions = filter(None, map(read_submission, jobs))
+    users = {submission.user or current_user() for submission in submissions} | {current_user()}
+    unseen = dict.fromkeys(jobs, 0)  # successive checks in which the queue did not list the job
+    checked = time.monotonic()
+    while jobs:
+        ended = [folder for folder, job in jobs.items() if job.paths.result_pickle.exists()]
+        if time.monotonic() - checked > SECONDS_BETWEEN_QUEUE_CHECKS:
+            checked = time.monotonic()
+            queue = read_queue(users)
+            if queue is not None:  # while the scheduler does not answer, no job counts as lost
+                for folder, job in jobs.items():
+                    unseen[folder] = 0 if job.job_id in queue else unseen[folder] + 1
+            ended += [folder for folder in jobs if unseen[folder] >= CHECKS_UNTIL_LOST and folder not in ended]
+        for folder in ended:
+            outcomes.append(collect(jobs.pop(folder), folder, trials))
+            with suppress(OSError):
+                forget_submission(folder)
+            log.info("%s: %s  (%d of %d)", outcomes[-1].label, outcomes[-1].message, len(outcomes), len(trials))
+        if not ended:
+            time.sleep(SECONDS_BETWEEN_POLLS)
+    return outcomes

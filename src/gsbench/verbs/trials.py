@@ -14,9 +14,8 @@ from gsbench.config.command_words import key_of, makes_other_trials, typed_permi
 from gsbench.config.compose import Trial, compose_one
 from gsbench.config.trust import PERMISSIONS
 from gsbench.errors import GsbenchError, InputError
-from gsbench.launch.dry_run import describe_plan
 from gsbench.launch.record import PlannedTrial, forget, read_plan, remove
-from gsbench.launch.states import TrialState, states_of_experiment
+from gsbench.launch.states import TrialState, describe_plan, states_of_experiment
 from gsbench.runs.code import module_digest
 from gsbench.runs.experiments import experiment_home, list_experiments, trial_folders
 from gsbench.runs.trial_folder import TrialFolder
