@@ -17,14 +17,17 @@ from PIL import Image
 from gsbench.errors import InputError
 from gsbench.init import MODEL_FOLDER, Dim, SiftKornia, read_cloud
 from gsbench.init.networks import extract_and_match
-from gsbench.init.networks.extract_and_match import NetworkJob, at_low_resolution, choose_pairs, open_store
-from gsbench.init.networks.extractors import (
+from gsbench.init.networks.extract_and_match import (
     SUPERPOINT_BORDER,
-    MutualNearestMatcher,
+    NetworkJob,
+    at_low_resolution,
     build_extractor,
     build_matcher,
+    choose_pairs,
     extract_features,
     match,
+    mutual_nearest_matcher,
+    open_store,
 )
 from gsbench.init.networks.features import Features, FeatureStore
 from gsbench.logs import no_progress
@@ -199,7 +202,9 @@ class TestContracts:
         assert len(matches) > 60  # width pruning may drop some
         np.testing.assert_array_equal(order[matches[:, 1]], matches[:, 0])
 
-    def test_lightglue_reads_the_published_names(self, untrained_weights: Path, tmp_path: Path):
+    def test_lightglue_reads_the_published_names(
+        self, untrained_weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ):
         """cvg/LightGlue's files say self_attn.0.… where the network says transformers.0.self_attn.…"""
         state = torch.load(untrained_weights / "superpoint_lightglue.pth", weights_only=True)
         published = {}
@@ -211,8 +216,13 @@ class TestContracts:
         published.pop("confidence_thresholds")
         torch.save(published, tmp_path / "published.pth")
         settings = superpoint(untrained_weights).feature_settings()
-        matcher = build_matcher(settings, tmp_path / "published.pth", CPU)
-        loaded = matcher.network.state_dict()
+        networks: list[torch.nn.Module] = []
+        load_into = extract_and_match.load_into
+        monkeypatch.setattr(
+            extract_and_match, "load_into", lambda network, *rest: (networks.append(network), load_into(network, *rest))
+        )
+        build_matcher(settings, tmp_path / "published.pth", CPU)
+        loaded = networks[0].state_dict()
         assert all(torch.equal(loaded[name], value) for name, value in state.items())
 
     def test_no_network_is_downloaded_by_the_libraries(self, untrained_weights: Path, monkeypatch: pytest.MonkeyPatch):
@@ -336,7 +346,7 @@ class TestErrors:
         some = Features(
             np.zeros((3, 2), np.float32), np.eye(3, 8, dtype=np.float32), np.ones(3, np.float32), (9, 9), (9, 9)
         )
-        assert match(MutualNearestMatcher(0.9, CPU), some, some.strongest(0)).shape == (0, 2)
+        assert match(mutual_nearest_matcher(0.9, CPU), some, some.strongest(0)).shape == (0, 2)
 
     @pytest.mark.parametrize(
         ("options", "message"),
@@ -370,7 +380,7 @@ def test_mutual_nearest_by_brute_force():
         row, column = np.sort(distance[i]), np.sort(distance[:, j])
         if distance[:, j].argmin() == i and row[0] <= 0.9 * row[1] and column[0] <= 0.9 * column[1]:
             expected.append((i, j))
-    matches = MutualNearestMatcher(0.9, CPU)(*sides)
+    matches = mutual_nearest_matcher(0.9, CPU)(*sides)
     assert sorted(map(tuple, matches.tolist())) == expected
     assert len(expected) > 3
 

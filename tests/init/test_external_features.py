@@ -22,7 +22,7 @@ from gsbench.init.colmap.database import (
 from gsbench.init.colmap.mapping import map_images
 from gsbench.init.colmap.reconstruct import verification_options
 from gsbench.init.colmap.sift import extract_sift, match_sift
-from gsbench.init.networks.extractors import build_extractor, extract_features
+from gsbench.init.networks.extract_and_match import build_extractor, extract_features
 from gsbench.init.networks.features import Features, FeatureSettings
 from gsbench.logs import no_progress
 from gsbench.scene.types import Capture

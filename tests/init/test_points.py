@@ -13,7 +13,7 @@ from plyfile import PlyData, PlyElement
 from gsbench.errors import InputError
 from gsbench.init import MODEL_FOLDER, Points, read_cloud
 from gsbench.init.base import PointCloud
-from gsbench.init.points import GREY, read_points, seen_colors
+from gsbench.init.placed import GREY, read_points, seen_colors
 from gsbench.scene.images import read_image
 from gsbench.scene.types import Capture
 from tests.init.test_report import CENTERS, model_of
@@ -90,7 +90,7 @@ def test_black_is_a_colour_and_what_no_camera_sees_is_grey(
 ):
     save(tmp_path / "scan.xyz", XYZ[:3])
     seen = np.array([[0, 0, 0], [-1, -1, -1], [0, 9, 255]], dtype=np.int16)
-    monkeypatch.setattr("gsbench.init.points.seen_colors", lambda *_: seen)
+    monkeypatch.setattr("gsbench.init.placed.seen_colors", lambda *_: seen)
     cloud = Points(path=tmp_path / "scan.xyz").cloud(courtyard, pycolmap.Reconstruction())
     np.testing.assert_array_equal(cloud.colors, [[0, 0, 0], [GREY] * 3, [0, 9, 255]])
 

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from gsbench.init import Sfm
 from gsbench.init.base import PoseErrors, Preparation, Timer
-from gsbench.init.colmap.job import ReconstructionJob, _finish
+from gsbench.init.colmap.mapping import ReconstructionJob, _finish
 from gsbench.init.colmap.reconstruct import similarity_to
 from gsbench.init.report import (
     compare_poses,

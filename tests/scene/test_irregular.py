@@ -14,7 +14,7 @@ from PIL import Image
 
 from gsbench.errors import InputError
 from gsbench.gaussians.ply import check_ply, read_ply
-from gsbench.init.points import read_points
+from gsbench.init.placed import read_points
 from gsbench.scene.colmap import read_model
 from gsbench.scene.images import IMAGE_SUFFIXES, check_picture_names, exif_orientation, image_size, read_image
 from gsbench.scene.options import SplitRule

@@ -14,8 +14,7 @@ from gsbench.init.base import (
     read_cloud,
 )
 from gsbench.init.dim import Dim, SiftKornia
-from gsbench.init.placed import Carved, Dataset, Random
-from gsbench.init.points import Ply, Points
+from gsbench.init.placed import Carved, Dataset, Ply, Points, Random
 from gsbench.init.sfm import Jittered, Sfm, SfmDense
 from gsbench.logs import Progress
 

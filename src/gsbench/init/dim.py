@@ -16,9 +16,9 @@ from pydantic import NonNegativeFloat, PositiveInt
 
 from gsbench.errors import InputError
 from gsbench.init.base import Preparation, Timer
-from gsbench.init.colmap.initializer import MIN_DETECTION_SIZE, ColmapInitializer
 from gsbench.init.colmap.pairs import Pairing
 from gsbench.init.networks.features import FeatureSettings
+from gsbench.init.sfm import MIN_DETECTION_SIZE, ColmapInitializer
 from gsbench.logs import Progress
 from gsbench.scene.types import Capture
 from gsbench.settings import AnyPath, Fraction

@@ -16,10 +16,10 @@ from PIL import Image, ImageDraw
 
 from gsbench.gaussians.paper_values import VOLUME_THRESHOLD
 from gsbench.init.base import MODEL_FOLDER, PICTURE_FILE, REPORT_FILE, Gauge, InitReport, PoseErrors, TrainingPoints
-from gsbench.init.colmap.alignment import Array, Similarity, rotation_angles, transformed_rotations
+from gsbench.init.colmap.alignment import Similarity, rotation_angles, transformed_rotations
 from gsbench.init.colmap.reconstruct import common_poses, poses_by_name, save_reconstruction
 from gsbench.scene.colmap import model_points
-from gsbench.scene.types import Capture, extent_of_centers
+from gsbench.scene.types import Array, Capture, extent_of_centers
 
 SIDE, MARGIN = 960, 60  # px
 MAX_POINTS = 200_000  # drawn; more would only cover each other

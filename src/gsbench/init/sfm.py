@@ -1,25 +1,171 @@
-"""Structure from motion on COLMAP's SIFT features."""
+"""Structure from motion by COLMAP: the base of initialisers that end in COLMAP, and those on COLMAP's SIFT features."""
 
 from __future__ import annotations
 
+import logging
+import shutil
+from abc import abstractmethod
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import numpy as np
 from annotated_types import Ge, Interval
 from pydantic import PositiveFloat, PositiveInt
 
 from gsbench.errors import InputError
-from gsbench.init.base import MODEL_FOLDER, InitReport, Timer
-from gsbench.init.colmap.alignment import Array
-from gsbench.init.colmap.initializer import MIN_DETECTION_SIZE, ColmapInitializer
+from gsbench.init.base import (
+    MIN_IMAGES,
+    MODEL_FOLDER,
+    WORK_FOLDER,
+    Initializer,
+    InitReport,
+    PointsFrom,
+    Poses,
+    Preparation,
+    Seed,
+    Timer,
+)
+from gsbench.init.colmap.pairs import STRONGEST, Pairing, proposed_pairs
 from gsbench.logs import Progress, no_progress
-from gsbench.scene.types import Capture
+from gsbench.scene.types import Array, Capture
+from gsbench.settings import Fraction, Threads, check_settings
 from gsbench.system.isolate import run_with_progress
+from gsbench.system.resources import available_cores
+from gsbench.words import counted
 
 if TYPE_CHECKING:
+    import pycolmap
+
     from gsbench.init.colmap.database import DatabaseTask
+
+logger = logging.getLogger(__name__)
+
+LOG_FILE = "colmap.log"
+CameraSharing = Literal["single", "per_folder", "per_image"]
+CameraModel = Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"]
+Intrinsics = Literal["estimate", "reference"]
+MIN_DETECTION_SIZE = 32  # px: detectors find nothing in smaller images
+
+
+@dataclass(frozen=True, kw_only=True)
+class ColmapInitializer(Initializer):
+    """Base of `Sfm`, `SfmDense`, `Dim` and `SiftKornia`, with the settings that they share.
+
+    With ``poses=shared``, points are triangulated under the reference cameras. With ``poses=own``, cameras and points
+    are estimated; if there is a reference and ``align`` is set, a similarity then moves them into its gauge.
+
+    With ``points_from=train``, test views contribute no points. Under given cameras their photographs are not read. If
+    cameras are estimated, all photographs are used for the cameras, and only points of training views are kept.
+
+    The reference is the ``reference`` given to `run`, else the model that came with the capture.
+    """
+
+    is_own_reference: ClassVar[bool] = False  # estimates the poses itself if poses=shared and there is no reference
+
+    poses: Poses = "shared"
+    align: bool = True
+    camera: CameraSharing = "single"
+    camera_model: CameraModel = "SIMPLE_RADIAL"
+    focal_length: PositiveFloat | None = None
+    intrinsics: Intrinsics = "estimate"
+    pairs: Pairing = "exhaustive"
+    overlap: Annotated[int, Interval(ge=1, le=60)] = 10
+    min_inliers: Annotated[int, Ge(7)] = 15  # a fundamental matrix needs seven
+    min_inlier_ratio: Fraction = 0.0
+    mapper: Literal["auto", "incremental", "global"] = "auto"
+    min_model_size: Annotated[int, Ge(2)] = 3
+    two_view_tracks: bool = False
+    points_from: PointsFrom = "all"
+    seed: Seed = 0
+    threads: Threads | Literal["auto"] = "auto"
+    mapper_threads: Threads = 1
+
+    def __post_init__(self) -> None:
+        check_settings(self, "init")
+
+    @abstractmethod
+    def fill_database(self, task: DatabaseTask, progress: Progress, timer: Timer) -> dict[str, int]:
+        """Write features, matches and verified geometries, in the isolated process. Returns counts for the report."""
+
+    @property
+    def num_threads(self) -> int:
+        """``threads`` as a number; ``auto`` is the number of cores that this process may use."""
+        return available_cores() if self.threads == "auto" else self.threads
+
+    def packages(self) -> tuple[str, ...]:
+        """The packages whose versions are in the report."""
+        return ("pycolmap", "numpy")
+
+    @property
+    def uses_reference_cameras(self) -> bool:
+        """Return whether at least the intrinsics are taken from the reference, if there is one."""
+        return self.poses == "shared" or self.intrinsics == "reference"
+
+    def select_images(self, capture: Capture, reference: pycolmap.Reconstruction | None) -> list[str]:
+        """The sorted names of the images to use: all, or the images of the reference if its cameras are used."""
+        if reference is None or not self.uses_reference_cameras:
+            return sorted(capture.image_names)
+        names = sorted(image.name for image in reference.images.values() if image.has_pose)
+        ignored = set(capture.test_names) if self.ignores_test_photographs(reference) else set()
+        return [name for name in names if name not in ignored]
+
+    def ignores_test_photographs(self, reference: pycolmap.Reconstruction | None) -> bool:
+        """Return whether test photographs are not read at all: given cameras do not need them."""
+        return self.points_from != "all" and self.poses == "shared" and reference is not None
+
+    def needs_reference(self, capture: Capture) -> bool:
+        """Return whether `run` needs a ``reference`` because the capture came without cameras."""
+        needs_poses = self.poses == "shared" and not self.is_own_reference
+        return capture.model is None and (needs_poses or self.intrinsics == "reference")
+
+    def run(
+        self,
+        capture: Capture,
+        output_dir: Path,
+        progress: Progress = no_progress,
+        reference: Path | None = None,
+        work_dir: Path | None = None,
+    ) -> InitReport:
+        """Write model and report (see `Initializer.run`).
+
+        ``work_dir`` keeps features and matches for a later run. Without it, they are kept in ``output_dir`` until the
+        run succeeds, so that an interrupted run continues there.
+
+        Raises ``InputError`` if no model can be made from the photographs with these settings.
+        """
+        self.check(capture, reference)
+        output_dir.mkdir(parents=True, exist_ok=True)
+        work = output_dir / WORK_FOLDER if work_dir is None else work_dir
+        work.mkdir(parents=True, exist_ok=True)
+        preparation = self.prepare(capture, work, reference, progress)
+        from gsbench.init.colmap.mapping import ReconstructionJob, build_model
+
+        job = ReconstructionJob(self, capture, output_dir, work, reference, preparation)
+        report = run_with_progress(build_model, job, progress, what=self.name, log=output_dir / LOG_FILE)
+        if work_dir is None:
+            shutil.rmtree(work)
+        for warning in report.warnings:
+            logger.warning("%s: %s", self.name, warning)
+        return report
+
+    def check(self, capture: Capture, reference: Path | None) -> None:
+        """Raise ``InputError``, before any work, if this capture cannot be initialised with these settings."""
+        if len(capture.image_names) < MIN_IMAGES:
+            raise InputError(
+                f"scene {capture.name} has {counted(len(capture.image_names), 'image')}: {self.name} needs at least "
+                f"{MIN_IMAGES}"
+            )
+        if reference is None and self.needs_reference(capture):
+            raise InputError(
+                f"init={self.name} takes its cameras from a reference, and scene {capture.name} came without: "
+                "make one with init=sfm first, or set init.poses=own and init.intrinsics=estimate"
+            )
+
+    def prepare(self, capture: Capture, work_dir: Path, reference: Path | None, progress: Progress) -> Preparation:
+        """Do the work that comes before COLMAP; none by default."""
+        return Preparation()
+
 
 # COLMAP's defaults
 DEFAULT_PEAK_THRESHOLD = 0.02 / 3
@@ -51,7 +197,6 @@ class Sfm(ColmapInitializer):
 
     def fill_database(self, task: DatabaseTask, progress: Progress, timer: Timer) -> dict[str, int]:
         from gsbench.init.colmap.database import colmap_masks, database_counts, strongest_descriptors
-        from gsbench.init.colmap.pairs import STRONGEST, proposed_pairs
         from gsbench.init.colmap.sift import extract_sift, match_sift
 
         with timer.phase("extract"):

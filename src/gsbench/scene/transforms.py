@@ -17,18 +17,15 @@ from typing import Annotated
 
 import numpy as np
 from annotated_types import Len
-from numpy.typing import NDArray
 
 from gsbench.errors import InputError
 from gsbench.parsing import resolved
 from gsbench.records import Number, Record, Text, read_typed
 from gsbench.scene.images import IMAGE_SUFFIXES, image_size
-from gsbench.scene.types import CameraModel
+from gsbench.scene.types import Array, CameraModel
 from gsbench.words import some_of
 
 log = logging.getLogger(__name__)
-
-Array = NDArray[np.float64]
 Row = Annotated[list[Number], Len(4, 4)]
 Matrix = Annotated[list[Row], Len(3, 4)]  # a fourth row is ignored
 

@@ -186,7 +186,7 @@ def test_ways_are_tried_until_one_places_nine_of_ten(
 def test_the_ways_of_a_mapper(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mapper: Any, prior: bool) -> None:
     """From the defaults to assumed focal lengths, these only where none is known."""
     calls: list[tuple[object, ...]] = []
-    monkeypatch.setattr(mapping, "cameras_without_prior", lambda database: not prior)
+    monkeypatch.setattr(mapping.colmap_database, "cameras_without_prior", lambda database: not prior)
     own = mapping._Mapper
     monkeypatch.setattr(own, "with_assumed_focal_lengths", lambda _, factor: calls.append(("assumed", factor)) or [])
     monkeypatch.setattr(

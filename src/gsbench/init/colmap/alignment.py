@@ -3,9 +3,8 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from gsbench.scene.types import Array
 
 RANSAC_TRIALS = 500
 # 2.5 sigma, as in least median of squares; the median absolute deviation times 1.4826 estimates sigma.

@@ -1,4 +1,4 @@
-"""Mapping: cameras and points from a database of verified matches, by the first of several strategies that succeeds.
+"""Making a COLMAP model with its report: triangulation, or mapping by the first of several strategies that succeeds.
 
 COLMAP's defaults need an initial pair that sees points under 16 degrees. Forward-facing captures with a small baseline
 have no such pair; COLMAP's global mapper, smaller angles or assumed focal lengths can still place them. Everything here
@@ -8,8 +8,8 @@ calls native code that can abort the process: run it isolated.
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,14 +18,16 @@ import numpy as np
 import pycolmap
 
 from gsbench.errors import InputError
-from gsbench.init.base import MIN_IMAGES
-from gsbench.init.colmap.database import assume_focal_lengths, cameras_without_prior, verify_pairs
-from gsbench.init.colmap.reconstruct import pipeline_options, verification_options
-from gsbench.init.report import REGISTERED_SHARE
+from gsbench.init import report
+from gsbench.init.base import MIN_IMAGES, OWN_GAUGE_FOLDER, InitReport, Preparation, Timer, TrainingPoints
+from gsbench.init.colmap import database as colmap_database
+from gsbench.init.colmap import reconstruct
+from gsbench.init.colmap.alignment import Similarity
 from gsbench.logs import Progress
+from gsbench.scene.types import Capture
 
 if TYPE_CHECKING:
-    from gsbench.init.colmap.initializer import ColmapInitializer
+    from gsbench.init.sfm import ColmapInitializer
 
 SMALL_ANGLE_DEG = 2.0  # triangulation angle of the initial pair; COLMAP's default is 16
 FOCAL_FACTORS = (0.75, 1.0, 1.4)  # focal length over the longest side: lenses of 27, 36 and 50 mm on 35 mm film
@@ -77,7 +79,7 @@ def map_images(
         tried.append((strategy, 0 if largest is None else largest.num_reg_images()))
         if largest is not None and (best is None or _model_size(largest) > _model_size(best[0])):
             best = largest, len(models), strategy
-        if best is not None and best[0].num_reg_images() >= REGISTERED_SHARE * total:
+        if best is not None and best[0].num_reg_images() >= report.REGISTERED_SHARE * total:
             break
     if best is None:
         raise InputError(NO_PAIR)
@@ -115,7 +117,7 @@ class _Mapper:
             )
         if mapper in ("auto", "global"):
             yield "global", self.global_mapping
-        if mapper == "auto" and cameras_without_prior(self.database):
+        if mapper == "auto" and colmap_database.cameras_without_prior(self.database):
             for factor in FOCAL_FACTORS:
                 yield f"focal length {factor:g} x the longest side", partial(self.with_assumed_focal_lengths, factor)
 
@@ -128,7 +130,7 @@ class _Mapper:
             registered += 1
             self.progress("map", min(registered, self.total), self.total)
 
-        options = pipeline_options(self.options)
+        options = reconstruct.pipeline_options(self.options)
         if initial_angle is not None:
             options.mapper.init_min_tri_angle = initial_angle
         run = partial(pycolmap.incremental_mapping, database, next_image_callback=count_image)
@@ -152,7 +154,8 @@ class _Mapper:
         """
         copy = self.database.with_name(f"assumed-{factor:g}.db")
         shutil.copy(self.database, copy)
-        verify_pairs(copy, assume_focal_lengths(copy, factor), verification_options(self.options), self.progress)
+        pairs = colmap_database.assume_focal_lengths(copy, factor)
+        colmap_database.verify_pairs(copy, pairs, reconstruct.verification_options(self.options), self.progress)
         return self.incremental(copy, SMALL_ANGLE_DEG)
 
     def _run(self, mapping: Callable[..., dict[int, pycolmap.Reconstruction]], options: Any) -> Models:
@@ -185,3 +188,106 @@ def _widest_angle(point: pycolmap.Point3D, centers: dict[int, np.ndarray]) -> fl
     rays = np.array([centers[element.image_id] for element in point.track.elements]) - point.xyz  # [T, 3]
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     return float(np.degrees(np.arccos(np.clip(rays @ rays.T, -1, 1)).max()))
+
+
+@dataclass(frozen=True)
+class ReconstructionJob:
+    """Inputs of one run of an initialiser in its isolated process."""
+
+    options: ColmapInitializer
+    capture: Capture
+    output_dir: Path
+    work_dir: Path
+    reference: Path | None
+    preparation: Preparation
+
+
+def build_model(job: ReconstructionJob, progress: Progress) -> InitReport:
+    """Make cameras, features, matches, model and report. Calls native code that can abort: run it isolated."""
+    pycolmap.logging.minloglevel = int(pycolmap.logging.Level.WARNING)
+    options, capture = job.options, job.capture
+    timer = Timer(dict(job.preparation.seconds))
+    reference = reconstruct.load_reference(capture, job.reference)
+    database = job.work_dir / "database.db"
+    used = capture.train_names if options.ignores_test_photographs(reference) else capture.image_names
+    images = colmap_database.readable_images(capture.images, used, job.work_dir)
+    if reference is not None and options.uses_reference_cameras:
+        groups = colmap_database.reference_camera_groups(reference)
+    else:
+        groups = colmap_database.unknown_camera_groups(
+            images, capture.image_names, options.camera, options.camera_model, options.focal_length
+        )
+    image_ids = colmap_database.create_database(database, groups)
+    names = [name for name in image_ids if name in set(used)]
+    pairs = reconstruct.select_pairs(names, options)
+    task = colmap_database.DatabaseTask(database, images, names, pairs, capture, job.work_dir)
+    counts = options.fill_database(task, progress, timer)
+    counts = {**job.preparation.counts, **counts, **colmap_database.database_counts(database)}
+    if counts["pairs_verified"] == 0:
+        raise InputError(
+            f"{options.name}: no pair of images shares enough matches: the photos need more overlap or texture"
+        )
+    scratch = job.work_dir / "mapping"
+    shutil.rmtree(scratch, ignore_errors=True)
+    if options.poses == "shared" and reference is not None:
+        with timer.phase("triangulate"):
+            model = reconstruct.triangulate(database, images, scratch, reference, names, options, progress)
+        points = None
+        if options.ignores_test_photographs(reference):
+            points = TrainingPoints(options.points_from, model.num_points3D(), None, None)
+        return _finish(job, "shared", model, reference, None, timer, counts, points=points)
+    with timer.phase("map"):
+        mapped = map_images(database, images, scratch, options, progress)
+    points = None
+    if options.points_from == "train":
+        points = reconstruct.keep_training_points(mapped.model, capture.train_names, images)
+    similarity = None if reference is None else reconstruct.similarity_to(mapped.model, reference)
+    counts["models"] = mapped.models
+    return _finish(job, "own", mapped.model, reference, similarity, timer, counts, mapped, points)
+
+
+def _finish(
+    job: ReconstructionJob,
+    poses: str,
+    model: pycolmap.Reconstruction,
+    reference: pycolmap.Reconstruction | None,
+    similarity: Similarity | None,
+    timer: Timer,
+    counts: Mapping[str, int],
+    mapped: MappingResult | None = None,
+    points: TrainingPoints | None = None,
+) -> InitReport:
+    """Align the model if its poses were estimated, write it, and make the report."""
+    options, capture = job.options, job.capture
+    warnings = [*job.preparation.warnings, *(() if mapped is None else mapped.warnings)]
+    pose_errors, own_gauge, scale = None, None, 1.0 if poses == "shared" else None
+    if poses == "own" and reference is not None and similarity is None:
+        warnings.append("too few common cameras with the reference: poses are neither aligned nor compared")
+    if reference is not None and similarity is not None:
+        exact = capture.exact_poses and job.reference is None
+        reference_extent = report.training_extent(reference, capture)
+        pose_errors = report.compare_poses(model, reference, similarity, reference_extent, exact)
+        scale = similarity.scale
+        if options.align:
+            own_gauge = report.measure_gauge(report.training_extent(model, capture), scale)
+            reconstruct.save_reconstruction(model, job.output_dir / OWN_GAUGE_FOLDER)
+            reconstruct.apply_similarity(model, similarity)
+            scale = 1.0
+    made = report.make_report(
+        options.name,
+        poses,
+        capture,
+        model,
+        scale,
+        settings={**asdict(options), **job.preparation.settings},
+        seconds=timer.rounded(),
+        packages=options.packages(),
+        own_gauge=own_gauge,
+        pose_errors=pose_errors,
+        counts=counts,
+        mapped_by=None if mapped is None else mapped.strategy,
+        warnings=warnings,
+        training_points=points,
+    )
+    report.write_result(model, made, job.output_dir)
+    return made

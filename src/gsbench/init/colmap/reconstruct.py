@@ -15,14 +15,14 @@ import pycolmap
 
 from gsbench.errors import InputError
 from gsbench.init.base import TrainingPoints
-from gsbench.init.colmap.alignment import Array, Similarity, align_poses
+from gsbench.init.colmap.alignment import Similarity, align_poses
 from gsbench.init.colmap.pairs import exhaustive_pairs, sequential_pairs
 from gsbench.logs import Progress
 from gsbench.scene.colmap import MIN_TRACK, read_reference
-from gsbench.scene.types import Capture
+from gsbench.scene.types import Array, Capture
 
 if TYPE_CHECKING:
-    from gsbench.init.colmap.initializer import ColmapInitializer
+    from gsbench.init.sfm import ColmapInitializer
 
 
 def verification_options(options: ColmapInitializer) -> pycolmap.TwoViewGeometryOptions:

@@ -15,7 +15,7 @@ from PIL import Image
 
 from gsbench.files import file_sha256
 from gsbench.init.base import MODEL_FOLDER, Initializer
-from gsbench.init.points import GREY, read_points
+from gsbench.init.placed import GREY, read_points
 from gsbench.logs import Progress, progress
 from gsbench.runs.code import VIEWS_ROOMS, edited, states_of
 from gsbench.runs.keys import CAPTURE, GROUND_TRUTH, INIT, NO_USER_CODE, Step, UserCode, options_of, sha256_of, step_of
