@@ -1,4 +1,4 @@
-"""Plug-ins by which Hydra finds gsbench's launcher and sweeper. Their work is done in ``gsbench.app.sweep``.
+"""Plug-ins by which Hydra finds gsbench's launcher and sweeper. Their work is done in ``gsbench.app.command``.
 
 Hydra imports this file whenever any Hydra app in the same environment starts, so it imports only Hydra.
 """
@@ -36,7 +36,7 @@ class GsbenchSweeper(Sweeper):
         self.params, self.tune = params or {}, tune or {}
 
     def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
-        from gsbench.app.sweep import Sweep
+        from gsbench.app.command import Sweep
 
         self.started = Sweep.begin(hydra_context, task_function, config)
 

@@ -1,35 +1,67 @@
 """gsbench as a Hydra app: a command line becomes trials and an exit code.
 
 Before Hydra runs, the whole configuration is composed and checked (`gsbench.config.compose`). Then ``hydra.main`` runs
-the task once, or hands it to gsbench's sweeper.
+the task once, or hands it to gsbench's sweeper. A sweep may first tune its arms (`gsbench.app.tuning`). Its trials run
+as one batch, or seed by seed until their question is decided.
 """
 
 import logging
 import os
 import sys
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Self
 
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
+from hydra.core.plugins import Plugins
+from hydra.core.utils import JobReturn
 from hydra.errors import HydraException
-from hydra.types import RunMode
+from hydra.plugins.launcher import Launcher
+from hydra.types import HydraContext, RunMode, TaskFunction
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from gsbench.analysis.quantities import COSTS
-from gsbench.config.command_words import check_words, is_sweep, parse
-from gsbench.config.compose import Trial, compose_whole, enforce_permissions, resolve_trial, typed_words
-from gsbench.config.hydra_entry import explained, hydra_ready, run_main
+from gsbench.app.tuning import tuned_jobs
+from gsbench.claims.stopping import KeyAndSeed, headline, plan_sweep, run_looks
+from gsbench.config.command_words import (
+    bare_key,
+    check_words,
+    grid_points,
+    is_interval,
+    is_sweep,
+    key_of,
+    parse,
+    parse_word,
+)
+from gsbench.config.compose import (
+    Trial,
+    compose_jobs,
+    compose_whole,
+    enforce_permissions,
+    explained,
+    hydra_ready,
+    resolve_times,
+    resolve_trial,
+    run_main,
+    typed_words,
+)
 from gsbench.config.trust import PERMISSIONS, check_composed, load_callbacks
 from gsbench.errors import GsbenchError, InputError
 from gsbench.eval.options import EvalConfig
-from gsbench.launch.batch import check_parts, missing_folders, need_no_check, run_batch
-from gsbench.launch.jobs import Outcome
+from gsbench.files import checked_runs_folder, make_runs_folder
+from gsbench.launch.batch import begin_for_another_launcher, check_parts, missing_folders, need_no_check, run_batch
+from gsbench.launch.jobs import Outcome, outcome_of_error
+from gsbench.launch.record import declare_questions
 from gsbench.launch.states import describe_plan
 from gsbench.logs import set_up_logging
+from gsbench.runs.layout import RESULTS
 from gsbench.system.own_modules import allow_modules
 
+GRIDS = "hydra.sweeper.grids"
 OWN_LAUNCHER = "gsbench"  # its name in Hydra
 
 log = logging.getLogger(__name__)
@@ -141,7 +173,7 @@ def run_app(words: Sequence[str], multirun: bool, task: TrialTask) -> None:
     task.allowed = tuple(config[PERMISSIONS])
     task.grids = OmegaConf.to_container(config.hydra.sweeper, resolve=False).get("grids")  # type: ignore[union-attr]
     # The grids are taken out: Hydra would resolve their ${…} when it makes the sweeper, before each trial's values.
-    argv = [*words, *["hydra.sweeper.grids=[]"] * bool(task.grids)]
+    argv = [*words, *[f"{GRIDS}=[]"] * bool(task.grids)]
     if task.look_only:  # nothing runs, so no callback is called
         argv += [f"~hydra.callbacks.{name}" for name in config.hydra.callbacks]
     else:
@@ -206,3 +238,155 @@ def summarize(outcomes: Sequence[Outcome], trials: Sequence[Trial]) -> int:
     if failed and all(outcome.status == "failed" and outcome.bad_input for outcome in outcomes):
         return 2
     return 1 if failed else 0
+
+
+# ---- sweeps
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """A sweep that Hydra has started: its configuration, its task, Hydra's context and the launcher."""
+
+    config: DictConfig
+    task: TrialTask
+    context: HydraContext
+    launcher: Launcher
+
+    @classmethod
+    def begin(cls, context: HydraContext, task: TaskFunction, config: DictConfig) -> Self:
+        """Make a sweep from what Hydra gives a sweeper."""
+        assert isinstance(task, TrialTask)
+        config.allow_targets = list(task.allowed)
+        resolve_times(config)
+        launcher = Plugins.instance().instantiate_launcher(hydra_context=context, task_function=task, config=config)
+        return cls(config, task, context, launcher)
+
+    def run(self, params: Mapping[str, Any], tune: Mapping[str, Any], words: Sequence[str]) -> None:
+        """Run all points that the ``words`` and ``params`` (``hydra.sweeper.params``) of the sweep span.
+
+        ``tune`` (``hydra.sweeper.tune``) says how intervals among them are searched first (`gsbench.app.tuning`).
+        """
+        grids = checked_grids(self.task.grids or [])
+        jobs: list[list[str]] = []
+        intervals: list[dict[str, Override]] = []  # for each job, the settings that are searched for its arm
+        for grid_words in words_of_grids(params, grids, words):
+            by_key = {bare_key(override.get_key_element()): override for override in self.parse(grid_words)}
+            points = grid_points([override for override in by_key.values() if not is_interval(override)])
+            jobs += points
+            searched = {override.get_key_element(): override for override in by_key.values() if is_interval(override)}
+            intervals += [searched] * len(points)
+        trials = self.trials(tuned_jobs(self, tune, jobs, intervals))
+        if any(trial.values["launch"]["stop_when_decided"] for trial in trials):
+            self._run_until_decided(trials)
+        else:
+            self.launch(trials)
+
+    def parse(self, words: Sequence[str]) -> list[Override]:
+        """The words as Hydra reads them, with the choices of ``glob(*)``."""
+        for word in words:
+            parse_word(word)  # for its errors: words from a file were not checked before
+        with explained(words):
+            return OverridesParser.create(self.context.config_loader).parse_overrides(list(words))
+
+    def trials(self, jobs: Sequence[Sequence[str]]) -> list[Trial]:
+        """The trials of ``jobs``, each the list of its words."""
+        return compose_jobs(self.context.config_loader, self.config, jobs)
+
+    def launch(self, trials: Sequence[Trial]) -> None:
+        """Run trials by the launcher. For another launcher than gsbench's, all trials are checked before the first."""
+        name = self.config.hydra.runtime.choices["hydra/launcher"]
+        if name == OWN_LAUNCHER or self.task.look_only:
+            self.task.launch(trials)
+            return
+        begin_for_another_launcher(trials)
+        jobs = [[word for word in trial.overrides if not parse_word(word).is_hydra_override()] for trial in trials]
+        try:
+            returned = self.launcher.launch(jobs, initial_job_idx=len(self.task.trials))
+        except GsbenchError:
+            raise
+        except Exception as error:
+            message = " ".join(str(error).split()) or type(error).__name__
+            raise GsbenchError(f"hydra/launcher={name}: {message} (gsbench status tells how far it came)") from error
+        self.task.trials += trials
+        self.task.outcomes += [_outcome(trial, ended) for trial, ended in zip(trials, returned, strict=True)]
+
+    def _run_until_decided(self, trials: Sequence[Trial]) -> None:
+        """Run the trials in the looks that the sequential test plans. Decided pairs of arms get no further trials.
+
+        Raises InputError for a sweep that cannot be tested so.
+        """
+        stopping = plan_sweep(trials)
+        if self.task.look_only:
+            print(stopping.describe())
+            self.launch(trials)
+            return
+        make_runs_folder(checked_runs_folder(trials[0].values["runs"]))
+        stopping = replace(stopping, declaration=declare_questions(stopping.home, stopping.declaration))
+        launched: set[Path] = set()
+
+        def run(planned: Sequence[KeyAndSeed]) -> None:
+            batch = [trial for key in planned if (trial := stopping.trials[key]).folder not in launched]
+            launched.update(trial.folder for trial in batch)
+            if batch:
+                self.launch(batch)
+
+        for verdict in run_looks(stopping.declaration, stopping.judged, run):
+            log.info("%s", headline(verdict))
+        spared = [trial for trial in trials if trial.folder not in launched and not (trial.folder / RESULTS).exists()]
+        log.info("%d of %d trials were not needed", len(spared), len(trials))
+
+
+def _outcome(trial: Trial, returned: JobReturn) -> Outcome:
+    """The outcome of a trial that another launcher ran."""
+    value: Any = returned._return_value  # the public property `return_value` would write a line to stderr
+    return outcome_of_error(trial.folder, value) if isinstance(value, Exception) else Outcome(trial.folder, "done")
+
+
+# ---- grids
+#
+# An experiment's file may join several grids. Each maps settings to values, and all share the settings of
+# ``hydra.sweeper.params``:
+#
+#     hydra:
+#       mode: MULTIRUN
+#       sweeper:
+#         params:
+#           seed: 0,1,2
+#         grids:
+#           - densify: adc
+#           - densify: volumetric
+#             densify.volume_threshold: 0.01,0.03
+#
+# If some grids list the setting of a word of the command line, the word replaces their values and does not reach the
+# other grids. Any other word is for all grids.
+
+
+def checked_grids(grids: Any) -> list[dict[str, str]]:
+    """The grids of the configuration, with values as texts. Raises InputError unless they are a list of mappings."""
+    if not isinstance(grids, list) or not all(isinstance(grid, dict) and grid for grid in grids):
+        raise InputError(f"{GRIDS} must be a list, each a mapping of settings to values, got {grids!r}")
+    return [{str(key): _text(key, value) for key, value in grid.items()} for grid in grids]
+
+
+def words_of_grids(
+    params: Mapping[str, Any], grids: Sequence[Mapping[str, str]], given: Sequence[str]
+) -> list[list[str]]:
+    """The words of each grid: its own, the shared ``params``, and the words ``given`` that are for it.
+
+    If two set one key, the later counts. Trials are in the order of the grids; the shared settings vary fastest.
+    """
+    listed = {bare_key(key) for grid in grids for key in grid}
+    return [
+        [
+            *(f"{key}={value}" for key, value in grid.items()),
+            *(f"{key}={value}" for key, value in params.items() if bare_key(key) not in map(bare_key, grid)),
+            *(word for word in given if key_of(word) not in listed - set(map(bare_key, grid))),
+        ]
+        for grid in grids or [{}]
+    ]
+
+
+def _text(key: object, value: object) -> str:
+    if value is None or isinstance(value, list | dict):
+        raise InputError(f"{GRIDS}: {key} must list values as on the command line, such as 1,2,3, got {value!r}")
+    return str(value).lower() if isinstance(value, bool) else str(value)

@@ -25,9 +25,8 @@ from hydra.core.override_parser.types import Override
 from omegaconf import OmegaConf
 from pydantic import NonNegativeInt, PositiveInt
 
-from gsbench.app.grids import bare_key, grid_points, value_text
 from gsbench.claims.stopping import facts_for
-from gsbench.config.command_words import check_makes_trials, key_of, parse_word
+from gsbench.config.command_words import bare_key, check_makes_trials, grid_points, key_of, parse_word
 from gsbench.config.compose import Trial
 from gsbench.errors import GsbenchError, InputError
 from gsbench.eval.facts import known_keys
@@ -45,7 +44,7 @@ if TYPE_CHECKING:
     from optuna.distributions import BaseDistribution
     from optuna.trial import Trial as Proposal
 
-    from gsbench.app.sweep import Sweep
+    from gsbench.app.command import Sweep
 
 log = logging.getLogger(__name__)
 
@@ -151,7 +150,7 @@ class ArmSearch:
             wanted=self.settings.points,
             seeds=list(self.goal.seeds),
             scenes=list(self.scenes),
-            ranges={key: value_text(interval) for key, interval in self.intervals.items()},
+            ranges={key: str(interval.input_line).partition("=")[2] for key, interval in self.intervals.items()},
             log=[key for key, values in self.ranges.items() if getattr(values, "log", False)],
             as_it_is=self.first is not None,
             points=self.points,

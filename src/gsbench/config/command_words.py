@@ -4,6 +4,7 @@ import re
 import shlex
 from collections.abc import Sequence
 from functools import cache
+from itertools import accumulate, product
 from pathlib import Path
 from typing import Any
 
@@ -75,8 +76,7 @@ def check_words(words: Sequence[str]) -> None:
     if len(experiments) > 1:
         raise InputError(f"{' '.join(experiments)}: two experiments are two sweeps: give a command for each")
     for word in words:
-        override = parse_word(word)
-        key = override.get_key_element().lstrip("+~")
+        override, key = parse_word(word), key_of(word)
         if key.startswith(("hydra.", "hydra/")):  # the rest about them is checked after composition (config/trust.py)
             if override.is_sweep_override():
                 raise InputError(f"{word}: Hydra's own settings apply to all trials, so choose one value")
@@ -85,7 +85,9 @@ def check_words(words: Sequence[str]) -> None:
         elif "@" in key:
             raise InputError(f"{word!r}: a group has one place, so leave out the @ and what follows it")
         elif override.is_delete():
-            _check_deletion(word, key)
+            group, dot, _ = key.partition(".")
+            if not dot or group not in (*COMPONENTS, "raster"):
+                raise InputError(f"{word!r}: a setting cannot be removed: give it another value")
         elif key in GROUPS and not _is_choice(override):
             raise InputError(f"{word!r}: choose one by its name: {key}={', '.join(options(key))}")
 
@@ -95,7 +97,7 @@ def typed_permissions(words: Sequence[str]) -> tuple[str, ...]:
     allowed: tuple[str, ...] = ()
     for word in words:
         override = parse_word(word)
-        if override.get_key_element().lstrip("+~") != PERMISSIONS or override.is_sweep_override():
+        if key_of(word) != PERMISSIONS or override.is_sweep_override():
             continue
         names: Any = override.value()
         if not isinstance(names, list) or not all(isinstance(name, str) and name and "$" not in name for name in names):
@@ -112,7 +114,7 @@ def check_search_path(words: Sequence[str], allowed: Sequence[str]) -> None:
     """
     for word in words:
         override = parse_word(word)
-        key = override.get_key_element().lstrip("+~").replace("[", ".").replace("]", "")
+        key = key_of(word).replace("[", ".").replace("]", "")
         if key != "hydra.searchpath" or override.is_sweep_override():
             continue
         value: Any = override.value()
@@ -149,16 +151,17 @@ def parse_word(word: str) -> Override:
 
 def key_of(word: str) -> str:
     """The setting that a word sets, adds or removes."""
-    return parse_word(word).get_key_element().lstrip("+~")
+    return bare_key(parse_word(word).get_key_element())
+
+
+def bare_key(key: str) -> str:
+    """A key without the signs that add or remove it."""
+    return key.lstrip("+~")
 
 
 def bracket_depth(word: str) -> int:
     """The largest number of brackets that are open at once."""
-    depth = deepest = 0
-    for letter in word:
-        depth += (letter in "[{(") - (letter in "]})")
-        deepest = max(deepest, depth)
-    return deepest
+    return max(accumulate(((letter in "[{(") - (letter in "]})") for letter in word), initial=0))
 
 
 def hint_for(word: str) -> str:
@@ -201,7 +204,7 @@ def is_sweep(word: str) -> bool:
 def check_sweep(override: Override) -> None:
     """Raise InputError for a sweep that has no list of values, or whose values would all give the same trial."""
     if not override.is_discrete_sweep():
-        key = override.get_key_element().lstrip("+~")
+        key = bare_key(override.get_key_element())
         raise InputError(
             f"{override.input_line}: a sweep is a list of values, such as {key}=1,2,3; "
             "intervals are for gsbench's own sweeper, which searches in them (docs/search.md)"
@@ -209,9 +212,32 @@ def check_sweep(override: Override) -> None:
     check_makes_trials(override)
 
 
+def grid_points(overrides: Sequence[Override]) -> list[list[str]]:
+    """The words of every point of the grid that ``overrides`` span. If two set one key, the later counts."""
+    choices: dict[str, list[str]] = {}
+    for override in overrides:
+        key = override.get_key_element()
+        if override.is_sweep_override():
+            check_sweep(override)
+            try:
+                choices[key] = [f"{key}={value}" for value in override.sweep_string_iterator()]
+            except ValueError as error:  # such as a range with a step of 0
+                raise InputError(f"{override.input_line}: {error}") from error
+            if not choices[key]:
+                raise InputError(f"{override.input_line} lists no value")
+        else:
+            choices[key] = [key if override.is_delete() else f"{key}={override.get_value_element_as_str()}"]
+    return [list(point) for point in product(*choices.values())]
+
+
+def is_interval(override: Override) -> bool:
+    """Return whether a word gives an interval in which a value is searched, instead of a list of values."""
+    return override.is_sweep_override() and not override.is_discrete_sweep()
+
+
 def check_makes_trials(override: Override) -> None:
     """Raise InputError for a setting whose values would all give the same trial."""
-    key = override.get_key_element().lstrip("+~")
+    key = bare_key(override.get_key_element())
     if not makes_other_trials(key):
         raise InputError(f"{override.input_line}: {key} does not make a different trial, so choose one value")
 
@@ -244,19 +270,11 @@ def searched_folders(words: Sequence[str]) -> list[Path]:
 
 
 def _check_experiment_word(word: str, override: Override) -> None:
-    choices = ", ".join(options("experiment"))
-    if not word.startswith("+experiment="):
-        raise InputError(f"{word}: write +experiment=NAME (choose: {choices})")
-    if override.is_sweep_override() or isinstance(override.value(), list):
+    several = override.is_sweep_override() or isinstance(override.value(), list)
+    if several and word.startswith("+experiment="):
         raise InputError(f"{word}: two experiments are two sweeps: give a command for each")
-    if not _is_choice(override):
-        raise InputError(f"{word}: write +experiment=NAME (choose: {choices})")
-
-
-def _check_deletion(word: str, key: str) -> None:
-    group = key.partition(".")[0]
-    if key == group or group not in (*COMPONENTS, "raster"):
-        raise InputError(f"{word!r}: a setting cannot be removed: give it another value")
+    if several or not word.startswith("+experiment=") or not _is_choice(override):
+        raise InputError(f"{word}: write +experiment=NAME (choose: {', '.join(options('experiment'))})")
 
 
 def _is_choice(override: Override) -> bool:

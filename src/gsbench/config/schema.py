@@ -32,7 +32,6 @@ from gsbench.settings import (
     check_settings,
     check_values,
     is_folder_name,
-    unknown_setting,
 )
 from gsbench.system.resources import trials_at_once
 from gsbench.train.options import TrainConfig
@@ -128,13 +127,10 @@ class Config:
     launch: LaunchConfig = field(default_factory=LaunchConfig)
 
 
-GROUP_SCHEMAS: dict[str, type] = {
-    "scene": SceneConfig,
-    "raster": RasterConfig,
-    "train": TrainConfig,
-    "eval": EvalConfig,
-    "tracking": TrackingConfig,
-    "launch": LaunchConfig,
+GROUP_SCHEMAS: dict[str, Any] = {
+    entry.name: entry.default_factory
+    for entry in dataclasses.fields(Config)
+    if dataclasses.is_dataclass(entry.default_factory)
 }
 COMPONENTS = ("init", "densify")  # groups whose keys are the options of a class
 
@@ -178,7 +174,8 @@ def checked_values(config: DictConfig) -> dict[str, Any]:
         if given.get("_target_") is not None:  # the other keys are options of the user's class
             given = {key: given.get(key) for key in ("name", "_target_")}
         _require_all(schema, given, f"{group}.")
-        values[group] |= plain(_converted(schema, given, group))
+        settings = schema(**check_values(schema, given, group))
+        values[group] |= plain({key: getattr(settings, key) for key in given})
     root = {key: value for key, value in values.items() if key not in (*GROUP_SCHEMAS, *COMPONENTS)}
     _require_all(Config, values, "")
     values |= check_values(Config, root, "")
@@ -198,16 +195,6 @@ def checked_values(config: DictConfig) -> dict[str, Any]:
     if launch["parallel"] == "auto":
         launch["parallel"] = trials_at_once(densify.get("max_gaussians"), values["device"])
     return values
-
-
-def _converted(schema: type, given: Mapping[str, Any], group: str) -> dict[str, Any]:
-    """The settings ``given``, converted and checked by the class ``schema``."""
-    fields = [entry.name for entry in dataclasses.fields(schema)]
-    for name in given:
-        if name not in fields:
-            raise InputError(unknown_setting(f"{group}.{name}", name, fields))
-    settings = schema(**given)
-    return {name: getattr(settings, name) for name in given}
 
 
 def _require_all(schema: type, given: Mapping[str, Any], prefix: str) -> None:

@@ -167,14 +167,7 @@ def check_permissions(values: Mapping[str, Any]) -> None:
 
 def targets_in(values: Any, place: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
     """Yield every ``_target_`` at any depth, lists included, as (keys that lead to its mapping, the target)."""
-    if isinstance(values, Mapping):
-        if values.get(TARGET) is not None:
-            yield place, values[TARGET]
-        for key, value in values.items():
-            yield from targets_in(value, (*place, str(key)))
-    elif isinstance(values, list | tuple):
-        for number, value in enumerate(values):
-            yield from targets_in(value, (*place, str(number)))
+    return ((inner, value) for inner, key, value in _entries(values, place) if key == TARGET and value is not None)
 
 
 def packages_allowed_at(place: Sequence[str]) -> tuple[str, ...]:
@@ -207,8 +200,8 @@ def check_composed(config: DictConfig, allowed: Sequence[str]) -> None:
 
 def _entries(values: Any, place: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], str, Any]]:
     """Yield every entry at any depth, lists included, as (keys that lead there, its key, its value)."""
-    if isinstance(values, dict | list):
-        for key, value in values.items() if isinstance(values, dict) else enumerate(values):
+    if isinstance(values, Mapping | list | tuple):
+        for key, value in values.items() if isinstance(values, Mapping) else enumerate(values):
             yield place, str(key), value
             yield from _entries(value, (*place, str(key)))
 
@@ -323,7 +316,7 @@ def check_program(settings: Mapping[str, Any], allowed: Sequence[str]) -> None:
     if not programs and not variables:
         return
     runs = [f"runs the program {' and '.join(map(repr, programs))}"] * bool(programs)
-    sets = [f"sets {variables_text(variables)}"] * bool(variables)
+    sets = ["sets " + ", ".join(f"{name}={value!r}" for name, value in variables.items())] * bool(variables)
     raise InputError(
         f"densify={settings['name']} {' and '.join(runs + sets)}; if you trust it, "
         + permission_advice([*programs, *variables], allowed)
@@ -337,11 +330,6 @@ def foreign_variables(variables: Mapping[str, Any], allowed: Sequence[str]) -> d
         for name, value in variables.items()
         if name not in FREE_VARIABLES and name not in allowed and value != os.environ.get(name)
     }
-
-
-def variables_text(variables: Mapping[str, Any]) -> str:
-    """Variables with their values, for a message."""
-    return ", ".join(f"{name}={value!r}" for name, value in variables.items())
 
 
 def _check_launch(launch: Mapping[str, Any], allowed: Sequence[str]) -> None:

@@ -6,8 +6,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from gsbench.config.command_words import check_search_path, check_single, parse_word, search_path, typed_permissions
-from gsbench.config.compose import compose_whole, has_key
-from gsbench.config.hydra_entry import hydra_ready, run_main
+from gsbench.config.compose import compose_whole, has_key, hydra_ready, run_main
 from gsbench.errors import InputError
 from gsbench.verbs.arguments import ArgumentParser
 
