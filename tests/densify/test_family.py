@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from gsbench.densify import ADC, MCMC, MRNF, DensifyContext, NoDensifier, Volumetric
+from gsbench.densify.base import revised_logits
 from gsbench.densify.budget import limit_at
 from gsbench.densify.mcmc import shared_opacity
-from gsbench.densify.operations import revised_logits
 from gsbench.errors import InputError
 from gsbench.gaussians.paper_values import LearningRates
 from gsbench.gaussians.trainable import TrainableGaussians

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from gsbench.densify import ADC, Cause, Densifier, DensifyContext, Lineage, RefineEvent, Refinement, Volumetric
-from gsbench.densify.operations import standard_normal
+from gsbench.densify.base import standard_normal
 from gsbench.gaussians.paper_values import LearningRates
 from gsbench.gaussians.trainable import TrainableGaussians
 from tests.gaussians.helpers import random_gaussians

@@ -10,9 +10,8 @@ from annotated_types import Ge, Interval
 from pydantic import PositiveFloat, PositiveInt
 from torch import Tensor
 
-from gsbench.densify.base import NEVER, Refinement, Rule, Statistic
+from gsbench.densify.base import NEVER, Refinement, Rule, Statistic, revised_logits
 from gsbench.densify.budget import Budgeted, admit
-from gsbench.densify.operations import revised_logits
 from gsbench.events import Cause
 from gsbench.raster.base import RenderOutput
 from gsbench.settings import OpenFraction, Switch
@@ -62,6 +61,8 @@ class ADC(Budgeted):
         "absolute_gradient": Switch({"gradient": "signed"}, "the absolute gradient, in which pixels do not cancel"),
         "revised_opacity": Switch({"revised_opacity": False}, "children that share their parent's opacity"),
     }
+
+    prunes_by_size: ClassVar[bool] = True
 
     gradient: Literal["signed", "absolute"] = "signed"  # absolute: AbsGS, arXiv 2404.10484
     gradient_threshold: PositiveFloat = 2e-4
@@ -173,7 +174,7 @@ class ADC(Budgeted):
 
     def huge(self, step: int, log_scales: Tensor) -> Tensor:
         """Mask [N] of the Gaussians to prune by size: none until the first opacity reset has passed."""
-        if step <= self.opacity_reset_interval:
+        if not self.prunes_by_size or step <= self.opacity_reset_interval:
             return log_scales.new_zeros(len(log_scales), dtype=torch.bool)
         huge = log_scales.amax(-1) > math.log(self.prune_size * self.context.extent)
         if self.prune_screen_radius is not None:

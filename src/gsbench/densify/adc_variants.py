@@ -11,9 +11,8 @@ from pydantic import NonNegativeInt, PositiveFloat, PositiveInt
 from torch import Tensor
 
 from gsbench.densify.adc import ADC, OPACITY_RESET, Grown
-from gsbench.densify.base import NEVER, Refinement, Rule, Statistic
+from gsbench.densify.base import NEVER, Refinement, Rule, Statistic, faded, quantile, standard_normal
 from gsbench.densify.budget import admit
-from gsbench.densify.operations import faded, quantile, standard_normal
 from gsbench.errors import InputError
 from gsbench.events import Cause
 from gsbench.gaussians.model import Gaussians
@@ -290,6 +289,8 @@ class ResGS(ADC):
         "levels": Switch({"level_factor": 1.0}, "lower thresholds for those that earlier stages passed over"),
     }
 
+    prunes_by_size = False
+
     gradient: Literal["signed", "absolute"] = "absolute"
     gradient_threshold: PositiveFloat = 6.7e-4
     parent_opacity: OpenFraction = 0.3
@@ -375,10 +376,6 @@ class ResGS(ADC):
         logits = gaussians.values.opacity_logits.detach()
         fainter = torch.where(parents, faded(logits, self.parent_opacity), logits)
         gaussians.overwrite("opacity_logits", fainter, where=parents)
-
-    def huge(self, step: int, log_scales: Tensor) -> Tensor:
-        """An empty mask [N]: the authors do not prune by size."""
-        return torch.zeros_like(log_scales[:, 0], dtype=torch.bool)
 
     def reset_statistics(self, refinement: Refinement) -> None:
         """Set all statistics but the levels to zero."""

@@ -1,8 +1,9 @@
 """The contract of a densifier: its hyper-parameters, its saved state, the lineage of every Gaussian, and a record of
-each refinement."""
+each refinement. At the end stand functions that several densifiers share."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
@@ -10,7 +11,6 @@ from typing import Any, ClassVar, NamedTuple
 import torch
 from torch import Tensor
 
-from gsbench.densify.operations import revised_logits, split
 from gsbench.densify.scores import TrainingViews
 from gsbench.events import Cause, RefineEvent
 from gsbench.gaussians.model import Gaussians
@@ -29,10 +29,14 @@ class Lineage:
     def __init__(self, num_gaussians: int) -> None:
         self.ids = torch.arange(num_gaussians)  # [N]
         self.initial_count = num_gaussians
-        self._parents = [torch.full((num_gaussians,), -1, dtype=torch.int64)]
-        self._causes = [torch.full((num_gaussians,), int(Cause.INITIAL), dtype=torch.uint8)]
-        self._steps = [torch.zeros(num_gaussians, dtype=torch.int32)]
+        self._history = [self._entries(torch.full((num_gaussians,), -1), Cause.INITIAL, 0)]  # joined when asked for
         self._total = num_gaussians
+
+    @staticmethod
+    def _entries(parents: Tensor, cause: Cause, step: int) -> dict[str, Tensor]:
+        """The history of Gaussians that were born together, given the identities [A] of their parents."""
+        causes = torch.full_like(parents, int(cause), dtype=torch.uint8)
+        return {"parents": parents, "causes": causes, "steps": torch.full_like(parents, step, dtype=torch.int32)}
 
     def edit(self, keep: Tensor | None, parents: Tensor | None, cause: Cause, step: int) -> None:
         """Keep the Gaussians at the mask ``keep`` [N], then append a child of each of ``parents`` [A].
@@ -40,38 +44,31 @@ class Lineage:
         ``parents`` are indices from before the edit.
         """
         living = self.ids if keep is None else self.ids[keep.cpu()]
-        if parents is not None and len(parents):
-            added = len(parents)
-            self._parents.append(self.ids[parents.cpu()])
-            self._causes.append(torch.full((added,), int(cause), dtype=torch.uint8))
-            self._steps.append(torch.full((added,), step, dtype=torch.int32))
-            living = torch.cat([living, torch.arange(self._total, self._total + added)])
-            self._total += added
+        if parents is not None:
+            self._history.append(self._entries(self.ids[parents.cpu()], cause, step))
+            living = torch.cat([living, torch.arange(self._total, self._total + len(parents))])
+            self._total += len(parents)
         self.ids = living
 
     def causes_of_living(self) -> dict[str, int]:
         """Count the present Gaussians by cause."""
-        counts = torch.bincount(torch.cat(self._causes)[self.ids].long(), minlength=len(Cause))
+        counts = torch.bincount(self.state_dict()["causes"][self.ids].long(), minlength=len(Cause))
         return {cause.key: int(counts[cause]) for cause in Cause}
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return ``ids``, ``parents``, ``causes`` and ``steps`` as tensors; ``lineage.npz`` of a trial holds the
         same."""
-        return {
-            "ids": self.ids.clone(),
-            "parents": torch.cat(self._parents),
-            "causes": torch.cat(self._causes),
-            "steps": torch.cat(self._steps),
+        return {"ids": self.ids} | {
+            name: torch.cat([entries[name] for entries in self._history]) for name in self._history[0]
         }
 
     @classmethod
     def from_state(cls, state: dict[str, Tensor]) -> Lineage:
+        history = {name: tensor.cpu() for name, tensor in state.items()}
         lineage = cls(0)
-        parents = state["parents"].cpu()
-        lineage.ids = state["ids"].cpu().clone()
-        lineage._parents, lineage._causes, lineage._steps = [parents], [state["causes"].cpu()], [state["steps"].cpu()]
-        lineage._total = len(parents)
-        lineage.initial_count = int((parents < 0).sum())
+        lineage.ids = history.pop("ids")
+        lineage._history, lineage._total = [history], len(history["parents"])
+        lineage.initial_count = int((history["parents"] < 0).sum())
         return lineage
 
 
@@ -278,8 +275,11 @@ class Densifier:
         children. The means of children are drawn from the density of their parent (``sampled``), or equal its mean.
         """
         parents = selected.nonzero().squeeze(-1)  # [S]
-        parent_values = refinement.gaussians.values.detach().select(parents)
-        new = split(parent_values, children, child_log_scales, refinement.rng, sampled)
+        new = Gaussians.concatenate([refinement.gaussians.values.detach().select(parents)] * children)
+        if sampled:
+            offsets = standard_normal((len(new), 3), refinement.rng, new.means) * new.scales  # along each one's axes
+            new.means = new.means + (new.rotations @ offsets.unsqueeze(-1)).squeeze(-1)
+        new.log_scales = child_log_scales.repeat(children, 1)
         if revised_opacity:
             new.opacity_logits = revised_logits(new.opacity_logits)
         keep = None if keep_parent else ~selected
@@ -317,12 +317,48 @@ class Densifier:
         self.statistics = {name: saved[name].to(context.device, copy=True) for name in self.STATISTICS}
 
     def _zeros(self, count: int, device: torch.device) -> dict[str, Tensor]:
-        zeros = {}
-        for name, kind in self.STATISTICS.items():
-            dtype, shape = (kind, ()) if isinstance(kind, torch.dtype) else kind
-            zeros[name] = torch.zeros(count, *shape, dtype=dtype, device=device)
-        return zeros
+        kinds = {n: Statistic(k) if isinstance(k, torch.dtype) else k for n, k in self.STATISTICS.items()}
+        return {name: torch.zeros(count, *kind.shape, dtype=kind.dtype, device=device) for name, kind in kinds.items()}
 
 
 class NoDensifier(Densifier):
     """``densify=none``: the initial Gaussians are only optimised."""
+
+
+def standard_normal(shape: tuple[int, ...], rng: torch.Generator, like: Tensor) -> Tensor:
+    """Draw normal numbers of ``shape``, with the dtype and on the device of ``like``, determined by the CPU generator
+    ``rng``.
+
+    On another device, a temporary generator there draws the numbers, seeded by ``rng``. So no numbers are uploaded, and
+    the state of ``rng`` is all that a checkpoint must save. The same seed gives other numbers there than on the CPU.
+    """
+    if like.device.type == "cpu":
+        return torch.randn(shape, generator=rng, dtype=like.dtype)
+    seed = int(torch.randint(2**62, (1,), generator=rng))
+    device_rng = torch.Generator(like.device).manual_seed(seed)
+    return torch.randn(shape, generator=device_rng, dtype=like.dtype, device=like.device)
+
+
+MIN_REVISED_OPACITY = 1e-6  # keeps the logit finite
+
+
+def revised_logits(opacity_logits: Tensor) -> Tensor:
+    """Logits of 1 - sqrt(1 - o): two such children, one behind the other, are as opaque as the parent.
+
+    From Revising Densification (arXiv 2404.06109).
+    """
+    transmittance = (-opacity_logits).sigmoid().sqrt()  # sqrt(1 - o)
+    return torch.logit((1 - transmittance).clamp_min(MIN_REVISED_OPACITY))
+
+
+def faded(opacity_logits: Tensor, factor: float) -> Tensor:
+    """Logits of ``factor`` (at most 1) times the opacity."""
+    return torch.logit(factor * opacity_logits.sigmoid())
+
+
+def quantile(ordered: Tensor, q: float) -> float:
+    """The ``q``-quantile of sorted values [N], interpolated linearly (torch.quantile refuses more than 16 M values)."""
+    position = q * (len(ordered) - 1)
+    low = math.floor(position)
+    high = min(low + 1, len(ordered) - 1)
+    return float(ordered[low] + (position - low) * (ordered[high] - ordered[low]))

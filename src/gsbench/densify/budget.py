@@ -17,14 +17,6 @@ CapKind = Literal["soft", "freeze", "hard", "curve", "governor"]
 BISECTION_STEPS = 40  # of log(factor): the last interval is far below the spacing of float32 scores
 
 
-def check_room(most: int, num_initial: int) -> None:
-    """Raise InputError if the initial cloud has more than ``most`` Gaussians, the largest count allowed."""
-    if most < num_initial:
-        raise InputError(
-            f"densify.max_gaussians must be at least the size of the initial cloud ({num_initial}), got {most}"
-        )
-
-
 def limit_at(step: int, start: int, stop: int, initial: int, max_gaussians: int | None, cap: CapKind) -> int | None:
     """The limit on the count at iteration ``step``; None: no limit.
 
@@ -150,8 +142,11 @@ class Budgeted(Densifier):
             raise InputError(f"densify.cap={self.cap} needs the method forecast, which {type(self).__name__} lacks")
 
     def begin(self, gaussians: Gaussians, context: DensifyContext) -> None:
-        if self.most_gaussians is not None:
-            check_room(self.most_gaussians, len(gaussians))
+        if self.most_gaussians is not None and self.most_gaussians < len(gaussians):
+            raise InputError(
+                f"densify.max_gaussians must be at least the size of the initial cloud ({len(gaussians)}), got "
+                f"{self.most_gaussians}"
+            )
         super().begin(gaussians, context)
 
     def due(self, step: int) -> bool:

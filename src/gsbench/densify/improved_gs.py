@@ -4,6 +4,7 @@ import logging
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Annotated, Any, ClassVar, Literal
 
 import torch
@@ -12,9 +13,8 @@ from pydantic import PositiveFloat, PositiveInt
 from torch import Tensor
 
 from gsbench.densify.adc import ADC, OPACITY_RESET, Grown
-from gsbench.densify.base import DensifyContext, Refinement, Rule
+from gsbench.densify.base import DensifyContext, Refinement, Rule, faded, quantile
 from gsbench.densify.budget import allowance
-from gsbench.densify.operations import faded, quantile
 from gsbench.densify.scores import by_mean, draw, draw_views, edge_scores
 from gsbench.events import Cause
 from gsbench.gaussians.model import Gaussians
@@ -126,6 +126,8 @@ class EdgeAware(LongAxis):
         "recovery_prune": Switch({"recovery_share": 0.0}, "the pruning of what did not recover from an opacity reset"),
     }
 
+    prunes_by_size = False
+
     gradient: Literal["signed", "absolute"] = "absolute"
     gradient_threshold: PositiveFloat = 3e-4
     score_views: PositiveInt = 10
@@ -145,7 +147,7 @@ class EdgeAware(LongAxis):
         if self.prune in rules and step >= self.stop - self.interval:
             rules.remove(self.prune)
         if step == EARLY_PRUNE * self.interval:
-            rules.append(self.prune_early)
+            rules.append(partial(self.prune_below, opacity=self.early_prune_opacity))
         if self.start < step < self.stop and self.rounds_after_reset(step) == RECOVERY:
             rules += [self.prune_unrecovered, self.reset_statistics]
         return rules
@@ -194,14 +196,6 @@ class EdgeAware(LongAxis):
         count = len(views) if self.rounds_after_reset(step) == ALL_VIEWS else self.score_views
         return edge_scores(views, draw_views(views, count, rng), gaussians, step, by_mean)
 
-    def huge(self, step: int, log_scales: Tensor) -> Tensor:
-        """An empty mask [N]: the authors do not prune by size."""
-        return torch.zeros_like(log_scales[:, 0], dtype=torch.bool)
-
-    def prune_early(self, refinement: Refinement) -> None:
-        """Remove Gaussians that became faint before the first round."""
-        self.prune_below(refinement, self.early_prune_opacity)
-
     def prune_unrecovered(self, refinement: Refinement) -> None:
         """Remove the ``recovery_share`` with the lowest opacities, which did not recover from the opacity reset."""
         opacities = refinement.gaussians.values.opacities.detach()
@@ -223,6 +217,7 @@ HARD_FACTOR = 3.0  # on the pressure after the first part
 BAND, WEAKER, STRONGER = 0.1, 0.8, 1.2  # the weight is changed if the opacity is more than BAND from its aim
 CLOSE = 1.05  # times the budget: below this, the excess is removed at once, by a random draw
 RATE_FACTOR = 4.0  # on the learning rate of opacities, until `SOFT_SHARE` after the budget is met
+SELECTION = ("step", "weight", "aim", "met_at")  # the attributes of `GNS` that checkpoints hold
 
 
 @dataclass
@@ -311,20 +306,16 @@ class GNS(EdgeAware):
         """The rules of Improved-GS within the window, then those of the selection."""
         step, count = refinement.step, len(refinement.gaussians)
         if self.met_at is not None and step == self.met_at + round(SOFT_SHARE * self.pressure_time):
-            return [self.restore_rate]
+            return [partial(self.multiply_rate, factor=1.0)]
         if not self.pressing(step):
             return super().rules(refinement)
         if step == self.stop:
-            return [self.raise_rate]
+            return [partial(self.multiply_rate, factor=RATE_FACTOR)]
         ended = step == self.stop + self.pressure_time
         if ended or count < CLOSE * self.max_gaussians:
             return [self.meet_budget]
         pruning = step % self.pressure_interval == 0 and not self.in_first_part(step)
-        return [self.prune_transparent] if pruning else []
-
-    def prune_transparent(self, refinement: Refinement) -> None:
-        """Remove the Gaussians that the pressure has made transparent."""
-        self.prune_below(refinement, self.selected_opacity)
+        return [partial(self.prune_below, opacity=self.selected_opacity)] if pruning else []
 
     def meet_budget(self, refinement: Refinement) -> None:
         """Keep ``max_gaussians`` Gaussians, drawn by opacity, and end the pressure."""
@@ -341,19 +332,14 @@ class GNS(EdgeAware):
             self.remove(refinement, ~kept)
         self.met_at = refinement.step
 
-    def raise_rate(self, refinement: Refinement) -> None:
-        """Raise the learning rate of opacities for the pressure and for a while after it."""
-        refinement.gaussians.set_rate("opacity_logits", RATE_FACTOR * refinement.gaussians.rates.opacity)
-
-    def restore_rate(self, refinement: Refinement) -> None:
-        """Restore the learning rate of opacities."""
-        refinement.gaussians.set_rate("opacity_logits", refinement.gaussians.rates.opacity)
+    def multiply_rate(self, refinement: Refinement, factor: float) -> None:
+        """Set the learning rate of opacities to ``factor`` times that of the settings."""
+        refinement.gaussians.set_rate("opacity_logits", factor * refinement.gaussians.rates.opacity)
 
     def state_dict(self) -> dict[str, Any]:
-        selection = {"step": self.step, "weight": self.weight, "aim": self.aim, "met_at": self.met_at}
-        return super().state_dict() | {"selection": selection}
+        return super().state_dict() | {"selection": {name: getattr(self, name) for name in SELECTION}}
 
     def load_state_dict(self, state: dict[str, Any], context: DensifyContext) -> None:
         super().load_state_dict(state, context)
-        saved = state["selection"]
-        self.step, self.weight, self.aim, self.met_at = (saved[key] for key in ("step", "weight", "aim", "met_at"))
+        for name in SELECTION:
+            setattr(self, name, state["selection"][name])

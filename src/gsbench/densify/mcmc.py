@@ -10,10 +10,9 @@ from annotated_types import Interval
 from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 from torch import Tensor
 
-from gsbench.densify.base import Refinement, Rule
+from gsbench.densify.base import Refinement, Rule, standard_normal
 from gsbench.densify.budget import Budgeted
 from gsbench.densify.improved_gs import halves
-from gsbench.densify.operations import standard_normal
 from gsbench.densify.scores import blended_sums, by_median, draw, draw_views, edge_scores
 from gsbench.events import Cause
 from gsbench.gaussians.model import Gaussians
@@ -86,10 +85,7 @@ class MCMC(Budgeted):
         if count in (0, len(gaussians)):
             return
         opacities = gaussians.values.opacities.detach().masked_fill(dead, 0)
-        sources = _draw(opacities, count, refinement.rng)  # [D]
-        self._share_opacity(gaussians, sources)
-        copies = gaussians.values.detach().select(sources)
-        self.edit(refinement, keep=~dead, append=copies, parents=sources, cause=Cause.RELOCATED)
+        self._copy(refinement, opacities, count, ~dead, Cause.RELOCATED)
         refinement.event.relocated = count
 
     def add(self, refinement: Refinement) -> None:
@@ -102,13 +98,12 @@ class MCMC(Budgeted):
         event.blocked_by_cap += wanted - event.added
         if event.added == 0:
             return
-        sources = _draw(gaussians.values.opacities.detach(), event.added, refinement.rng)  # [A]
-        self._share_opacity(gaussians, sources)
-        copies = gaussians.values.detach().select(sources)
-        self.edit(refinement, append=copies, parents=sources, cause=Cause.ADDED)
+        self._copy(refinement, gaussians.values.opacities.detach(), event.added, None, Cause.ADDED)
 
-    def _share_opacity(self, gaussians: TrainableGaussians, sources: Tensor) -> None:
-        """Set opacity and scale of the Gaussians at ``sources`` [D] to those that they share with their copies."""
+    def _copy(self, refinement: Refinement, weights: Tensor, count: int, keep: Tensor | None, cause: Cause) -> None:
+        """Append ``count`` (at least 1) copies of Gaussians drawn by ``weights`` [N], which share their opacity; of
+        the others, keep those at the mask ``keep``."""
+        gaussians, sources = refinement.gaussians, _draw(weights, count, refinement.rng)  # [A]
         copies = torch.bincount(sources, minlength=len(gaussians)) + 1  # [N], the Gaussian included
         touched = copies > 1
         limited = copies[touched].clamp_max(self.max_copies)
@@ -121,6 +116,7 @@ class MCMC(Budgeted):
         changed = {"opacity_logits": logits, "log_scales": log_scales}
         for name, tensor in gaussians.values.tensors().items():  # all six parameters: overwriting zeroes the moments
             gaussians.overwrite(name, changed.get(name, tensor), where=touched)
+        self.edit(refinement, keep, gaussians.values.detach().select(sources), sources, cause)
 
 
 def shared_opacity(opacities: Tensor, copies: Tensor) -> tuple[Tensor, Tensor]:
@@ -132,7 +128,7 @@ def shared_opacity(opacities: Tensor, copies: Tensor) -> tuple[Tensor, Tensor]:
     """
     new = 1 - (1 - opacities.double()).pow(1 / copies.double())  # [M]
     total = torch.zeros_like(new)
-    for i in range(1, int(copies.max()) + 1 if len(copies) else 1):
+    for i in range(1, int(copies.max()) + 1):
         inner = torch.zeros_like(new)
         for k in range(i):
             inner += math.comb(i - 1, k) * (-1) ** k * new ** (k + 1) / math.sqrt(k + 1)

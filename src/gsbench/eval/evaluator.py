@@ -136,7 +136,7 @@ def _require_size(image: Tensor, min_side: int) -> None:
         raise UnavailableError(f"a view is {width}x{height} px, below {min_side} px a side")
 
 
-# How each metric of `gsbench.eval.facts.METRICS` is made; raises UnavailableError if weights or packages are missing.
+# Each metric of `gsbench.eval.facts.METRICS` for a context. Raises UnavailableError if weights or packages are missing.
 MEASURES: dict[str, Callable[[MetricContext], Metric]] = {
     "psnr": Psnr,
     "ssim": Ssim,
