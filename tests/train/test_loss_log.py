@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gsbench.raster.staged import Readback
-from gsbench.train.journal import LossLog, volume_histogram
+from gsbench.train.trainer import LossLog, volume_histogram
 
 
 def scalars(step: int, total: float | None = None) -> tuple[Tensor, ...]:

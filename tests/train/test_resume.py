@@ -18,8 +18,7 @@ from gsbench.gaussians.model import Gaussians
 from gsbench.raster import create_rasterizer
 from gsbench.scene.types import Scene
 from gsbench.system.stopping import Stopped, stop_on_signals
-from gsbench.train.journal import drop_after
-from gsbench.train.trainer import Status, Trainer
+from gsbench.train.trainer import Status, Trainer, drop_after
 from tests.train.test_trainer import cloud, options, records, same
 
 ITERATIONS = 120
@@ -142,7 +141,7 @@ def test_a_kill_while_a_resumed_training_tidies_its_records_loses_none(share: fl
     file.write_text("".join(lines))
     kept = len("".join(lines[:4000]))
     code = (
-        "import resource, signal, sys\nfrom pathlib import Path\nfrom gsbench.train.journal import drop_after\n"
+        "import resource, signal, sys\nfrom pathlib import Path\nfrom gsbench.train.trainer import drop_after\n"
         "signal.signal(signal.SIGXFSZ, signal.SIG_DFL)\n"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[2]),) * 2)\n"
         "resource.setrlimit(resource.RLIMIT_CORE, (0, 0))\ndrop_after(Path(sys.argv[1]), 4000)"

@@ -95,6 +95,10 @@ def _base(name: str) -> str:
     return re.split(r"/|__", _stem(name))[-1]
 
 
+def _folded(words: Mapping[str, str]) -> dict[str, str]:
+    return {name: word.casefold() for name, word in words.items()}
+
+
 def _stripped(words: Mapping[str, str]) -> dict[str, str]:
     """The words without the start and the end that all of them share, which never contain digits next to the rest."""
     if len(words) < 2:
@@ -123,13 +127,9 @@ def _by_value(name: str) -> list[tuple[int, int, str]]:
 KeyFunction = Callable[[Sequence[str]], dict[str, str]]  # names are equal under a rule if their keys are
 
 
-def _exactly(key: Callable[[str], str]) -> KeyFunction:
-    return lambda names: {name: key(name) for name in names}
-
-
-def _without_case(key: Callable[[str], str], *steps: Callable[[Mapping[str, str]], dict[str, str]]) -> KeyFunction:
+def _names(key: Callable[[str], str], *steps: Callable[[Mapping[str, str]], dict[str, str]]) -> KeyFunction:
     def keys(names: Sequence[str]) -> dict[str, str]:
-        words = {name: key(name).casefold() for name in names}
+        words = {name: key(name) for name in names}
         for step in steps:
             words = step(words)
         return words
@@ -138,15 +138,15 @@ def _without_case(key: Callable[[str], str], *steps: Callable[[Mapping[str, str]
 
 
 _RULES: dict[str, KeyFunction] = {
-    SAME_NAMES: _exactly(lambda name: name),
-    "apart from the extension": _exactly(_stem),
-    "with folders as part of the name": _exactly(_flat),
-    "apart from case": _without_case(_flat),
-    "apart from what all names begin or end with": _without_case(_flat, _stripped),
-    "apart from leading zeros": _without_case(_flat, _stripped, _unpadded),
-    "apart from folders": _without_case(_base),
-    "apart from folders and what all names begin or end with": _without_case(_base, _stripped),
-    "apart from folders and leading zeros": _without_case(_base, _stripped, _unpadded),
+    SAME_NAMES: _names(str),
+    "apart from the extension": _names(_stem),
+    "with folders as part of the name": _names(_flat),
+    "apart from case": _names(_flat, _folded),
+    "apart from what all names begin or end with": _names(_flat, _folded, _stripped),
+    "apart from leading zeros": _names(_flat, _folded, _stripped, _unpadded),
+    "apart from folders": _names(_base, _folded),
+    "apart from folders and what all names begin or end with": _names(_base, _folded, _stripped),
+    "apart from folders and leading zeros": _names(_base, _folded, _stripped, _unpadded),
 }
 
 

@@ -95,14 +95,10 @@ def load_checkpoint(folder: Path) -> dict[str, Any] | None:
 
 def _check_digest(path: Path) -> None:
     """Raise ValueError unless the last bytes of the file are the sha256 of the rest."""
-    remaining = path.stat().st_size - DIGEST_BYTES
+    end = path.stat().st_size - DIGEST_BYTES
     digest = hashlib.sha256()
     with path.open("rb") as stream:
-        while remaining > 0:
-            chunk = stream.read(min(CHUNK, remaining))
-            if not chunk:
-                break
+        while chunk := stream.read(min(CHUNK, max(end - stream.tell(), 0))):
             digest.update(chunk)
-            remaining -= len(chunk)
-        if remaining != 0 or stream.read() != digest.digest():
+        if stream.read() != digest.digest():
             raise ValueError("its checksum differs")

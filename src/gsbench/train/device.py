@@ -2,7 +2,7 @@
 
 import torch
 
-from gsbench.errors import InputError, TrainingError
+from gsbench.errors import InputError
 
 
 def select_device(name: str) -> torch.device:
@@ -39,16 +39,3 @@ def free_bytes(device: torch.device) -> int | None:
     free, _ = torch.cuda.mem_get_info(device)
     # torch's cache counts as used for the driver, but torch itself can still use it.
     return free + torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
-
-
-ADVICE = (
-    "lower densify.max_gaussians, scene.max_size or the number of trials at once (launch.parallel), or end other "
-    "programs on that device"
-)
-
-
-def out_of_memory_error(step: int, gaussians: int, device: torch.device, last_state: str) -> TrainingError:
-    """The error to raise when the device's memory is full at iteration ``step``."""
-    return TrainingError(
-        f"iteration {step}: {device} has no memory left at {gaussians:,} Gaussians; {last_state}; {ADVICE}"
-    )

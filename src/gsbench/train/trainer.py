@@ -1,32 +1,40 @@
-"""The training loop: the schedule of 3DGS, with any rasterizer and any densifier."""
+"""The training loop: the schedule of 3DGS, with any rasterizer and any densifier; and its log."""
 
+import json
 import logging
+import math
 import time
+from collections import deque
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
+import numpy as np
 import torch
+from torch import Tensor
 
 from gsbench.densify import Densifier, DensifyContext, NoDensifier
+from gsbench.densify.volumetric import log_volume
 from gsbench.errors import TrainingError
 from gsbench.eval.images import replace_ignored
 from gsbench.events import RefineEvent
+from gsbench.files import write_text
 from gsbench.gaussians.model import MAX_SH_DEGREE, Gaussians
 from gsbench.gaussians.paper_values import LearningRates
 from gsbench.gaussians.ply import write_ply
 from gsbench.gaussians.trainable import TrainableGaussians
 from gsbench.raster import Rasterizer
 from gsbench.raster.base import RenderOutput
+from gsbench.raster.staged import Readback
 from gsbench.runs.layout import CURVES, EVENTS, HISTOGRAMS
+from gsbench.runs.trial_record import whole_lines
 from gsbench.scene.types import Scene
 from gsbench.system.stopping import deferred, requested
 from gsbench.train.checkpoint import CheckpointWriter, load_checkpoint
-from gsbench.train.device import free_bytes, out_of_memory_error
-from gsbench.train.journal import LossLog, append, drop_after, volume_histogram
+from gsbench.train.device import free_bytes
 from gsbench.train.loss import PhotometricLoss
 from gsbench.train.options import TrainConfig
 from gsbench.train.resolution import Resolution, ScaledViews
@@ -35,6 +43,46 @@ from gsbench.train.views import CameraOrder, SceneViews, Targets, generators
 log = logging.getLogger(__name__)
 
 SHARE_FOR_IMAGES = 0.5  # of a GPU's free memory; the rest is for the model and its renders
+SMOOTHING = 0.9  # weight of the previous mean in the loss that is shown
+
+
+class LossLog:
+    """The losses of a training, in order of iterations. Losses from a GPU arrive with a delay.
+
+    ``smoothed`` is the exponential mean of the losses that have arrived, NaN before the first.
+    """
+
+    def __init__(self) -> None:
+        self.smoothed = math.nan
+        self._pending: deque[tuple[int, Readback]] = deque()
+        self._latest: dict[str, float] = {}
+
+    def add(self, step: int, loss: Tensor, l1: Tensor, ssim: Tensor, total: Tensor) -> None:
+        """Add the scalars of iteration ``step``; ``total`` is the loss plus a regulariser.
+
+        Raises FloatingPointError if a total that has arrived meanwhile is not finite.
+        """
+        scalars = [scalar.detach().to(loss) for scalar in (loss, l1, ssim, total)]
+        self._pending.append((step, Readback(torch.stack(scalars))))
+        while self._pending and self._pending[0][1].arrived:
+            self._take()
+
+    def wait(self) -> dict[str, float]:
+        """Wait for all losses; return ``step``, ``loss``, ``l1`` and ``ssim`` of the latest iteration.
+
+        Raises FloatingPointError, which names the first iteration whose total was not finite.
+        """
+        while self._pending:
+            self._take()
+        return self._latest
+
+    def _take(self) -> None:
+        step, readback = self._pending.popleft()
+        loss, l1, ssim, total = readback.values().tolist()
+        if not math.isfinite(total):
+            raise FloatingPointError(f"the loss became {total} at iteration {step}")
+        self.smoothed = loss if math.isnan(self.smoothed) else SMOOTHING * self.smoothed + (1 - SMOOTHING) * loss
+        self._latest = {"step": step, "loss": loss, "l1": l1, "ssim": ssim}
 
 
 @dataclass(frozen=True)
@@ -210,7 +258,11 @@ class Trainer:
         except FloatingPointError as error:
             raise TrainingError(f"{error}; {_last_state(folder)}") from error
         except torch.OutOfMemoryError as error:
-            raise out_of_memory_error(self.step, len(self.gaussians), self.device, _last_state(folder)) from error
+            raise TrainingError(
+                f"iteration {self.step}: {self.device} has no memory left at {len(self.gaussians):,} Gaussians; "
+                f"{_last_state(folder)}; lower densify.max_gaussians, scene.max_size or the number of trials at once "
+                "(launch.parallel), or end other programs on that device"
+            ) from error
 
     @property
     def sh_degree(self) -> int:
@@ -221,7 +273,7 @@ class Trainer:
         """The number by which the sides of pictures are divided in the present iteration."""
         return 1 if self.resolution is None else self.resolution.scale(self.step)
 
-    def _optimize(self, visible: torch.Tensor) -> None:
+    def _optimize(self, visible: Tensor) -> None:
         self.gaussians.optimizer_step(self.sh_degree, visible if self.options.visible_adam else None)
 
     def _state(self) -> dict[str, Any]:
@@ -272,3 +324,29 @@ def sh_degree_at(options: TrainConfig, step: int) -> int:
 def learning_rates(options: TrainConfig) -> LearningRates:
     """The learning rates in the settings of a training."""
     return LearningRates(**{field.name: getattr(options, field.name) for field in fields(LearningRates)})
+
+
+LOG_VOLUME_BINS = np.linspace(-18, 3, 85)  # log10 of world units^3, in steps of a quarter
+
+
+def volume_histogram(step: int, log_scales: Tensor) -> dict[str, Any]:
+    """The record of iteration ``step`` with a histogram of volumes, for Gaussians with ``log_scales`` [N, 3]."""
+    volumes = (log_volume(log_scales) / math.log(10)).cpu().numpy()
+    clipped = np.clip(volumes, LOG_VOLUME_BINS[0], LOG_VOLUME_BINS[-1])
+    counts, edges = np.histogram(clipped, LOG_VOLUME_BINS)
+    return {"step": step, "log10_edges": edges.tolist(), "counts": counts.tolist()}
+
+
+def append(stream: TextIO, record: dict[str, Any]) -> None:
+    """Append a record to an open file, and flush it so that readers see it."""
+    stream.write(json.dumps(record) + "\n")
+    stream.flush()
+
+
+def drop_after(path: Path, step: int) -> None:
+    """Remove records later than ``step`` and an incomplete last line from a JSON-lines file, if the file exists.
+
+    A resumed training writes the removed records again. A kill leaves the old or the new file, never a part of one.
+    """
+    if path.exists():
+        write_text(path, "".join(f"{line}\n" for line, at in whole_lines(path) if at <= step))
