@@ -22,7 +22,7 @@ from typing import Any, get_type_hints
 import yaml
 
 from gsbench.config.schema import GROUP_SCHEMAS, Config
-from gsbench.records import adapter
+from gsbench.parsing import adapter
 from gsbench.runs.trial_record import TrialRecord
 from gsbench.settings import MISSING, describe, option_fields
 

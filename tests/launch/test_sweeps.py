@@ -28,7 +28,7 @@ from gsbench.launch.batch import run_batch
 from gsbench.launch.jobs import Outcome
 from gsbench.launch.record import add_to_plan, forget, read_plan
 from gsbench.launch.states import FinishedTrials, describe_plan, states_of_experiment
-from gsbench.runs import made_of
+from gsbench.runs import trial_folder
 from gsbench.runs.keys import TRAIN, Step, config_hash
 from gsbench.runs.store import Store
 from gsbench.runs.trial_folder import TrialFolder
@@ -309,7 +309,7 @@ def test_changes_are_noticed_and_named(change: str, names: str, runs: Path, monk
     elif change == "store gone":
         shutil.rmtree(runs / "store")
     elif change == "stage":
-        monkeypatch.setattr(made_of, "STAGES", [replace(stage, version=2) for stage in made_of.STAGES[2:3]])
+        monkeypatch.setattr(trial_folder, "STAGES", [replace(stage, version=2) for stage in trial_folder.STAGES[2:3]])
         record["stages"] = {"train": 1}
     elif change == "package":
         record["pycolmap"] = "0.1"

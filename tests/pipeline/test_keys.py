@@ -39,7 +39,7 @@ class BareSource(CaptureSource):
 
 def test_the_keys_of_a_known_trial_stay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A photographs' trial without cameras: so the keys of the cameras that stand in for them are seen as well."""
-    monkeypatch.setattr(scene_module, "version", lambda package: "4.0.0")
+    monkeypatch.setattr(scene_module, "version_of", lambda package: "4.0.0")
     monkeypatch.setattr(keys, "edited", lambda files: {})  # as in a release
     values = compose_one(WORDS).values
     monkeypatch.setattr(pipeline_trial, "CaptureSource", BareSource)

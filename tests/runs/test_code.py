@@ -35,7 +35,7 @@ SOURCE = '"""A module."""\nX = 0.8  # weight\n\n\ndef loss(a):\n    """The loss.
 # user's words is in the keys as it is.
 WITHOUT_NUMBERS = frozenset(
     """
-    analysis app bench cli claims config datasets downloads errors files launch logs parsing records renders runs
+    analysis app bench cli claims config datasets downloads errors files launch logs parsing renders runs
     settings system tracking verbs view words
     """.split()  # noqa: SIM905 - words are easier to read than a list of quoted ones
 )

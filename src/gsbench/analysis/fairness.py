@@ -20,7 +20,7 @@ from gsbench.analysis.pairing import pair_trials
 from gsbench.analysis.quantities import COSTS, Reader, relative_change
 from gsbench.analysis.results import Arm, TrialResult, canonical, group_by, read_experiment
 from gsbench.analysis.table_formats import Column, Row, Table, TableEntry
-from gsbench.records import read_if_sound
+from gsbench.parsing import read_if_sound
 from gsbench.runs.experiments import SearchPoint, TuningRecord
 from gsbench.runs.layout import TUNING
 from gsbench.words import counted, listed

@@ -13,7 +13,7 @@ from PIL import Image, UnidentifiedImageError
 
 from gsbench.analysis.results import TrialPair, TrialResult
 from gsbench.errors import InputError
-from gsbench.records import Number, Record, read_if_sound
+from gsbench.parsing import Number, Record, read_if_sound
 from gsbench.runs.layout import FROM_PIXELS, GROUND_TRUTH, MASKS, RENDERS
 from gsbench.scene.images import read_mask
 

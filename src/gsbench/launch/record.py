@@ -18,8 +18,7 @@ from pydantic import AfterValidator
 from gsbench.config.compose import Trial
 from gsbench.errors import InputError
 from gsbench.files import require_no_links, write_json, write_text
-from gsbench.parsing import DamagedError
-from gsbench.records import Amount, Record, read_typed
+from gsbench.parsing import Amount, DamagedError, Record, read_typed
 from gsbench.runs.declaration import (
     Declaration,
     declared_now,

@@ -22,8 +22,7 @@ from gsbench.config.compose import Trial
 from gsbench.errors import InputError
 from gsbench.files import write_json
 from gsbench.launch.record import read_plan
-from gsbench.parsing import DamagedError
-from gsbench.records import Record, read_if_sound
+from gsbench.parsing import DamagedError, Record, read_if_sound
 from gsbench.runs.experiments import trial_folders
 from gsbench.runs.keys import determining_settings
 from gsbench.runs.layout import CONFIG, FAILED, LOCK, RESULTS, SEED, SUBMITTED, TRIAL_GLOB

@@ -38,9 +38,8 @@ from gsbench.runs.code import user_modules
 from gsbench.runs.declaration import read_declarations
 from gsbench.runs.keys import EVALUATE, GROUND_TRUTH, INIT, STAGES, TRAIN, Stage, Step, config_hash, flatten, sha256_of
 from gsbench.runs.layout import BUILDING, CONFIG, EVENTS, FAILED, LOG
-from gsbench.runs.made_of import version_of
 from gsbench.runs.store import Store, StoredResult, read_manifest
-from gsbench.runs.trial_folder import Failure, TrialFolder
+from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import (
     FROM_MODEL,
     FROM_RENDERS,
@@ -50,6 +49,7 @@ from gsbench.runs.trial_record import (
     Code,
     Declared,
     ExternalTrainer,
+    Failure,
     Training,
     TrialRecord,
     read_evaluation,
@@ -59,6 +59,7 @@ from gsbench.runs.trial_record import (
 )
 from gsbench.scene.colmap_files import model_files
 from gsbench.scene.types import Capture, Scene
+from gsbench.system.install import version_of
 from gsbench.system.locks import hold
 from gsbench.system.stopping import reinstall_handlers
 

@@ -17,8 +17,7 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
-from gsbench.parsing import DamagedError, read_bytes
-from gsbench.records import STRICT, Amount, Count, Record, iterate_rows
+from gsbench.parsing import STRICT, Amount, Count, DamagedError, Record, iterate_rows, read_bytes
 from gsbench.runs.keys import sha256_of
 from gsbench.runs.layout import DECLARED
 from gsbench.runs.trial_record import Declared

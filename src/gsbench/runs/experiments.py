@@ -9,7 +9,7 @@ from typing import Literal
 
 from gsbench.errors import InputError
 from gsbench.files import require_no_links
-from gsbench.records import Count, Number, Record, Text, Whole, read_typed
+from gsbench.parsing import Count, Number, Record, Text, Whole, read_typed
 from gsbench.runs.layout import IN_RUNS, TUNING
 
 log = logging.getLogger(__name__)

@@ -27,8 +27,7 @@ from gsbench.files import (
     sync_to_disk,
     write_json,
 )
-from gsbench.parsing import DamagedError, fault_of
-from gsbench.records import Amount, Count, Record, read_typed
+from gsbench.parsing import Amount, Count, DamagedError, Record, fault_of, read_typed
 from gsbench.runs.keys import Stage, Step, sha256_of
 from gsbench.runs.layout import MANIFEST, VIEWS
 from gsbench.system.locks import BusyError, hold

@@ -1,4 +1,4 @@
-"""A trial's folder: its path, its state, and reading and writing its files.
+"""A trial's folder: its path, its state, reading and writing its files, and what it was made of.
 
 Nothing here follows a link (`gsbench.files.open_plain`): the runs folder may come from a stranger. Loads no torch.
 """
@@ -11,103 +11,50 @@ import io
 import json
 import os
 import re
-from collections.abc import Callable, Collection, Iterable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic_core import to_json
+from pydantic_core import from_json, to_json
 
 from gsbench.errors import InputError
-from gsbench.files import atomic, require_no_links
-from gsbench.parsing import DamagedError, one_line, read_bytes, read_tail, read_yaml
-from gsbench.records import MAX_NUMBER, Amount, Count, Record, parse_typed, read_if_sound, read_typed
-from gsbench.runs.keys import config_hash
-from gsbench.runs.layout import (
-    BUILDING,
-    CONFIG,
-    CURVES,
-    EVENTS,
-    FAILED,
-    HISTOGRAMS,
-    LOCK,
-    PER_VIEW,
-    RESULTS,
-    SEED,
+from gsbench.files import atomic, file_sha256, require_no_links
+from gsbench.parsing import (
+    MAX_NUMBER,
+    DamagedError,
+    one_line,
+    parse_typed,
+    read_bytes,
+    read_if_sound,
+    read_tail,
+    read_typed,
+    read_yaml,
 )
-from gsbench.runs.made_of import (
-    MADE_OF,
-    READ_LATER,
+from gsbench.runs import layout
+from gsbench.runs.code import changed_rooms
+from gsbench.runs.keys import STAGES, config_hash, sha256_of
+from gsbench.runs.store import read_manifest
+from gsbench.runs.trial_record import (
+    Building,
+    Configuration,
+    Failure,
+    Histogram,
     MadeOf,
     ResultsFile,
-    content_hash,
-    describe_inputs,
-    find_changes,
+    Row,
+    Stamp,
+    TrialRecord,
+    UnfinishedError,
+    read_rows,
+    record_from,
 )
-from gsbench.runs.trial_record import Histogram, Row, TrialRecord, UnfinishedError, read_rows, record_from
-from gsbench.settings import FolderName
+from gsbench.system.install import version_of
 from gsbench.system.locks import is_held
 
 State = Literal["done", "running", "failed", "partial", "damaged", "missing"]
 Rows = list[dict[str, bool | int | float]]
 
 TAIL_BYTES = 4096  # of a growing log, enough for its last rows
-
-
-@dataclass(frozen=True, kw_only=True)
-class NamedGroup(Record):
-    """A group of the configuration that must have a name."""
-
-    name: FolderName
-
-
-@dataclass(frozen=True, kw_only=True)
-class TrackingSettings(Record):
-    """The settings of the group ``tracking`` that later mirroring of a trial needs."""
-
-    uri: str | None
-    flush_seconds: Amount
-    patience_seconds: Amount
-    images: Count
-
-
-@dataclass(frozen=True, kw_only=True)
-class Configuration(Record):
-    """The keys that every usable ``config.yaml`` of a trial has; `gsbench.config.schema` checks the others."""
-
-    name: FolderName
-    seed: Count
-    runs: str
-    scene: NamedGroup
-    init: NamedGroup
-    densify: NamedGroup
-    tracking: TrackingSettings
-
-
-@dataclass(frozen=True, kw_only=True)
-class Failure(Record):
-    """``failed.json``: the error's type, its text, its traceback, and the Unix time."""
-
-    error: str = ""
-    message: str = ""
-    traceback: str = field(default="", repr=False)
-    time: Amount = 0.0
-    seed: Count = 0
-    bad_input: bool = False  # the user's files or settings are the cause
-
-    @property
-    def reason(self) -> str:
-        """The first line of the message."""
-        lines = (self.message or self.error).strip().splitlines()
-        return one_line(lines[0]) if lines else "no reason was given"
-
-
-@dataclass(frozen=True, kw_only=True)
-class Building(Record):
-    """``building.json``: the present stage of an unfinished trial, and the folder in which it is built."""
-
-    stage: str = ""
-    folder: str = ""
 
 
 class TrialFolder:
@@ -127,7 +74,7 @@ class TrialFolder:
         """The folder of the trial with the resolved configuration ``values``."""
         runs = Path(values["runs"]).expanduser().resolve()
         arm = f"{values['init']['name']}-{values['densify']['name']}"
-        leaf = f"{config_hash(dict(values))[:8]}{SEED}{values['seed']}"
+        leaf = f"{config_hash(dict(values))[:8]}{layout.SEED}{values['seed']}"
         return cls(runs / values["name"] / values["scene"]["name"] / arm / leaf)
 
     @property
@@ -143,17 +90,17 @@ class TrialFolder:
     @property
     def key(self) -> str:
         """The folder within its experiment, without the seed (`gsbench.runs.declaration.trial_key`)."""
-        return self.path.relative_to(self.home).as_posix().rpartition(SEED)[0]
+        return self.path.relative_to(self.home).as_posix().rpartition(layout.SEED)[0]
 
     @property
     def lock(self) -> Path:
         """The lock file of the process that runs the trial."""
-        return self.path / LOCK
+        return self.path / layout.LOCK
 
     @property
     def label(self) -> str:
         """Scene, arm, seed and hash, for messages."""
-        hash8, _, seed = self.path.name.partition(SEED)
+        hash8, _, seed = self.path.name.partition(layout.SEED)
         return f"{self.path.parent.parent.name}/{self.path.parent.name} seed {seed} ({hash8})"
 
     def require_no_links(self) -> None:
@@ -173,27 +120,27 @@ class TrialFolder:
             pass
         except DamagedError:
             return "damaged"
-        if (self.path / FAILED).exists():
+        if (self.path / layout.FAILED).exists():
             return "failed"
-        return "partial" if (self.path / CONFIG).exists() else "missing"
+        return "partial" if (self.path / layout.CONFIG).exists() else "missing"
 
     def failure(self) -> Failure:
         """The reason why the trial failed."""
-        return read_if_sound(self.path / FAILED, Failure) or Failure(message=f"{FAILED} cannot be read")
+        return read_if_sound(self.path / layout.FAILED, Failure) or Failure(message=f"{layout.FAILED} cannot be read")
 
     def has_failed(self) -> bool:
         """Return whether the trial's last run failed."""
-        return (self.path / FAILED).exists()
+        return (self.path / layout.FAILED).exists()
 
     def building(self) -> Building:
         """The present stage of the trial; empty if it has none, or if the file cannot be read."""
-        return read_if_sound(self.path / BUILDING, Building) or Building()
+        return read_if_sound(self.path / layout.BUILDING, Building) or Building()
 
     def stage_and_step(self) -> tuple[str, int]:
         """The present stage of the unfinished trial ("" if none has begun), and the last logged iteration."""
         building = self.building()
         try:
-            tail = read_tail(Path(building.folder, CURVES), TAIL_BYTES) if building.folder else b""
+            tail = read_tail(Path(building.folder, layout.CURVES), TAIL_BYTES) if building.folder else b""
         except (FileNotFoundError, DamagedError):
             tail = b""
         steps = re.findall(rb'"step": (\d{1,18})', tail)
@@ -203,7 +150,7 @@ class TrialFolder:
 
     def configuration(self) -> dict[str, Any]:
         """The configuration in ``config.yaml``, without its permissions; raises InputError if it cannot be used."""
-        path = self.path / CONFIG
+        path = self.path / layout.CONFIG
         try:
             values = read_yaml(path)
         except FileNotFoundError:
@@ -219,7 +166,7 @@ class TrialFolder:
         Raises FileNotFoundError if there is none, and DamagedError if it is damaged, unfinished, or was changed after
         it was written. Results without ``made_of`` cannot be checked for changes, and are accepted.
         """
-        path = self.path / RESULTS
+        path = self.path / layout.RESULTS
         content = read_bytes(path)
         record = record_from(content, path)
         made_of = parse_typed(content, ResultsFile, path).made_of
@@ -237,7 +184,7 @@ class TrialFolder:
 
     def made_of(self) -> MadeOf | None:
         """The inputs of the results, not checked for changes; None if they are not recorded. Raises as `record`."""
-        return read_typed(self.path / RESULTS, ResultsFile).made_of
+        return read_typed(self.path / layout.RESULTS, ResultsFile).made_of
 
     def settings(self) -> dict[str, Any]:
         """The settings in ``results.json``, else those in ``config.yaml``: YAML takes some twenty times longer to read.
@@ -248,7 +195,7 @@ class TrialFolder:
             made_of = self.made_of()
         except FileNotFoundError:
             made_of = None
-        return read_yaml(self.path / CONFIG) if made_of is None else made_of.settings
+        return read_yaml(self.path / layout.CONFIG) if made_of is None else made_of.settings
 
     def write_finished(
         self,
@@ -263,7 +210,7 @@ class TrialFolder:
         ``sources`` are the user's files, ``entries`` results of stages by name, ``published`` files in this folder.
         Returns True if it already had equal results: then only ``made_of`` is renewed, and the file keeps its time.
         """
-        path, content = self.path / RESULTS, record.to_json()
+        path, content = self.path / layout.RESULTS, record.to_json()
         present = self.sound_record()
         before = path.stat() if present is not None and present.to_json() == content else None
         files = sorted({*published, *(self.path / name for name in READ_LATER if (self.path / name).is_file())})
@@ -288,11 +235,11 @@ class TrialFolder:
         try:
             record, made_of = self.record(), self.made_of()
         except (FileNotFoundError, UnfinishedError):
-            return f"{RESULTS} is not there, or not complete"
+            return f"{layout.RESULTS} is not there, or not complete"
         except DamagedError as error:
             return f"{error.path.name} {error.reason}"
         if made_of is None:
-            return f"{RESULTS} does not say what it was made of"
+            return f"{layout.RESULTS} does not say what it was made of"
         change = next(find_changes(self.path, values, record, made_of), "")
         return change or _now_available(record, unavailable_now, values["eval"])
 
@@ -304,15 +251,15 @@ class TrialFolder:
         With a warning, a finished trial's file that was changed after it was written is left out, and so are all rows
         from a damaged one on.
         """
-        return self.rows(CURVES)
+        return self.rows(layout.CURVES)
 
     def events(self) -> Rows:
         """The rows of ``events.jsonl`` with the counts of every refinement; read as `curves`."""
-        return self.rows(EVENTS)
+        return self.rows(layout.EVENTS)
 
     def histograms(self) -> list[Histogram]:
         """The rows of ``volume_histograms.jsonl``; read as `curves`."""
-        return self.rows(HISTOGRAMS, Histogram)
+        return self.rows(layout.HISTOGRAMS, Histogram)
 
     def rows(self, name: str, kind: Any = Row) -> list[Any]:
         """The rows of a file of JSON lines; see `gsbench.runs.trial_record`."""
@@ -323,7 +270,7 @@ class TrialFolder:
 
         Raises FileNotFoundError and DamagedError.
         """
-        path, content = self.path / PER_VIEW, self._unchanged(PER_VIEW)
+        path, content = self.path / layout.PER_VIEW, self._unchanged(layout.PER_VIEW)
         try:
             text = content.decode("utf-8")
             return {
@@ -365,3 +312,132 @@ def _number(text: str) -> float:
     if not abs(value) <= MAX_NUMBER:
         raise ValueError(f"{text} is not a measured number")
     return value
+
+
+# ---- what a trial was made of: by this a repeated sweep recognises finished trials without reading photographs
+
+MADE_OF = "made_of"  # the key in results.json
+READ_LATER = (layout.PER_VIEW, layout.CURVES, layout.EVENTS, layout.HISTOGRAMS)  # files that tables and reports read
+# Files up to so many bytes are compared by content, since a flipped bit changes neither size nor time.
+MAX_HASHED_BYTES = 1 << 20
+
+_digests: dict[Stamp, str] = {}  # sha256 of files that this process has read, by device, inode and stamp
+
+
+def describe_inputs(
+    folder: Path,
+    values: Mapping[str, Any],
+    content: Mapping[str, Any],
+    sources: Iterable[Path],
+    entries: Mapping[str, Path],
+    published: Iterable[Path],
+) -> MadeOf:
+    """The inputs of the results ``content`` of the trial in ``folder``, with the present state of files.
+
+    ``sources`` are the user's files, ``entries`` results of stages by name, ``published`` files in the trial's folder.
+    """
+    sources = sorted(sources)
+    names = {path.relative_to(folder).as_posix(): path for path in published}
+    return MadeOf(
+        results=sha256_of(content),
+        config=config_hash(dict(values)),
+        stages={stage.name: stage.version for stage in STAGES},
+        pycolmap=version_of("pycolmap"),
+        sources={str(path): source_stamp_of(path) for path in sources},
+        # Adding or removing a file changes its folder's time.
+        folders={str(path): path.stat().st_mtime_ns for path in sorted({path.parent for path in sources})},
+        entries={name: str(path) for name, path in entries.items()},
+        published={name: stamp_of(path) for name, path in names.items()},
+        digests={name: file_sha256(path) for name, path in names.items() if _is_hashed(name, path)},
+        settings=dict(values),
+    )
+
+
+def find_changes(folder: Path, values: dict[str, Any], record: TrialRecord, made_of: MadeOf) -> Iterator[str]:
+    """Reasons why the complete trial in ``folder`` is out of date; those that are found quickly come first.
+
+    Files are compared by size and time of change, small files of gsbench's also by content.
+    """
+    present = config_hash(values)
+    if record.hashes.get("config") != present or made_of.config != present:
+        yield "its results are of another configuration"
+    versions = {stage.name: stage.version for stage in STAGES}
+    for name in sorted(versions.keys() | made_of.stages.keys()):
+        made, now = made_of.stages.get(name), versions.get(name)
+        if made != now:
+            yield f"it was made by version {made} of the stage {name}, which is now at {now}"
+    if rooms := changed_rooms(record.code.rooms):
+        yield f"the code of gsbench changed in: {', '.join(rooms)}"
+    if made_of.pycolmap != (installed := version_of("pycolmap")):
+        yield f"it was made with pycolmap {made_of.pycolmap}, and {installed} is installed"
+    for source, stamp in made_of.sources.items():
+        yield from _change_of(Path(source), stamp, source_stamp_of)
+    for source_folder, changed in made_of.folders.items():
+        if _changed_at(Path(source_folder)) != changed:
+            yield f"files have come to {source_folder}, or gone from there"
+    for name, stamp in made_of.published.items():
+        yield from _change_of(folder / name, stamp, stamp_of)
+        if name in made_of.digests and _digest(folder / name) != made_of.digests[name]:
+            yield f"{folder / name} has changed"
+    for name, entry in made_of.entries.items():
+        try:
+            read_manifest(Path(entry))
+        except ValueError as error:
+            yield f"the result of its stage {name} in the store is damaged or gone ({error})"
+
+
+def content_hash(content: bytes) -> str:
+    """The hash of the values in ``results.json`` without ``made_of``; white space does not matter."""
+    values = from_json(content)
+    values.pop(MADE_OF, None)
+    return sha256_of(values)
+
+
+def stamp_of(path: Path) -> Stamp:
+    """Size and time of change; raises OSError."""
+    state = os.stat(path)
+    return state.st_size, state.st_mtime_ns
+
+
+def source_stamp_of(path: Path) -> Stamp:
+    """Size, mtime and ctime of a user's file; raises OSError.
+
+    A program may replace a file and restore its mtime, but not its ctime. The ctime of gsbench's own files is not used:
+    they are hard links, and each further link changes it.
+    """
+    state = os.stat(path)
+    return state.st_size, state.st_mtime_ns, state.st_ctime_ns
+
+
+def _change_of(path: Path, stamp: Stamp, stamp_now: Callable[[Path], Stamp]) -> Iterator[str]:
+    try:
+        if stamp_now(path) != stamp:
+            yield f"{path} has changed"
+    except (OSError, ValueError) as error:
+        yield f"{path} cannot be read ({getattr(error, 'strerror', error)})"
+
+
+def _changed_at(folder: Path) -> int | None:
+    try:
+        return folder.stat().st_mtime_ns
+    except (OSError, ValueError):
+        return None
+
+
+def _is_hashed(name: str, path: Path) -> bool:
+    return name in READ_LATER or path.stat().st_size <= MAX_HASHED_BYTES
+
+
+def _digest(path: Path) -> str | None:
+    """The sha256 of a file's content; None if it cannot be read.
+
+    Trials share photographs as hard links to one file, so its content is read once.
+    """
+    try:
+        state = os.stat(path)
+        key = state.st_dev, state.st_ino, state.st_size, state.st_mtime_ns, state.st_ctime_ns
+        if key not in _digests:
+            _digests[key] = hashlib.sha256(read_bytes(path)).hexdigest()
+        return _digests[key]
+    except (OSError, DamagedError):
+        return None

@@ -11,21 +11,25 @@ from typing import Annotated, Any, Final, Literal
 
 from pydantic import AfterValidator, Field, ValidationError
 
-from gsbench.parsing import DamagedError, fault_of, read_bytes
-from gsbench.records import (
+from gsbench.parsing import (
     MAX_NUMBER,
     Amount,
     Count,
+    DamagedError,
     Number,
     Record,
     Text,
     Whole,
     adapter,
     describe_misfit,
+    fault_of,
     iterate_rows,
+    one_line,
+    read_bytes,
     read_typed,
 )
 from gsbench.runs.layout import METRICS, TRAINING
+from gsbench.settings import FolderName
 
 log = logging.getLogger(__name__)
 
@@ -218,6 +222,99 @@ def split_text(config: Mapping[str, Any]) -> str:
     elif config.get("scene.match_views"):
         text += ", matched" if text.startswith("sector") else f", matched with {sectors}"
     return f"{text}, validation" if config.get("scene.validation") else text
+
+
+# ---- the other files of a trial's folder
+
+Stamp = tuple[int, ...]  # size in bytes, times of change in ns
+
+
+@dataclass(frozen=True, kw_only=True)
+class NamedGroup(Record):
+    """A group of the configuration that must have a name."""
+
+    name: FolderName
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrackingSettings(Record):
+    """The settings of the group ``tracking`` that later mirroring of a trial needs."""
+
+    uri: str | None
+    flush_seconds: Amount
+    patience_seconds: Amount
+    images: Count
+
+
+@dataclass(frozen=True, kw_only=True)
+class Configuration(Record):
+    """The keys that every usable ``config.yaml`` of a trial has; `gsbench.config.schema` checks the others."""
+
+    name: FolderName
+    seed: Count
+    runs: str
+    scene: NamedGroup
+    init: NamedGroup
+    densify: NamedGroup
+    tracking: TrackingSettings
+
+
+@dataclass(frozen=True, kw_only=True)
+class Failure(Record):
+    """``failed.json``: the error's type, its text, its traceback, and the Unix time."""
+
+    error: str = ""
+    message: str = ""
+    traceback: str = field(default="", repr=False)
+    time: Amount = 0.0
+    seed: Count = 0
+    bad_input: bool = False  # the user's files or settings are the cause
+
+    @property
+    def reason(self) -> str:
+        """The first line of the message."""
+        lines = (self.message or self.error).strip().splitlines()
+        return one_line(lines[0]) if lines else "no reason was given"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Building(Record):
+    """``building.json``: the present stage of an unfinished trial, and the folder in which it is built."""
+
+    stage: str = ""
+    folder: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MadeOf(Record):
+    """The configuration (``settings``) and its hash (``config``), versions, and files with their stamps.
+
+    ``results`` is the hash of the rest of ``results.json``. ``sources`` are the user's files, ``folders`` their folders
+    with times of change. ``entries`` are the stages' results in the store. ``published`` are files in the trial's
+    folder; ``digests`` has the sha256 of those that tables and reports read, and of small ones.
+    """
+
+    results: str
+    config: str
+    stages: dict[str, int]
+    pycolmap: str | None
+    sources: dict[str, Stamp]
+    folders: dict[str, int | None]
+    entries: dict[str, str]
+    published: dict[str, Stamp]
+    digests: dict[str, str]
+    settings: dict[str, Any]
+
+    def __post_init__(self) -> None:
+        if fault := fault_of(self.settings):
+            raise ValueError(f"in settings {fault}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ResultsFile(Record):
+    """The part of ``results.json`` that this module reads."""
+
+    made_of: MadeOf | None = field(default=None, repr=False)
 
 
 # ---- the JSON lines of a training

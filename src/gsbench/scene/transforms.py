@@ -19,8 +19,7 @@ import numpy as np
 from annotated_types import Len
 
 from gsbench.errors import InputError
-from gsbench.parsing import resolved
-from gsbench.records import Number, Record, Text, read_typed
+from gsbench.parsing import Number, Record, Text, read_typed, resolved
 from gsbench.scene.images import IMAGE_SUFFIXES, image_size
 from gsbench.scene.types import Array, CameraModel
 from gsbench.words import some_of

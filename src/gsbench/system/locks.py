@@ -15,7 +15,7 @@ from filelock import FileLock, Timeout
 
 from gsbench.errors import InputError
 from gsbench.files import open_plain
-from gsbench.records import Amount, Record, read_if_sound
+from gsbench.parsing import Amount, Record, read_if_sound
 
 try:
     import fcntl

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
-from gsbench.records import Count, Record, read_if_sound
+from gsbench.parsing import Count, Record, read_if_sound
 from gsbench.runs import layout
 from gsbench.runs.keys import TRAIN, flatten, sha256_of
 from gsbench.runs.trial_folder import TrialFolder

@@ -11,9 +11,8 @@ from typing import Any, Literal, NamedTuple
 
 from gsbench.errors import InputError
 from gsbench.raster.executors import AUTO, EXECUTORS, find_executor, resolve
-from gsbench.runs.made_of import version_of
 from gsbench.scene.options import MIN_SIZE
-from gsbench.system.install import install_command
+from gsbench.system.install import install_command, version_of
 from gsbench.system.own_modules import allow_modules
 from gsbench.system.resources import available_threads, installed_gpus
 from gsbench.verbs.arguments import ArgumentParser, path

@@ -6,7 +6,6 @@ Photographs are read from the user's folder, masked, and resized to views; the t
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import cache, cached_property
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,6 @@ from gsbench.logs import Progress, progress
 from gsbench.runs.code import VIEWS_ROOMS, edited, states_of
 from gsbench.runs.keys import CAPTURE, GROUND_TRUTH, INIT, NO_USER_CODE, Step, UserCode, options_of, sha256_of, step_of
 from gsbench.runs.layout import MASKS, VIEWS
-from gsbench.runs.made_of import PYCOLMAP, version_of
 from gsbench.runs.store import Store
 from gsbench.scene.colmap import write_frames
 from gsbench.scene.courtyard.render import render_courtyard
@@ -38,6 +36,7 @@ from gsbench.scene.readers import (
 from gsbench.scene.transforms import Transforms
 from gsbench.scene.transforms import read_transforms as read_transforms_files
 from gsbench.scene.types import Capture, Scene
+from gsbench.system.install import version_of
 from gsbench.system.resources import available_threads
 
 
@@ -191,7 +190,7 @@ def view_versions() -> dict[str, str | None]:
 
     Pillow reads and shrinks images, pycolmap undistorts them.
     """
-    return {**edited(states_of(VIEWS_ROOMS)), **{package: version_of(package) for package in (PYCOLMAP, "pillow")}}
+    return {**edited(states_of(VIEWS_ROOMS)), **{package: version_of(package) for package in ("pycolmap", "pillow")}}
 
 
 def ground_truth_step(views: Views) -> Step:
@@ -225,7 +224,7 @@ def init_step(
         "options": options_of("init", initializer, user),
         "content": initializer.content(),
         "reference": None if reference is None else reference.key,
-        "pycolmap": version("pycolmap"),
+        "pycolmap": version_of("pycolmap"),
     }
 
     def build(folder: Path) -> None:
