@@ -18,7 +18,7 @@ from gsbench.raster.base import Rasterizer
 from gsbench.raster.executors import find_executor
 from gsbench.system.isolate import run_isolated
 from gsbench.system.resources import peak_memory_mb, reset_peak_memory
-from gsbench.train.device import disable_tf32
+from gsbench.train.device import disable_tf32, flush_denormals
 from gsbench.train.options import TrainConfig
 from gsbench.train.trainer import Trainer
 
@@ -52,6 +52,7 @@ class Stepper:
         if self.device.type == "cuda":
             disable_tf32()
         gaussians, scene = make_scene(setting.scene, setting.width, setting.height, setting.count, setting.ply)
+        flush_denormals()  # as in a trial
         self.count = len(gaussians)
         self.trainer = Trainer(
             scene,
