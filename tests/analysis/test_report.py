@@ -178,7 +178,7 @@ def test_missing_or_damaged_pictures_are_named(tmp_path: Path) -> None:
     (paths[1] / "point_cloud.ply").write_bytes(b"ply\nformat ascii 1.0\n")
     experiment = load_experiment(tmp_path, "exp")
     text = build_report(experiment)
-    assert "view001.png cannot be read as an image" in text
+    assert "view001.png: not a readable image" in text
     assert "is not a readable 3DGS PLY" in text
 
 

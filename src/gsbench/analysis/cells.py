@@ -7,12 +7,7 @@ from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from gsbench.analysis.differences import (
-    describe_code,
-    differing_code,
-    differing_conditions,
-    differing_settings,
-)
+from gsbench.analysis.differences import describe_code, differing_code, differing_conditions, differing_settings
 from gsbench.analysis.quantities import Quantity, metric_keys
 from gsbench.analysis.results import Experiment, TrialResult, group_by
 from gsbench.errors import InputError
@@ -56,23 +51,23 @@ def field_value(trial: TrialResult, name: str) -> str:
     """A field of a trial, or a dotted key of its configuration, as text; a missing key counts as unset (null)."""
     if name in TRIAL_FIELDS:
         return str(getattr(trial.record, name))
-    if name not in trial.config and name.startswith(NOT_HASHED):
-        return str(trial.whole_config.get(name))
-    return str(trial.config.get(name))
+    return str(_settings_with(trial, name).get(name))
+
+
+def _settings_with(trial: TrialResult, name: str) -> Mapping[str, Any]:
+    """The settings that may contain ``name``; those that change no result are read from the trial's own file."""
+    is_hashed = name in trial.config or not name.startswith(NOT_HASHED)
+    return trial.config if is_hashed else trial.whole_config
 
 
 def check_fields(trials: Iterable[TrialResult], names: Iterable[str]) -> None:
     """Raise ``InputError`` for the first name that is neither a field nor a setting of any trial."""
     trials = list(trials)
     for name in names:
-        if name not in TRIAL_FIELDS and not any(_has_setting(trial, name) for trial in trials):
+        if name not in TRIAL_FIELDS and not any(name in _settings_with(trial, name) for trial in trials):
             raise InputError(
                 f"no trial has a setting {name!r}; use {', '.join(TRIAL_FIELDS)} or a key of a trial's config.yaml"
             )
-
-
-def _has_setting(trial: TrialResult, name: str) -> bool:
-    return name in trial.config or (name.startswith(NOT_HASHED) and name in trial.whole_config)
 
 
 def select_trials(trials: Iterable[TrialResult], where: Mapping[str, str]) -> list[TrialResult]:
@@ -88,7 +83,11 @@ def select_trials(trials: Iterable[TrialResult], where: Mapping[str, str]) -> li
 def check_averageable(trials: Sequence[TrialResult], where: str) -> None:
     """Raise ``InputError`` that names the differing keys, unless each scene's trials repeat one configuration."""
     if code := differing_code(trials):
-        raise _code_refusal(where, code, trials[0].experiment)
+        listed, experiment = "; ".join(describe_code(*part) for part in code.items()), trials[0].experiment
+        raise InputError(
+            f"the table cell {where} would average trials made by different versions of {listed}: `gsbench status "
+            f"{experiment}` names the superseded ones, `gsbench status {experiment} --forget-superseded` removes them"
+        )
     by_scene = group_by(trials, lambda trial: trial.scene)
     for scene, group in by_scene.items():
         keys = differing_conditions(group) or differing_settings(group)
@@ -155,14 +154,6 @@ def best_cells(cells: Mapping[K, Cell], quantity: Quantity) -> set[K]:
     if len(set(means.values())) == 1:
         return set()
     return {key for key, mean in means.items() if mean == best}
-
-
-def _code_refusal(where: str, code: Mapping[str, Mapping[str, Sequence[TrialResult]]], experiment: str) -> InputError:
-    listed = "; ".join(describe_code(part, versions) for part, versions in code.items())
-    return InputError(
-        f"the table cell {where} would average trials made by different versions of {listed}: `gsbench status "
-        f"{experiment}` names the superseded ones, `gsbench status {experiment} --forget-superseded` removes them"
-    )
 
 
 def _refusal(where: str, keys: Mapping[str, Sequence[str]], trials: Sequence[TrialResult]) -> InputError:

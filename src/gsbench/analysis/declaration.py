@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from gsbench.analysis.results import TrialResult
-from gsbench.runs.declaration import Declaration, Planned, Question, read_declarations
+from gsbench.runs.declaration import Declaration, Question, read_declarations
 from gsbench.words import counted
 
 
@@ -102,14 +102,10 @@ def active_declaration(folder: Path, trials: Sequence[TrialResult]) -> ActiveDec
     seen = tuple(trial for trial in trials if trial.measured < declaration.moment)
     if declaration.names_trials:
         planned = declaration.planned
-        added = tuple(trial for trial in trials if not _is_planned(trial, planned))
+        added = tuple(trial for trial in trials if trial.seed not in planned.get(trial.key, ()))
     else:
         # The record's file may be lost, and the trials' results repeat only its metric and time. Then every trial that
         # was measured after the next record with trials may have been added.
         next_record = next((one.moment for one in current if one.names_trials), math.inf)
         added = tuple(trial for trial in trials if trial.measured >= next_record)
     return ActiveDeclaration(declaration, seen, added, len(trials), tuple(others))
-
-
-def _is_planned(trial: TrialResult, planned: Planned) -> bool:
-    return trial.seed in planned.get(trial.key, ())

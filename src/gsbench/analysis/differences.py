@@ -177,7 +177,8 @@ def ingredients(one: Mapping[str, Any], other: Mapping[str, Any]) -> tuple[str, 
     names = [name for config in (other, one) for name in _class_ingredients(config) if name in of_one_class]
     other_init = any(one.get(key) != other.get(key) for key in ("init._target_", "init.name"))
     for key in differing_keys(one, other):
-        if key == TARGET or (one.get(TARGET) != other.get(TARGET) and _is_of_one_class(key, one, other)):
+        is_of_one_class = key.startswith("densify.") and ((key in one) != (key in other))
+        if key == TARGET or (one.get(TARGET) != other.get(TARGET) and is_of_one_class):
             continue
         is_cloud = other_init and key.startswith("init.") and key not in INGREDIENT_NAMES
         names.append(INITIAL_CLOUD if is_cloud else INGREDIENT_NAMES.get(key, key.removeprefix("densify.")))
@@ -211,7 +212,8 @@ def ingredients_sentence(names: Sequence[str], first: Arm, second: Arm) -> str:
 
 def is_mixed(names: Sequence[str]) -> bool:
     """Return whether the named ingredients are more than one, or stand for an unknown number."""
-    return len(names) > 1 or any(_is_bundle(name) for name in names)
+    bundles = (NO_RECORD, ELSEWHERE, BY_PROGRAM.partition("{")[0])
+    return len(names) > 1 or any(name.startswith(bundles) for name in names)
 
 
 def representatives(trials: Iterable[TrialResult], first: Arm, second: Arm) -> tuple[TrialResult, TrialResult]:
@@ -224,16 +226,6 @@ def representatives(trials: Iterable[TrialResult], first: Arm, second: Arm) -> t
         raise ValueError(f"no trial of {missing[0]}")
     pairs = itertools.product(by_arm[first], by_arm[second])
     return max(pairs, key=lambda pair: (pair[0].scene == pair[1].scene, pair[0].seed == pair[1].seed))
-
-
-def _is_bundle(ingredient: str) -> bool:
-    """Return whether the name stands for an unknown number of differences."""
-    return ingredient in (NO_RECORD, ELSEWHERE) or ingredient.startswith(BY_PROGRAM.partition("{")[0])
-
-
-def _is_of_one_class(key: str, one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
-    """Return whether only one of two densifier classes has this setting."""
-    return key.startswith("densify.") and ((key in one) != (key in other))
 
 
 def _class_ingredients(config: Mapping[str, Any]) -> tuple[str, ...]:

@@ -107,11 +107,6 @@ def _distinct(read: Callable[[TrialResult], str | None]) -> Callable[[Sequence[T
     return lambda trials: ", ".join(sorted({read(trial) or UNKNOWN for trial in trials}))
 
 
-def _refinements(trial: TrialResult) -> float | None:
-    """The number of times that the densifier refined; None if the log is missing or empty."""
-    return float(len(trial.folder.events())) or None
-
-
 def _resolution(trial: TrialResult) -> str | None:
     size = trial.record.resolution
     return None if size is None else f"{size[0]}×{size[1]} px"
@@ -144,7 +139,7 @@ MEASURED: dict[str, Callable[[Sequence[TrialResult]], str]] = {
     "initial points": _span(lambda trial: trial.record.num_init_points),
     "initial cloud (hash)": _distinct(lambda trial: trial.cloud[:12]),
     "iterations": _span(lambda trial: trial.record.iterations),
-    "rounds of the densifier": _span(_refinements),
+    "rounds of the densifier": _span(lambda trial: len(trial.folder.events()) or None),
     "budget": _distinct(budget_words),
     "Gaussians in the end": _span(lambda trial: trial.record.num_gaussians),
     "seconds of training": _span(lambda trial: trial.record.seconds.get("train")),

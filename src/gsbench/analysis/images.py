@@ -4,18 +4,17 @@ import base64
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
 from gsbench.analysis.results import TrialPair, TrialResult
 from gsbench.errors import InputError
 from gsbench.parsing import Number, Record, read_if_sound
 from gsbench.runs.layout import FROM_PIXELS, GROUND_TRUTH, MASKS, RENDERS
-from gsbench.scene.images import read_mask
+from gsbench.scene.images import read_image, read_mask
 
 TEXTURE_SIGMA = 2.0  # px: the Gaussian over which the squared gradient is averaged
 LUMINANCE = (0.2126, 0.7152, 0.0722)  # Rec. 709
@@ -82,15 +81,6 @@ def view_names(trial: TrialResult) -> list[str]:
     if not names:
         raise InputError(f"{trial.label} holds no {RENDERS}")
     return names
-
-
-def read_image(path: Path) -> Pixels:
-    """An image as [H, W, 3] uint8; raises ``InputError`` that names a damaged or missing file."""
-    try:
-        with Image.open(path) as image:
-            return np.asarray(image.convert("RGB"))
-    except (OSError, UnidentifiedImageError, SyntaxError, Image.DecompressionBombError) as error:
-        raise InputError(f"{path} cannot be read as an image ({error})") from None
 
 
 @dataclass(frozen=True)
@@ -185,7 +175,7 @@ def _data_uri(picture: Image.Image, kind: str, **options: Any) -> str:
 
 
 def _read(one: TrialResult, other: TrialResult, view: str) -> list[Pixels]:
-    """Both renders and the photograph, with stripes over ignored pixels."""
+    """Both renders and the photograph, with stripes over ignored pixels: equal stripes show no error."""
     first = read_image(one.path / RENDERS / f"{view}.png")
     second = read_image(other.path / RENDERS / f"{view}.png")
     truth = read_image(one.path / GROUND_TRUTH / f"{view}.png")
@@ -193,11 +183,8 @@ def _read(one: TrialResult, other: TrialResult, view: str) -> list[Pixels]:
         raise InputError(f"{one.label} and {other.label}: {view} has different sizes")
     ignored = read_ignored(one, view)
     images = [first, second, truth]
-    return images if ignored is None else [_hatched(image, ignored) for image in images]
-
-
-def _hatched(image: Pixels, ignored: NDArray[np.bool_]) -> Pixels:
-    """``image`` with stripes over ignored pixels; the stripes are the same in all images, so they show no error."""
+    if ignored is None:
+        return images
     rows, columns = np.indices(ignored.shape)
     stripes = np.where((rows + columns) % (2 * STRIPE) < STRIPE, *STRIPES).astype(np.uint8)  # [H, W]
-    return np.where(ignored[..., None], stripes[..., None], image)
+    return [np.where(ignored[..., None], stripes[..., None], image) for image in images]

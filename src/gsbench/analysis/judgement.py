@@ -10,9 +10,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gsbench.analysis.pairing import Pairs, pair
+from gsbench.analysis.pairing import Pairs, are_equal, pair
 from gsbench.analysis.quantities import Quantity, asked_quantity
-from gsbench.analysis.results import TrialPair, TrialResult, group_by
+from gsbench.analysis.results import TrialResult, group_by
 from gsbench.analysis.statistics import (
     TOO_SMALL,
     UNDECIDED,
@@ -76,7 +76,9 @@ class Verdict:
 
     @property
     def least(self) -> float | None:
-        return margin(self.question)
+        """The least difference that matters; for a relative question in logarithms, in which it is tested."""
+        least = self.question.least
+        return math.log1p(least) if self.question.relative and least is not None else least
 
     @property
     def mean(self) -> float | None:
@@ -118,11 +120,6 @@ class Verdict:
 
     def shown_interval(self, interval: Interval) -> str:
         return f"{self.shown(interval.low)} to {self.shown(interval.high)}"
-
-
-def margin(question: Question) -> float | None:
-    """The least difference that matters; for a relative question in logarithms, in which it is tested."""
-    return math.log1p(question.least) if question.relative and question.least is not None else question.least
 
 
 def judge(trials: Sequence[TrialResult], declaration: Declaration) -> list[Verdict]:
@@ -171,7 +168,7 @@ def _with_pairs(trials: Sequence[TrialResult], question: Question, declaration: 
         return replace(verdict, untestable=pairs.left_out[0], notes=pairs.left_out[1:], final=True)
     if question.scenes and len(pairs.rows) < len(question.scenes):  # a look waits for every scene
         return replace(verdict, pairs=replace(pairs, rows=()))
-    if pairs.rows and question.scenes and all(_is_equal(both) for row in pairs.rows for both in row.trials):
+    if pairs.rows and question.scenes and all(are_equal(*both) for row in pairs.rows for both in row.trials):
         count = sum(len(row.trials) for row in pairs.rows)
         reason = (
             f"both arms of {counted(count, 'pair')} of trials are equal to the last bit: the settings that differ had "
@@ -206,7 +203,7 @@ def _at_looks(asked: Verdict, looks: tuple[int, ...], rate: float) -> Verdict:
 
 def _decide(verdict: Verdict, answer: Answer) -> Verdict:
     """The verdict with its outcome; undecided if it rests on outlying trials."""
-    question, least, pairs = verdict.question, margin(verdict.question), verdict.pairs
+    question, least, pairs = verdict.question, verdict.least, verdict.pairs
     level = answer.level if question.scenes else answer.level / verdict.family
     about_like_these = judge_like_these(pairs.differences.mean(axis=1), question.sign, least, level)
     outcome = answer.outcome(question.sign, least)
@@ -257,13 +254,6 @@ def find_outlying(pairs: Pairs) -> list[TrialResult]:
                 if abs(value - others.mean()) > OUTLYING * deviation > 0:
                     outlying.append(row.trials[index][side])
     return outlying
-
-
-def _is_equal(trials: TrialPair) -> bool:
-    """Return whether two trials have the same metrics and number of Gaussians."""
-    one, other = trials
-    same_count = one.record.num_gaussians == other.record.num_gaussians
-    return bool(one.metrics) and one.metrics == other.metrics and same_count
 
 
 def _with_scenes(verdicts: Sequence[Verdict], level: float) -> list[Verdict]:

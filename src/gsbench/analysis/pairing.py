@@ -196,6 +196,12 @@ def _values(question: Question, baseline: TrialResult, arm: TrialResult) -> tupl
     return values
 
 
+def are_equal(one: TrialResult, other: TrialResult) -> bool:
+    """Return whether two trials have the same metrics and number of Gaussians."""
+    same_count = one.record.num_gaussians == other.record.num_gaussians
+    return bool(one.metrics) and one.metrics == other.metrics and same_count
+
+
 def choose_pairs(
     arms: Sequence[Arm], baseline: str = BASELINE, controls: Mapping[str, str] = MappingProxyType({})
 ) -> list[tuple[Arm, Arm]]:

@@ -45,11 +45,6 @@ class Quantity:
         return f"{value:.{self.decimals}f}"
 
 
-def total_seconds(trial: TrialResult) -> float | None:
-    """The seconds of all stages; None if the training was outside gsbench."""
-    return None if trial.made_elsewhere else sum(trial.record.seconds.values())
-
-
 def _textured(trial: TrialResult) -> float:
     from gsbench.analysis.images import textured_error  # here, since only claims about this error read pictures
 
@@ -60,12 +55,16 @@ COSTS: dict[str, tuple[str, Reader]] = {  # name, and value in its own unit (one
     "gaussians": ("Gaussians", lambda trial: trial.record.num_gaussians),
     "train_time": ("training time", lambda trial: trial.record.seconds.get("train")),
     "init_points": ("initial points", lambda trial: trial.record.num_init_points),
-    "total_time": ("total time", total_seconds),
+    "total_time": ("total time", lambda trial: None if trial.made_elsewhere else sum(trial.record.seconds.values())),
     "peak_memory_mb": ("peak memory", lambda trial: trial.record.peak_memory_mb),
 }
 COUNTS = ("gaussians", "init_points")
 # (cost, symbol, scale, decimals) of the names that fix a unit.
-FIXED_UNITS = {"gaussians_millions": ("gaussians", "M", MILLION, 2), "train_minutes": ("train_time", "min", MINUTE, 1)}
+FIXED_UNITS = {
+    "gaussians_millions": ("gaussians", "M", MILLION, 2),
+    "train_minutes": ("train_time", "min", MINUTE, 1),
+    "peak_memory_mb": ("peak_memory_mb", "MB", 1.0, 0),
+}
 ALIASES = {"num_gaussians": "gaussians", "seconds": "train_time", "train": "train_time"}
 TEXTURED = Quantity("error_textured", "error in textured parts (levels)", -1, 2, _textured)
 AT = "@"  # psnr@7000 is the PSNR at iteration 7000 (eval.at)
@@ -121,15 +120,10 @@ def quantity(name: str, trials: Iterable[TrialResult]) -> Quantity:
     metric, _, step = key.partition(AT)
     if metric == "lpips":
         metric = _protocol_lpips(trials[0]) if trials else f"{LPIPS}{PAPER.lpips}"
-    if find_metric(metric) is not None or any(
-        metric in trial.metrics for trial in trials
-    ):  # gsbench's metric or a user's
+    if find_metric(metric) is not None or any(metric in trial.metrics for trial in trials):  # gsbench's or a user's
         return _metric(metric, step, trials)
     if key in FIXED_UNITS:
-        cost, symbol, scale, decimals = FIXED_UNITS[key]
-        return _scaled(key, cost, symbol, scale, decimals)
-    if key == "peak_memory_mb":
-        return _scaled(key, key, "MB", 1.0, 0)
+        return _scaled(key, *FIXED_UNITS[key])
     if key not in COSTS:
         names = [*metric_keys(trials, known_keys()), *COSTS]
         raise InputError(f"unknown metric {name!r}; choose among {', '.join(names)}")
@@ -176,7 +170,7 @@ def _metric(key: str, step: str, trials: Sequence[TrialResult]) -> Quantity:
     """A metric at the end, or at iteration ``step`` unless it is "". Trials record the facts of a user's metric."""
     records = [trial.record.metric_facts.get(key) for trial in trials if key in trial.metrics]
     facts = find_metric(key) or from_record(key, records[0] if records else None)
-    name, read = facts.name, partial(_final_value, key)
+    name, read = facts.name, lambda trial: trial.metrics.get(key)
     if step:
         measured = sorted({int(at) for trial in trials for at in trial.record.metrics_at})
         if step not in map(str, measured):
@@ -186,10 +180,6 @@ def _metric(key: str, step: str, trials: Sequence[TrialResult]) -> Quantity:
     return Quantity(
         f"{key}{AT}{step}" if step else key, name, facts.direction, facts.decimals, read, worthwhile=facts.worthwhile
     )
-
-
-def _final_value(key: str, trial: TrialResult) -> float | None:
-    return trial.metrics.get(key)
 
 
 def _value_at(key: str, step: str, trial: TrialResult) -> float | None:

@@ -224,7 +224,7 @@ class TrialResult:
         """The recorded conditions that trials must share before their numbers may be averaged, as comparable text."""
         conditions = {
             "protocol": self.record.protocol,
-            "resolution": _size_text(self.record.resolution),
+            "resolution": "x".join(map(str, self.record.resolution or (None,))),
             "data": str(self.record.hashes.get("data")),
         }
         if self.split:
@@ -422,7 +422,3 @@ def _why_unfinished(path: Path) -> str:
     if (path / FAILED).exists():
         return f"failed, {TrialFolder(path).failure().reason}"
     return f"unfinished, no {RESULTS} yet" if (path / CONFIG).is_file() else "foreign, not a trial"
-
-
-def _size_text(size: tuple[int, int] | None) -> str:
-    return "None" if size is None else f"{size[0]}x{size[1]}"

@@ -1,7 +1,6 @@
 """Tables as plain data, and their formats: Markdown, CSV, LaTeX (booktabs) and HTML."""
 
 import itertools
-import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
@@ -73,13 +72,9 @@ def to_markdown(table: Table) -> str:
     heads = [*table.row_headings, *(f"{column.group} {column.heading}".strip() for column in table.columns)]
     rule = [":---"] * len(table.row_headings) + ["---:"] * len(table.columns)
     rows = [[*row.labels, *(f"**{e.text}**" if e.bold else e.text for e in row.entries)] for row in table.rows]
-    lines = [f"### {table.title}", "", *map(_markdown_row, [heads, rule, *rows])]
-    lines += ["", *(f"- {note}" for note in table.notes)]
-    return "\n".join(lines).rstrip() + "\n"
-
-
-def _markdown_row(cells: list[str]) -> str:
-    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
+    lines = [" | ".join(text.replace("|", "\\|") for text in row) for row in (heads, rule, *rows)]
+    notes = [f"- {note}" for note in table.notes]
+    return "\n".join([f"### {table.title}", "", *(f"| {line} |" for line in lines), "", *notes]).rstrip() + "\n"
 
 
 def to_csv(table: Table) -> str:
@@ -87,20 +82,14 @@ def to_csv(table: Table) -> str:
     import pandas as pd  # here, since it is slow to import
 
     heads = [*table.row_headings, "quantity", "column", "mean", "std", "count", "expected", "best", "text", "trials"]
-    cells = [
-        [*row.labels, *column.key, *_numbers(entry.cell), int(entry.bold), entry.text, _trials(entry.cell)]
-        for row in table.rows
-        for column, entry in zip(table.columns, row.entries, strict=True)
-    ]
-    return str(pd.DataFrame(cells, columns=heads, dtype=object).to_csv(index=False, lineterminator="\n"))
-
-
-def _numbers(cell: Cell | None) -> list[object]:
-    return [None] * 4 if cell is None else [cell.mean, cell.std, cell.count, cell.expected]
-
-
-def _trials(cell: Cell | None) -> str:
-    return "" if cell is None else " ".join(trial.label for trial in cell.trials)
+    lines: list[list[object]] = []
+    for row in table.rows:
+        for column, entry in zip(table.columns, row.entries, strict=True):
+            cell = entry.cell
+            numbers = [None] * 4 if cell is None else [cell.mean, cell.std, cell.count, cell.expected]
+            trials = "" if cell is None else " ".join(trial.label for trial in cell.trials)
+            lines.append([*row.labels, *column.key, *numbers, int(entry.bold), entry.text, trials])
+    return str(pd.DataFrame(lines, columns=heads, dtype=object).to_csv(index=False, lineterminator="\n"))
 
 
 def to_latex(table: Table) -> str:
@@ -144,20 +133,18 @@ FORMATS: dict[str, tuple[str, Callable[[Table], str]]] = {  # name -> file suffi
 
 WRAPPED_SHARE = 0.7  # share of a LaTeX line for the columns of a ``wrapped`` table
 
-_LATEX = {
+_LATEX = str.maketrans({
     "\\": "\\textbackslash{}", "&": "\\&", "%": "\\%", "$": "\\$", "#": "\\#", "_": "\\_", "{": "\\{", "}": "\\}",
     "~": "\\textasciitilde{}", "^": "\\textasciicircum{}", "<": "$<$", ">": "$>$", "|": "$|$",
     "±": "$\\pm$", "↑": "$\\uparrow$", "↓": "$\\downarrow$", "—": "---", "–": "--", "−": "$-$", "…": "\\ldots{}",
     "×": "$\\times$", "≈": "$\\approx$", "≠": "$\\neq$", "≤": "$\\leq$", "≥": "$\\geq$", "Δ": "$\\Delta$",
     "·": "$\\cdot$", "²": "$^2$", "“": "``", "”": "''", "‘": "`", "’": "'",
-}  # fmt: skip
-_LATEX_PATTERN = re.compile("|".join(re.escape(character) for character in _LATEX))
+})  # fmt: skip
 
 
 def escape_latex(text: str) -> str:
     """Text as LaTeX source; a character that plain LaTeX does not have becomes a question mark."""
-    escaped = _LATEX_PATTERN.sub(lambda match: _LATEX[match[0]], text)
-    return escaped.encode("latin-1", "replace").decode("latin-1")
+    return text.translate(_LATEX).encode("latin-1", "replace").decode("latin-1")
 
 
 def _latex_text(entry: TableEntry) -> str:

@@ -21,7 +21,7 @@ from gsbench.analysis.cells import (
 from gsbench.analysis.declaration import active_declaration
 from gsbench.analysis.differences import differing_conditions
 from gsbench.analysis.fairness import caveats
-from gsbench.analysis.pairing import BASELINE, choose_pairs, controls_of
+from gsbench.analysis.pairing import BASELINE, are_equal, choose_pairs, controls_of, pair_trials
 from gsbench.analysis.quantities import Quantity, choose_quantities
 from gsbench.analysis.results import Arm, Experiment, TrialResult, group_by, seeds_words
 from gsbench.analysis.table_formats import Column, Row, Table, TableEntry
@@ -147,8 +147,8 @@ def _best(
     """
 
     def scene_and_split(position: Position) -> tuple[str, str]:
-        labels = (*position[0], *position[1])
-        return "" if scene_index is None else labels[scene_index], _split(cells[position])
+        scene = "" if scene_index is None else (*position[0], *position[1])[scene_index]
+        return scene, next((trial.split for trial in cells[position].trials), "")
 
     bold: set[Position] = set()
     notes: list[str] = []
@@ -163,10 +163,6 @@ def _best(
             else:
                 bold |= best_cells({position: cells[position] for position in positions}, quantity)
     return bold, list(dict.fromkeys(notes))
-
-
-def _split(cell: Cell) -> str:
-    return cell.trials[0].split if cell.trials else ""
 
 
 def _means(
@@ -281,23 +277,14 @@ def comparison_notes(experiment: Experiment) -> list[str]:
         notes = declared_lines(declared, judge_pairs(trials, pairs, declared))
     by_arm = group_by(trials, lambda trial: trial.arm)
     for first, second in pairs:
-        if _are_equal(by_arm[first], by_arm[second]):
+        both = pair_trials(trials, first, second)
+        if both and all(are_equal(*one) for one in both):
             names = f"{second} and {first}"
             notes.append(
                 f"{names} are equal to the last bit in all their trials: the settings that differ had no effect."
             )
     sentences = (caveats([*by_arm[first], *by_arm[second]], first, second) for first, second in pairs)
     return notes + list(filter(None, sentences))
-
-
-def _are_equal(first: Sequence[TrialResult], second: Sequence[TrialResult]) -> bool:
-    """Return whether all trials of one scene and seed have the same metrics and number of Gaussians."""
-    one, other = (
-        {(trial.scene, trial.seed): (dict(trial.metrics), trial.record.num_gaussians) for trial in own}
-        for own in (first, second)
-    )
-    shared = one.keys() & other.keys()
-    return bool(shared) and all(one[key] == other[key] and one[key][0] for key in shared)
 
 
 def compared_pairs(experiment: Experiment, baseline: str = BASELINE) -> tuple[list[TrialResult], list[tuple[Arm, Arm]]]:

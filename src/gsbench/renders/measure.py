@@ -16,6 +16,7 @@ import torch
 import yaml
 from PIL import Image
 
+from gsbench.analysis.quantities import COSTS
 from gsbench.analysis.results import TrialResult, read_experiment, read_views
 from gsbench.config.command_words import options, typed_permissions
 from gsbench.config.compose import compose_one
@@ -90,7 +91,8 @@ def measure_renders(options: argparse.Namespace, runs: Path) -> None:
     renders = Path(options.renders).expanduser()
     if not renders.is_dir():
         raise InputError(f"{renders} is not a folder of renders")
-    matching = _match(truth, list_images(renders), options.by_order)
+    match = match_by_order if options.by_order else match_pictures
+    matching = match(list(truth.photographs), list_images(renders))
     pairs = [
         PicturePair(view, path, renders / matching.pairs[view], truth.masks.get(view))
         for view, path in truth.photographs.items()
@@ -122,11 +124,6 @@ def _reference_images(options: argparse.Namespace, runs: Path) -> ReferenceImage
     if truth.init is not None and overrides:
         raise InputError(f"{overrides[0]}: the settings of {truth.what} are as they are; only eval.… can be set here")
     return truth
-
-
-def _match(truth: ReferenceImages, renders: Sequence[str], by_order: bool) -> Matching:
-    photographs = list(truth.photographs)
-    return match_by_order(photographs, renders) if by_order else match_pictures(photographs, renders)
 
 
 def _evaluator(truth: ReferenceImages, protocol: str | None, settings: Sequence[str]) -> Evaluator:
@@ -190,11 +187,9 @@ def find_reference_images(place: str, settings: Sequence[str], runs: Path) -> Re
     folder = Path(place).expanduser()
     if folder.is_dir():
         home = folder.parent if folder.name in (GROUND_TRUTH, RENDERS) else folder
-        return (
-            reference_images_of(find_trial(str(home), runs))
-            if (home / RESULTS).is_file()
-            else _folder(folder, settings)
-        )
+        if not (home / RESULTS).is_file():
+            return _folder(folder, settings)
+        return reference_images_of(find_trial(str(home), runs))
     if ":" in place:
         return reference_images_of(find_trial(place, runs))
     scenes = options("scene")
@@ -358,7 +353,6 @@ def _results(
     source: Mapping[str, str],
 ) -> TrialRecord:
     evaluation = summary_of(evaluator, per_view)
-    unknown = dict.fromkeys(("gaussians", "train_time", "init_points", "total_time", "peak_memory_mb"), RENDERS_ALONE)
     return TrialRecord(
         status="complete",
         experiment=destination.experiment,
@@ -371,7 +365,7 @@ def _results(
         protocol=evaluator.protocol.id,
         iterations=0,
         metrics=evaluation.metrics,
-        unavailable=evaluation.unavailable | unknown,
+        unavailable=evaluation.unavailable | dict.fromkeys(COSTS, RENDERS_ALONE),
         awaited=evaluation.awaited,
         metric_facts=evaluation.facts,
         num_init_points=None,

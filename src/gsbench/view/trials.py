@@ -18,12 +18,7 @@ from gsbench.init.base import MODEL_FOLDER, PointCloud
 from gsbench.runs.keys import INIT
 from gsbench.runs.layout import GROUND_TRUTH, LINEAGE, POINT_CLOUD, RESULTS, STORE
 from gsbench.runs.store import Store
-from gsbench.scene.colmap import (
-    PINHOLE_MODELS,
-    model_points,
-    pinhole_camera,
-    read_model,
-)
+from gsbench.scene.colmap import PINHOLE_MODELS, model_points, pinhole_camera, read_model
 from gsbench.scene.images import png_name, read_image
 from gsbench.scene.types import Camera, View
 from gsbench.view import ADDRESS

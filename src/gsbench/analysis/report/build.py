@@ -3,9 +3,10 @@
 import logging
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from statistics import fmean
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +15,7 @@ from gsbench.analysis import verdicts
 from gsbench.analysis.declaration import active_declaration
 from gsbench.analysis.differences import short_version
 from gsbench.analysis.fairness import caveats, fairness_table
-from gsbench.analysis.images import ViewComparison, choose_views, png_uri, read_image
+from gsbench.analysis.images import choose_views, png_uri
 from gsbench.analysis.judgement import Verdict
 from gsbench.analysis.pairing import BASELINE, pair_trials
 from gsbench.analysis.paper import layout_of, load_paper, paper_tables
@@ -30,6 +31,7 @@ from gsbench.events import RefineEvent
 from gsbench.parsing import DamagedError
 from gsbench.runs import layout
 from gsbench.runs.experiments import read_tuning
+from gsbench.scene.images import read_image
 from gsbench.words import counted, signed
 
 log = logging.getLogger(__name__)
@@ -68,7 +70,11 @@ def build_report(experiment: Experiment, baseline: str = BASELINE) -> str:
         versus=[compare_arms(trials, own) for own in judged],
         declared=declared.sentences(quantity.name) if declared and quantity else [],
         families=verdicts.families(judged),
-        tables=[_without_verdicts(table) for table in tables],
+        # The top of the page has the notes on verdicts.
+        tables=[
+            replace(one, notes=tuple(note for note in one.notes if not note.startswith(verdicts.VERDICT)))
+            for one in tables
+        ],
         contradictions=[] if paper_table is None else load_paper().contradictions,
         search=search_summary(experiment.folder),
         say=verdicts,
@@ -82,11 +88,6 @@ def build_report(experiment: Experiment, baseline: str = BASELINE) -> str:
         provenance=provenance(trials),
         warnings=experiment.warnings,
     )
-
-
-def _without_verdicts(table: Table) -> Table:
-    """The table without its notes on verdicts: the top of the page has them."""
-    return replace(table, notes=tuple(note for note in table.notes if not note.startswith(verdicts.VERDICT)))
 
 
 def trial_figures(trials: Sequence[TrialResult]) -> list[tuple[str, str]]:
@@ -107,41 +108,21 @@ def _signed(value: float | None, decimals: int) -> str:
     return "unknown" if value is None else signed(value, f".{decimals}f")
 
 
-@dataclass(frozen=True)
-class ArmComparison:
-    """All results about one pair of arms; ``judged`` are its verdicts."""
-
-    judged: PairVerdicts
-    caveats: str  # what may have made the difference besides the idea
-    fairness: Table
-    costs: tuple[str, ...]
-    forests: tuple[str, ...]
-    views: tuple[ViewComparison, ...]
-    notes: tuple[str, ...]
-
-    @property
-    def title(self) -> str:
-        return f"{self.judged.second} against {self.judged.first}"
-
-    @property
-    def has_like_these(self) -> bool:
-        """Return whether there are enough scenes for a statement about scenes like these."""
-        return any(one.like_these is not None for one in self.judged.verdicts)
-
-
-def compare_arms(trials: Sequence[TrialResult], judged: PairVerdicts) -> ArmComparison:
-    """Costs, forest plots and views of two arms; notes say what could not be read."""
+def compare_arms(trials: Sequence[TrialResult], judged: PairVerdicts) -> dict[str, Any]:
+    """Everything that the page shows of two arms; notes say what could not be compared or read."""
     first, second = judged.first, judged.second
     views, faults = choose_views(pair_trials(trials, first, second))
-    return ArmComparison(
-        judged,
-        caveats(trials, first, second),
-        fairness_table(trials, first, second),
-        tuple(_costs(trials, first, second)),
-        tuple(_forest(verdict) for verdict in judged.verdicts),
-        tuple(views),
-        tuple(dict.fromkeys([*judged.notes, *faults])),
-    )
+    return {
+        "judged": judged,
+        "title": f"{second} against {first}",
+        "has_like_these": any(one.like_these is not None for one in judged.verdicts),
+        "caveats": caveats(trials, first, second),
+        "fairness": fairness_table(trials, first, second),
+        "costs": _costs(trials, first, second),
+        "forests": [_forest(verdict) for verdict in judged.verdicts],
+        "views": views,
+        "notes": dict.fromkeys([*judged.notes, *faults]),
+    }
 
 
 def _costs(trials: Sequence[TrialResult], first: Arm, second: Arm) -> list[str]:

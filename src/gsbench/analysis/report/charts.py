@@ -24,16 +24,6 @@ Points = Sequence[tuple[float, float]]
 
 
 @dataclass(frozen=True)
-class Line:
-    """A line of a chart with its name; points are in px."""
-
-    name: str
-    points: Points
-    color: str
-    dash: str
-
-
-@dataclass(frozen=True)
 class ForestRow:
     """A difference with its interval, None if it is unknown."""
 
@@ -68,8 +58,8 @@ def line_chart(
     x = Axis([x for x, _ in all_points] + ([] if marker is None else [marker]), log, LEFT, WIDTH - RIGHT)
     y = Axis([y for _, y in all_points], log, HEIGHT - BOTTOM, TOP)
     lines = [
-        Line(name, [(x.to_px(a), y.to_px(b)) for a, b in points], COLORS[k % len(COLORS)], DASHES[k % len(DASHES)])
-        for k, (name, points) in enumerate(shown)
+        {"name": name, "points": [(x.to_px(a), y.to_px(b)) for a, b in points], "color": color, "dash": dash}
+        for (name, points), color, dash in zip(shown, itertools.cycle(COLORS), itertools.cycle(DASHES), strict=False)
     ]
     words = f"{title}. {y_label} against {x_label}: {'; '.join(f'{name} {_ends(points)}' for name, points in shown)}."
     marked = None if marker is None else (x.to_px(marker), f"V_th {marker:g}")
