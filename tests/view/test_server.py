@@ -21,9 +21,8 @@ from gsbench.gaussians.initial import gaussians_from_cloud
 from gsbench.raster import create_rasterizer
 from gsbench.system.install import install_command
 from gsbench.verbs import servers
-from gsbench.view.picture import Layers, TrialPainter
 from gsbench.view.server import Session, Viewer, check_port, free_port
-from gsbench.view.trials import find_trial, load_viewed, read_causes
+from gsbench.view.trials import Layers, TrialPainter, find_trial, load_viewed, read_causes
 from tests.view.browser import Browser
 
 pytestmark = pytest.mark.slow

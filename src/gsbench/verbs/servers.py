@@ -40,9 +40,8 @@ def view(argv: Sequence[str], runs: Path) -> int:
 
     from gsbench.raster import create_rasterizer
     from gsbench.train.device import select_device
-    from gsbench.view.picture import TrialPainter
     from gsbench.view.server import Viewer, check_port
-    from gsbench.view.trials import find_trial, load_viewed
+    from gsbench.view.trials import TrialPainter, find_trial, load_viewed
 
     check_port(options.port)
     device = select_device(options.device)

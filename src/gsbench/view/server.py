@@ -28,7 +28,7 @@ from gsbench.events import Cause
 from gsbench.gaussians.model import MAX_SH_DEGREE
 from gsbench.gaussians.paper_values import VOLUME_THRESHOLD
 from gsbench.scene.types import Camera, View
-from gsbench.view.picture import Layers, Picture, TrialPainter, photograph_at, side_by_side
+from gsbench.view.trials import Layers, Picture, TrialPainter, photograph_at, side_by_side
 
 log = logging.getLogger(__name__)
 

@@ -13,9 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from gsbench.errors import InputError
 from gsbench.scene.types import Camera, View
-from gsbench.view.picture import photograph_at, side_by_side
 from gsbench.view.server import fitting_fov, level_up, mean_up, page_camera
-from gsbench.view.trials import read_causes
+from gsbench.view.trials import photograph_at, read_causes, side_by_side
 
 
 def smooth_image(height: int, width: int) -> np.ndarray:
