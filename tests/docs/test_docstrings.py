@@ -16,7 +16,7 @@ from gsbench.eval.metric import Metric
 from gsbench.external.settings import External
 from gsbench.init.base import Initializer
 from gsbench.raster import Rasterizer
-from gsbench.tracking.trial import Sink
+from gsbench.tracking.sinks import Sink
 from tests.conftest import ROOT
 
 PROMPT = re.compile(r"^\s*>>> ", re.MULTILINE)

@@ -33,7 +33,7 @@ from gsbench.launch.record import read_plan
 from gsbench.launch.states import FinishedTrials, states_of_experiment
 from gsbench.runs.declaration import read_declarations
 from gsbench.runs.trial_folder import TrialFolder
-from gsbench.tracking.trial import TrackedTrial, read_state
+from gsbench.tracking.sinks import TrackedTrial, read_state
 from gsbench.verbs.results import explain_cell
 from gsbench.verbs.trials import lines_of
 from tests.finished import record_of

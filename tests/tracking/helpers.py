@@ -13,7 +13,7 @@ from typing import Any
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.locks import hold
 from gsbench.tracking import Mirror
-from gsbench.tracking.follower import mirror_ended
+from gsbench.tracking.mirror import mirror_ended
 
 ROOT = Path(__file__).resolve().parents[2]
 RECORDS = 150

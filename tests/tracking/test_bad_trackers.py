@@ -152,7 +152,7 @@ def mirrors_of(program: subprocess.Popen[str]) -> list[psutil.Process]:
         with suppress(psutil.NoSuchProcess):
             children = psutil.Process(program.pid).children(recursive=True)
             found[:] = [
-                child for child in children if any("gsbench.tracking.follower" in word for word in child.cmdline())
+                child for child in children if any("gsbench.tracking.mirror" in word for word in child.cmdline())
             ]
         return bool(found)
 

@@ -1,24 +1,40 @@
-"""The mirror as the trials see it: it starts the follower process, and at the end waits for it a bounded time.
+"""Mirroring: reads the files of trials and sends new records to their tracker, in a process beside the trials.
 
 Why a process: a tracker's client may hang in a socket, a lock or a C library for any time. A hanging thread cannot be
 ended, and a thread that is inside a C library when the interpreter exits crashes the process, after a trial that was
 complete. A process can be killed.
 
-The follower gets the folders to follow on stdin, and reads everything else from files. Its exit code says how it ended,
-and the last line on its stderr says why.
+`Mirror` starts the process, and at the end waits for it a bounded time. `follow` is the main function of the process.
+It gets the folders to follow on stdin, and reads everything else from files. Its exit code says how it ended, and the
+last line on its stderr says why. `sync` mirrors once, trials that have ended.
 """
 
 from __future__ import annotations
 
 import logging
+import os
+import signal
 import subprocess
+import sys
 import tempfile
-from contextlib import suppress
+import threading
+import time
+import traceback
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack, closing, suppress
 from pathlib import Path
-from typing import Any
+from queue import Empty, Queue
+from typing import Any, NoReturn
 
+from gsbench.errors import InputError
+from gsbench.files import write_json
+from gsbench.runs.layout import CONFIG, FAILED, RESULTS
+from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.isolate import describe_exit, error_lines, python_command
-from gsbench.tracking.trial import name_of
+from gsbench.system.locks import BusyError, hold
+from gsbench.tracking.mlflow_sink import MlflowSink, untyped_address
+from gsbench.tracking.sinks import Sink, TensorBoardSink, TrackedTrial, WandbSink, name_of, read_state
+from gsbench.words import counted
 
 log = logging.getLogger(__name__)
 
@@ -67,11 +83,11 @@ class Mirror:
             self._finish(SECONDS_TO_STOP if stopped else float(self._options["patience_seconds"]))
 
     def _start(self) -> subprocess.Popen[bytes]:
-        """A fresh interpreter that runs `gsbench.tracking.follower.follow`. Raises OSError where it cannot start."""
+        """A fresh interpreter that runs `gsbench.tracking.mirror.follow`. Raises OSError where it cannot start."""
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - open as long as the process runs
         words = (str(self._options["flush_seconds"]), str(self._options["patience_seconds"]))
         return subprocess.Popen(
-            python_command("gsbench.tracking.follower", "follow", *words),
+            python_command(__name__, "follow", *words),
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,  # what MLflow prints
             stderr=self._errors,
@@ -104,3 +120,223 @@ class Mirror:
 
     def _warn(self, error: object) -> None:
         log.warning("tracking: %s; the files are complete, `gsbench sync` mirrors them later", error)
+
+
+# ---- a trial and its tracker
+
+LOCK = ".mlflow.lock"  # in the trial's folder: one process at a time mirrors a trial, to any tracker
+SECONDS_AFTER_PARENT = 10.0  # to tell the tracker how trials ended after the sweep's process is gone
+
+
+class TrackerRun:
+    """The tracker's run of the trial in ``folder``, new or continued. It is locked until it is closed.
+
+    ``options`` are the settings ``tracking``, ``values`` the whole configuration. Raises BusyError if another process
+    mirrors the trial, and any error of the tracker.
+    """
+
+    def __init__(self, folder: TrialFolder, options: dict[str, Any], values: dict[str, Any]) -> None:
+        folder.require_no_links()
+        self._options, self._trial = options, TrackedTrial(folder, values)
+        with ExitStack() as held:
+            held.enter_context(hold(folder.path / LOCK, "mirroring", wait=False))
+            self._sink = make_sink(options, self._trial)
+            self._file = folder.path / self._sink.state_file
+            self._open()
+            self._held = held.pop_all()
+
+    def close(self) -> None:
+        """Let other processes mirror the trial."""
+        self._held.close()
+
+    @property
+    def is_complete(self) -> bool:
+        """Return whether the run shows the trial's present results."""
+        return self._state["complete"] is not None and self._state["complete"] == self._trial.results_hash()
+
+    def add_curves(self) -> None:
+        """Log the records that were written since the last call."""
+        if self.is_complete:
+            return
+        for name, newest, scalars in self._trial.curves(self._state["logged"]):
+            self._sink.log(scalars)
+            self._state["logged"][name] = newest
+        write_json(self._file, self._state)
+
+    def end(self) -> None:
+        """Log the rest, and close the run with the trial's end by its files: failed, done, or otherwise killed."""
+        if self.is_complete:
+            return
+        if self._state["complete"] is not None:  # the run shows earlier results, which new ones have replaced
+            self._open()
+        self.add_curves()
+        folder = self._trial.folder
+        if folder.has_failed():
+            self._sink.stop("FAILED", folder.failure().reason)
+        elif (results := folder.sound_record()) is None:
+            self._sink.stop("KILLED", None)
+        else:
+            images, with_model = int(self._options["images"]), bool(self._options.get("model"))
+            self._sink.complete(self._trial.summary(results, images, with_model))
+            self._state["complete"] = self._trial.results_hash()
+        write_json(self._file, self._state)
+
+    def _open(self) -> None:
+        self._state = self._sink.open(read_state(self._file), self._trial.results_hash())
+        write_json(self._file, self._state)
+
+
+def make_sink(options: dict[str, Any], trial: TrackedTrial) -> Sink:
+    """The sink of a trial for the tracker that ``tracking.sink`` names."""
+    sink = options.get("sink")
+    if sink == "tensorboard":
+        return TensorBoardSink(trial)
+    return WandbSink(options, trial) if sink == "wandb" else MlflowSink(options, trial)
+
+
+# ---- once, after the end
+
+
+def sync(folders: Iterable[TrialFolder], uri: str | None) -> Iterator[str]:
+    """Mirror ended trials that the tracker lacks; yields a line for each mirrored or left-out trial, and a summary.
+
+    Raises MirrorError if the tracker refuses a trial.
+    """
+    new = already_there = 0
+    for folder in folders:
+        state = folder.state()
+        if state == "damaged":
+            yield f"left out: {folder.label}: damaged, see gsbench status"
+        if state not in ("done", "failed"):
+            continue
+        try:
+            values = folder.configuration()
+        except InputError as error:
+            yield f"left out: {error}"
+            continue
+        options = values["tracking"] | ({"uri": uri} if uri else {})
+        # The runs folder may be somebody else's: it must not make us send files or passwords to an address of theirs.
+        if address := untyped_address(options, uri):
+            yield (
+                f"left out: {folder.label}: its configuration names the tracker {address}, and --uri {address} was "
+                "not typed"
+            )
+            continue
+        try:
+            is_new = mirror_ended(folder, options, values)
+        except BusyError:
+            yield f"{folder.label} is being mirrored by another process"
+            continue
+        except Exception as error:  # any error of the tracker's client
+            raise refusal(folder, options, error) from error
+        new, already_there = new + is_new, already_there + (not is_new)
+        if is_new:
+            yield f"mirrored {folder.label}"
+    yield f"{counted(new, 'trial')} mirrored now, {already_there} before"
+
+
+def mirror_ended(folder: TrialFolder, options: dict[str, Any], values: dict[str, Any]) -> bool:
+    """Mirror an ended trial; returns False if the tracker lacked nothing. Raises the errors of `TrackerRun`."""
+    with closing(TrackerRun(folder, options, values)) as run:
+        if run.is_complete:
+            return False
+        run.end()
+        return True
+
+
+def refusal(folder: TrialFolder, options: dict[str, Any], error: Exception) -> MirrorError:
+    """A MirrorError, in one line, for an ``error`` of the tracker's client about a trial."""
+    lines = str(error).strip().splitlines()
+    reason = f"{type(error).__name__}: {lines[0][:200] if lines else ''}"
+    return MirrorError(f"{name_of(options)} does not take {folder.label} ({reason})")
+
+
+# ---- beside a sweep
+
+Lines = Queue[str | None]  # of stdin; None is the end
+
+
+def follow() -> NoReturn:
+    """Mirror the trials whose folders come as lines on stdin, until stdin ends and the trials have ended.
+
+    Arguments of the process: the time between two readings of the files, and how long the parent waits for this process
+    at the end; both in seconds.
+    """
+    pause, patience = map(float, sys.argv[2:4])
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    lines: Lines = Queue()
+    threading.Thread(target=_read_input, args=(lines, patience), daemon=True).start()
+    code = 0
+    try:
+        _follow(lines, pause)
+    except Exception as error:  # noqa: BLE001 - any error of the tracker's client
+        code = TRACKER_FAILED
+        traceback.print_exc()
+        print(" ".join(str(error).split()), file=sys.stderr, flush=True)
+    os._exit(code)  # skips the clean-up of libraries, which might hang or crash
+
+
+def _follow(lines: Lines, pause: float) -> None:
+    trials: list[_FollowedTrial] = []
+    last = False
+    while not last:
+        with suppress(Empty):
+            path = lines.get(timeout=pause)
+            while path is not None:
+                trials.append(_FollowedTrial(TrialFolder(Path(path))))
+                path = lines.get_nowait()
+            last = True
+        for trial in trials:
+            try:
+                trial.catch_up(last)
+            except BusyError:
+                pass
+            except Exception as error:  # any error of the tracker's client: tried again, and raised the last time
+                if last:
+                    raise refusal(trial.folder, trial.options, error) from error
+        trials = [trial for trial in trials if not trial.has_ended]
+
+
+class _FollowedTrial:
+    """A trial to mirror. Its run is opened once the trial runs or has ended, or when the sweep ends."""
+
+    def __init__(self, folder: TrialFolder) -> None:
+        self.folder, self.has_ended = folder, False
+        self.options: dict[str, Any] = {}
+        self._added_at = time.time()
+        self._run: TrackerRun | None = None
+
+    def catch_up(self, last: bool) -> None:
+        """Send the new records, and the trial's end once it has ended. ``last`` says that the sweep has ended."""
+        # The state is read before the curves: if it says that the trial has ended, the curves are complete.
+        state = self.folder.state()
+        is_waiting = state != "running" and self._run is None and not self._has_ended_since()
+        if not (self.folder.path / CONFIG).exists() or (is_waiting and not last):
+            return
+        if self._run is None:
+            values = self.folder.configuration()
+            self.options = values["tracking"]
+            self._run = TrackerRun(self.folder, self.options, values)
+        self._run.add_curves()
+        if state != "running":
+            self._run.end()
+            self._run.close()
+            self.has_ended = True
+
+    def _has_ended_since(self) -> bool:
+        """Return whether the trial has ended since it was added. Older result files are of an earlier run."""
+        for name in (RESULTS, FAILED):
+            with suppress(OSError):
+                if (self.folder.path / name).stat().st_mtime >= self._added_at:
+                    return True
+        return False
+
+
+def _read_input(lines: Lines, patience: float) -> None:
+    for line in sys.stdin:
+        lines.put(line.rstrip("\n"))
+    lines.put(None)
+    # The parent kills this process after its patience. If the parent was killed itself, this ends the process, even
+    # while the tracker's client hangs.
+    time.sleep(patience + SECONDS_AFTER_PARENT)
+    os._exit(1)

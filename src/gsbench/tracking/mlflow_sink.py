@@ -23,7 +23,7 @@ from gsbench.errors import InputError
 from gsbench.files import atomic, require_no_links, write_json
 from gsbench.runs import layout
 from gsbench.runs.layout import ARTIFACTS, DATABASE
-from gsbench.tracking.trial import Scalar, Summary, TrackedTrial
+from gsbench.tracking.sinks import Scalar, Summary, TrackedTrial
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
@@ -176,7 +176,7 @@ class MlflowSink:
         self._started = 0  # ms since 1970
 
     def open(self, state: dict[str, Any], results: str | None) -> dict[str, Any]:
-        """Open the run (see `gsbench.tracking.trial.Sink`). A deleted run, or one in another tracker, is replaced."""
+        """Open the run (see `gsbench.tracking.sinks.Sink`). A deleted run, or one in another tracker, is replaced."""
         uri = self._uri()
         experiment_id = ensure_experiment(self.client, self._trial.values["name"], self._trial.folder.runs)
         run = None

@@ -21,8 +21,8 @@ from gsbench.runs.experiments import experiment_home, list_experiments, trial_fo
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import FROM_RENDERS
 from gsbench.system.own_modules import allow_modules
-from gsbench.tracking.follower import sync as send_missing
 from gsbench.tracking.mirror import MirrorError
+from gsbench.tracking.mirror import sync as send_missing
 from gsbench.tracking.mlflow_sink import VARIABLE, untyped_address
 from gsbench.verbs.arguments import ArgumentParser
 from gsbench.words import counted, readable_time

@@ -1,10 +1,15 @@
-"""A trial in a tracker's terms: its scalars, tags and files, the state of its mirror, and the contract of a tracker."""
+"""A trial in a tracker's terms, the contract of a tracker, and the trackers TensorBoard and Weights & Biases."""
 
+import os
+import shutil
+import time
+import uuid
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
+from gsbench.files import require_no_links
 from gsbench.parsing import Count, Record, read_if_sound
 from gsbench.runs import layout
 from gsbench.runs.keys import TRAIN, flatten, sha256_of
@@ -13,10 +18,7 @@ from gsbench.runs.trial_record import TrialRecord, read_rows
 
 FILES = (layout.CONFIG, layout.RESULTS, layout.INIT_REPORT, layout.PER_VIEW, layout.EVENTS)
 CURVES = {layout.CURVES: "train", layout.EVENTS: "events"}  # file: prefix of its scalars' names
-
-
-DEFAULT = "mlflow"
-NAMES = {DEFAULT: "MLflow", "tensorboard": "TensorBoard", "wandb": "Weights & Biases"}
+NAMES = {"mlflow": "MLflow", "tensorboard": "TensorBoard", "wandb": "Weights & Biases"}
 
 
 @dataclass(frozen=True)
@@ -91,7 +93,7 @@ class Sink(Protocol):
 
 def name_of(options: dict[str, Any]) -> str:
     """The tracker's name in messages."""
-    return NAMES[options.get("sink", DEFAULT)]
+    return NAMES[options.get("sink", "mlflow")]
 
 
 @dataclass(frozen=True)
@@ -206,3 +208,127 @@ def read_state(file: Path) -> dict[str, Any]:
     """Read the state in ``file``. It is empty, as if nothing were mirrored yet, for an absent or damaged file."""
     state = read_if_sound(file, MirrorState)
     return {} if state is None else {"complete": None, "logged": {}} | state.to_json()
+
+
+# ---- TensorBoard: event files in ``tensorboard/`` of the runs folder
+
+
+class TensorBoardSink:
+    """The event files of one trial. They cannot be edited, so a continued trial is written anew."""
+
+    state_file = "tensorboard.json"
+
+    def __init__(self, trial: TrackedTrial) -> None:
+        self._trial = trial
+        self._folder = trial.folder.runs / layout.TENSORBOARD / trial.path
+        self._started = time.time()
+        self._writer: Any = None
+
+    def open(self, state: dict[str, Any], results: str | None) -> dict[str, Any]:
+        """Open the run as `gsbench.tracking.sinks.Sink` says."""
+        if self._folder.is_dir() and state.get("complete") is not None and state["complete"] == results:
+            return state
+        from torch.utils.tensorboard import SummaryWriter
+
+        require_no_links(self._trial.folder.runs, self._folder)
+        shutil.rmtree(self._folder, ignore_errors=True)
+        self._writer = SummaryWriter(str(self._folder))
+        for name, values in (("settings", self._trial.params()), ("trial", self._trial.tags())):
+            table = "".join(f"| {key} | {value} |\n" for key, value in values.items())
+            self._writer.add_text(name, f"| | |\n|---|---|\n{table}")
+        return {"complete": None, "logged": {}}
+
+    def log(self, scalars: Sequence[Scalar]) -> None:
+        """Write numbers, and flush them to the file."""
+        for scalar in scalars:
+            self._writer.add_scalar(scalar.key, scalar.value, scalar.step, self._started + scalar.seconds)
+        self._writer.flush()
+
+    def complete(self, summary: Summary) -> None:
+        """Write the final numbers and the pictures of the test views."""
+        import numpy as np
+        from PIL import Image
+
+        self.log(summary.scalars)
+        for name, path in summary.pictures.items():
+            with Image.open(path) as image:
+                self._writer.add_image(name, np.asarray(image.convert("RGB")), summary.step, dataformats="HWC")
+        self._writer.add_text("status", "FINISHED", summary.step)
+        self._writer.flush()
+
+    def stop(self, status: str, reason: str | None) -> None:
+        """Write why the trial ended."""
+        self._writer.add_text("status", status if reason is None else f"{status}: {reason}")
+        self._writer.flush()
+
+
+# ---- Weights & Biases: ``tracking.uri`` is its server, else WANDB_BASE_URL and WANDB_MODE decide
+
+STEP = "iteration"  # our own axis: W&B's step must only grow, and the two files of curves are read one after the other
+
+
+class WandbSink:
+    """The W&B run of one trial; the project is the experiment, the group is scene and arm."""
+
+    state_file = "wandb.json"
+
+    def __init__(self, options: dict[str, Any], trial: TrackedTrial) -> None:
+        self._trial = trial
+        if options["uri"]:
+            os.environ["WANDB_BASE_URL"] = options["uri"]
+        self._run: Any = None
+
+    def open(self, state: dict[str, Any], results: str | None) -> dict[str, Any]:
+        """Open the run (see `gsbench.tracking.sinks.Sink`). A run with earlier results stays beside the new one."""
+        if state.get("complete") is not None:
+            if state["complete"] == results:
+                return state
+            state = {}
+        state = state or {"id": uuid.uuid4().hex[:8], "complete": None, "logged": {}}
+        import wandb
+
+        trial = self._trial
+        folder = trial.folder.runs / layout.WANDB
+        require_no_links(trial.folder.runs, folder)
+        folder.mkdir(exist_ok=True)
+        self._run = wandb.init(
+            project=trial.values["name"],
+            name=trial.label,
+            id=state["id"],
+            resume="allow",
+            group=f"{trial.values['scene']['name']} {trial.arm}",
+            config=trial.params(),
+            tags=[trial.values["scene"]["name"], trial.arm],
+            dir=str(folder),
+            settings=wandb.Settings(silent=True, console="off"),
+        )
+        self._run.define_metric("*", step_metric=STEP)
+        return state
+
+    def log(self, scalars: Sequence[Scalar]) -> None:
+        """Log numbers, together for each iteration."""
+        by_step: dict[int, dict[str, float]] = {}
+        for scalar in scalars:
+            by_step.setdefault(scalar.step, {})[scalar.key] = scalar.value
+        for step, values in by_step.items():
+            self._run.log({STEP: step, **values})
+
+    def complete(self, summary: Summary) -> None:
+        """Log the final numbers, pictures and files, and finish the run."""
+        import wandb
+
+        self.log(summary.scalars)
+        pictures = {name: wandb.Image(str(path)) for name, path in summary.pictures.items()}
+        if pictures:
+            self._run.log({STEP: summary.step, **pictures})
+        final = {scalar.key: scalar.value for scalar in summary.scalars if scalar.step == summary.step}
+        self._run.summary.update(final)
+        self._run.config.update(summary.tags, allow_val_change=True)
+        for _, path in summary.files:
+            self._run.save(str(path), base_path=str(self._trial.folder.path), policy="now")
+        self._run.finish(0)
+
+    def stop(self, status: str, reason: str | None) -> None:
+        """Finish the run as failed, with the reason or the status."""
+        self._run.summary["error" if reason else "status"] = reason or status
+        self._run.finish(1)
