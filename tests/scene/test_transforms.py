@@ -124,7 +124,7 @@ def test_what_was_applied_is_undone_for_cameras_and_points(tmp_path: Path) -> No
     ],
 )
 def test_intrinsics_of_the_file_or_of_each_frame(tmp_path: Path, said, model, params) -> None:
-    shared = read_transforms(write(tmp_path / "shared", **said)).images["images/3.png"].camera
+    shared = read_transforms(write(tmp_path / "shared", **said)).images["images/3.png"][0]
     folder = write(tmp_path / "own")
     document = json.loads((folder / "transforms.json").read_text())
     own = {key: document.pop(key) for key in SHARED} | said
@@ -132,10 +132,10 @@ def test_intrinsics_of_the_file_or_of_each_frame(tmp_path: Path, said, model, pa
     document["frames"][2]["fl_x"] = 60.0
     (folder / "transforms.json").write_text(json.dumps(document))
     frames = read_transforms(folder).images
-    for camera in (shared, frames["images/3.png"].camera):
+    for camera in (shared, frames["images/3.png"][0]):
         assert (camera.name, camera.width, camera.height) == (model, 40, 30)
         assert list(camera.params) == params
-    assert frames["images/2.png"].camera.params[0] == 60
+    assert frames["images/2.png"][0].params[0] == 60
 
 
 def test_blenders_angle_its_missing_extension_its_parts_and_its_alpha(tmp_path: Path) -> None:
@@ -156,7 +156,7 @@ def test_blenders_angle_its_missing_extension_its_parts_and_its_alpha(tmp_path: 
     capture = capture_of(tmp_path, tmp_path / "made", split="list")
     assert capture.test_names == tuple(f"test/r_{k}.png" for k in range(3))
     assert capture.train_names == tuple(f"train/r_{k}.png" for k in range(5))
-    camera = read_transforms(tmp_path).images["train/r_0.png"].camera
+    camera = read_transforms(tmp_path).images["train/r_0.png"][0]
     assert camera.params == pytest.approx((0.5 * 40 / math.tan(0.5 * angle),) * 2 + (20, 20))
     from gsbench.pipeline.steps.scene import masked_capture, masking_step
 
@@ -242,7 +242,7 @@ def test_a_line_of_pixels_is_a_picture(tmp_path: Path) -> None:
     folder = write(tmp_path / "in", w=1)
     for k in range(len(EYES)):
         Image.new("RGB", (1, 30)).save(folder / "images" / f"{k}.png")
-    assert {image.camera.width for image in read_transforms(folder).images.values()} == {1}
+    assert {camera.width for camera, *_ in read_transforms(folder).images.values()} == {1}
 
 
 def test_no_file_and_a_name_without_a_decision(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 import zlib  # noqa: F401  must be loaded before pycolmap, whose own zlib otherwise crashes Pillow's PNG code
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +12,8 @@ from numpy.typing import NDArray
 from gsbench.errors import InputError
 from gsbench.scene.colmap_files import check_model
 from gsbench.scene.images import check_size, image_size, match_names
-from gsbench.scene.types import Camera, CameraModel, Capture
+from gsbench.scene.types import Array, Camera, CameraModel, Capture, to_pinhole
 
-PINHOLE_MODELS = (pycolmap.CameraModelId.SIMPLE_PINHOLE, pycolmap.CameraModelId.PINHOLE)
 UNIT_TOLERANCE = 1e-9  # a quaternion whose length differs from 1 by no more is not normalised again
 MIN_TRACK = 2  # images that must see a 3D point, as in COLMAP
 
@@ -33,9 +33,6 @@ def read_model(folder: Path) -> pycolmap.Reconstruction:
     except (ValueError, IndexError, RuntimeError, TypeError, MemoryError) as error:
         reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
         raise InputError(f"{folder}: the COLMAP model cannot be read ({reason}): export it again") from error
-    for camera in model.cameras.values():
-        if not camera.verify_params() or not np.isfinite(camera.params).all() or camera.width < 1 or camera.height < 1:
-            raise InputError(f"{folder}: camera {camera.camera_id} of the COLMAP model is damaged: export it again")
     return model
 
 
@@ -65,7 +62,8 @@ def read_reference(capture: Capture) -> pycolmap.Reconstruction:
 
     Only images in ``capture.image_names`` that have a pose remain, under those names. Cameras and 2D points are
     rescaled to the sizes of the files, so a model of the full size serves ``images_4``. 3D points that fewer than two
-    of the images see are dropped, unless no point of the model has a track.
+    of the images see are dropped, unless no point of the model has a track. The ids of cameras, images and points are
+    kept; if the files of one camera have different sizes, each further size gets a new camera.
 
     Raises `InputError` if there is no model, or if the aspect ratios of an image and its camera differ by more than
     rounding.
@@ -74,21 +72,6 @@ def read_reference(capture: Capture) -> pycolmap.Reconstruction:
         raise InputError(f"scene {capture.name}: no COLMAP model came with these photos: use init=sfm init.poses=own")
     model = read_model(capture.model)
     names = match_names(registered_names(model), capture.image_names)
-    sizes = {file: image_size(capture.images / file) for file in names.values()}
-    return fit_model(model, names, sizes, capture.images)
-
-
-def fit_model(
-    model: pycolmap.Reconstruction,
-    names: Mapping[str, str],
-    sizes: Mapping[str, tuple[int, int]],
-    folder: Path,
-) -> pycolmap.Reconstruction:
-    """A new model of the images ``names`` (old -> new name), for files of ``sizes`` (new name -> (width, height) px).
-
-    The ids of cameras, images and points are kept. If the files of one camera have different sizes, each further size
-    gets a new camera. ``folder`` is only for error messages.
-    """
     fitted = pycolmap.Reconstruction()
     next_camera_id = max(model.cameras, default=0) + 1
     camera_ids: dict[tuple[int, tuple[int, int]], int] = {}
@@ -97,13 +80,15 @@ def fit_model(
         if not image.has_pose or image.name not in names:
             continue
         name, camera = names[image.name], model.cameras[image.camera_id]
-        size = sizes[name]
-        check_size(folder / name, size, (camera.width, camera.height))
+        size = image_size(capture.images / name)
+        check_size(capture.images / name, size, (camera.width, camera.height))
         key = (image.camera_id, size)
         if key not in camera_ids:
-            new_id, next_camera_id = _unused_id(image.camera_id, camera_ids.values(), next_camera_id)
-            camera_ids[key] = new_id
-            fitted.add_camera_with_trivial_rig(rescaled_camera(camera, *size, camera_id=new_id))
+            if image.camera_id in camera_ids.values():
+                camera_ids[key], next_camera_id = next_camera_id, next_camera_id + 1
+            else:
+                camera_ids[key] = image.camera_id
+            fitted.add_camera_with_trivial_rig(rescaled_camera(camera, *size, camera_id=camera_ids[key]))
         scale = np.array(size) / (camera.width, camera.height)
         points = np.array([point.xy for point in image.points2D], dtype=np.float64).reshape(-1, 2) * scale  # [K, 2]
         fitted.add_image_with_trivial_frame(
@@ -121,38 +106,30 @@ def rescaled_camera(camera: pycolmap.Camera, width: int, height: int, camera_id:
     SIMPLE_PINHOLE becomes PINHOLE, because rounded sides scale the focal length differently in x and y. Other models
     with one focal length scale it by the mean of both scales, as COLMAP does.
     """
-    if camera.model == pycolmap.CameraModelId.SIMPLE_PINHOLE:
-        focal, cx, cy = camera.params
-        camera = pycolmap.Camera(
-            model=pycolmap.CameraModelId.PINHOLE,
-            width=camera.width,
-            height=camera.height,
-            params=[focal, focal, cx, cy],
-        )
+    params = list(camera.params)
+    model = camera.model
+    if model == pycolmap.CameraModelId.SIMPLE_PINHOLE:
+        model, params = pycolmap.CameraModelId.PINHOLE, [params[0], *params]
     # Copied because a Camera object taken from a Reconstruction is a view into it.
-    copy = pycolmap.Camera(
-        camera_id=camera_id, model=camera.model, width=camera.width, height=camera.height, params=list(camera.params)
-    )
+    copy = pycolmap.Camera(camera_id=camera_id, model=model, width=camera.width, height=camera.height, params=params)
     copy.has_prior_focal_length = camera.has_prior_focal_length
     if (width, height) != (camera.width, camera.height):
         copy.rescale(width, height)
     return copy
 
 
+def plain_camera(camera: pycolmap.Camera) -> CameraModel:
+    """A COLMAP camera as plain values."""
+    return CameraModel(camera.model_name, camera.width, camera.height, tuple(map(float, camera.params)))
+
+
 def pinhole_camera(camera: pycolmap.Camera, cam_from_world: pycolmap.Rigid3d) -> Camera:
     """Convert a COLMAP camera and pose to a `Camera`; raises `InputError` if the camera is distorted."""
-    if camera.model not in PINHOLE_MODELS:
-        raise InputError(f"a camera of the model {camera.model_name} is distorted: undistort the images first")
-    return Camera(
-        width=camera.width,
-        height=camera.height,
-        fx=camera.focal_length_x,
-        fy=camera.focal_length_y,
-        cx=camera.principal_point_x,
-        cy=camera.principal_point_y,
-        rotation=cam_from_world.rotation.matrix(),
-        translation=np.array(cam_from_world.translation),
-    )
+    plain = plain_camera(camera)
+    if plain.distorted:
+        raise InputError(f"a camera of the model {plain.name} is distorted: undistort the images first")
+    rotation, translation = cam_from_world.rotation.matrix(), np.array(cam_from_world.translation)
+    return replace(to_pinhole(plain), rotation=rotation, translation=translation)
 
 
 def reference_cameras(model: pycolmap.Reconstruction, names: Iterable[str]) -> list[Camera]:
@@ -181,7 +158,7 @@ def write_model(
     folder: Path,
     cameras: Mapping[str, Camera],
     text: bool = False,
-    cloud: tuple[NDArray[np.float64], NDArray[np.uint8]] | None = None,
+    cloud: tuple[Array, NDArray[np.uint8]] | None = None,
 ) -> None:
     """Write PINHOLE cameras with their poses as a COLMAP model; images with equal intrinsics share one camera.
 
@@ -197,9 +174,9 @@ def write_model(
 
 def write_frames(
     folder: Path,
-    frames: Mapping[str, tuple[CameraModel, NDArray[np.float64], NDArray[np.float64]]],
+    frames: Mapping[str, tuple[CameraModel, Array, Array]],
     text: bool = False,
-    cloud: tuple[NDArray[np.float64], NDArray[np.uint8]] | None = None,
+    cloud: tuple[Array, NDArray[np.uint8]] | None = None,
 ) -> None:
     """Write cameras of any camera model with their world-to-camera rotations [3, 3] and translations [3].
 
@@ -234,7 +211,3 @@ def _copy_points(model: pycolmap.Reconstruction, target: pycolmap.Reconstruction
         target.add_point3D_with_id(point_id, copy)
         for element in elements:
             target.images[element.image_id].set_point3D_for_point2D(element.point2D_idx, point_id)
-
-
-def _unused_id(preferred: int, used: Iterable[int], next_id: int) -> tuple[int, int]:
-    return (preferred, next_id) if preferred not in set(used) else (next_id, next_id + 1)

@@ -50,15 +50,14 @@ def model_files(folder: Path) -> list[Path]:
 
 def check_model(folder: Path) -> None:
     """Raise `InputError`, one line, if a file of the model is truncated, has extra bytes, or has impossible values."""
-    files = {file.stem: file for file in model_files(folder)}
-    walks = _BINARY_WALKS if files["cameras"].suffix == ".bin" else _TEXT_WALKS
     checks = ModelChecks()
-    for stem, walk in walks.items():
-        if stem not in files:
-            continue
-        file = files[stem]
+    for file in model_files(folder):  # in this order: images refer to cameras, points to images
+        binary_record, text_record = _RECORDS[file.stem]
         try:
-            walk(file, checks)
+            if file.suffix == ".bin":
+                _walk_binary(file, binary_record, checks)
+            else:
+                _walk_text(file, text_record, checks)
         except (struct.error, ValueError, IndexError, OverflowError) as error:
             if isinstance(error, InputError):  # a ValueError that already says what is wrong
                 raise InputError(f"{file}: {error}: copy or export it again") from error
@@ -67,146 +66,122 @@ def check_model(folder: Path) -> None:
             raise InputError(f"{file}: cannot be read ({error.strerror})") from error
 
 
-def _walk_binary(walk: Callable[[bytes, int, ModelChecks], int]) -> Callable[[Path, ModelChecks], None]:
-    def walk_file(file: Path, checks: ModelChecks) -> None:
-        data = file.read_bytes()
-        (count,) = _COUNT.unpack_from(data)
-        end = walk(data, count, checks)
-        if end != len(data):
-            raise InputError(f"{abs(len(data) - end)} bytes too {'many' if end < len(data) else 'few'}")
-
-    return walk_file
-
-
-def _binary_cameras(data: bytes, count: int, checks: ModelChecks) -> int:
+def _walk_binary(file: Path, record: Callable[[bytes, int, ModelChecks], int], checks: ModelChecks) -> None:
+    """Check a file of a count and records; ``record`` checks the one at an offset and returns the offset after it."""
+    data = file.read_bytes()
+    (count,) = _COUNT.unpack_from(data)
     offset = _COUNT.size
     for _ in range(count):
-        camera_id, model, width, height = _CAMERA.unpack_from(data, offset)
-        if model not in _MODELS:
-            raise InputError(f"camera {camera_id} is of an unknown model ({model})")
-        name, length = _MODELS[model]
-        params = struct.unpack_from(f"<{length}d", data, offset + _CAMERA.size)
-        checks.camera(camera_id, name, width, height, params)
-        offset += _CAMERA.size + 8 * length
-    return offset
-
-
-def _binary_images(data: bytes, count: int, checks: ModelChecks) -> int:
-    offset = _COUNT.size
-    for _ in range(count):
-        image_id, *pose, camera_id = _IMAGE.unpack_from(data, offset)
-        end = data.index(b"\0", offset + _IMAGE.size)
-        name = data[offset + _IMAGE.size : end].decode()
-        (points,) = _COUNT.unpack_from(data, end + 1)
-        checks.image(image_id, pose, camera_id, name, points)
-        offset = end + 1 + _COUNT.size + points * _POINT2D_BYTES
+        offset = record(data, offset, checks)
         if offset > len(data):
-            raise InputError(f"{offset - len(data)} bytes too few")
+            break
+    if offset != len(data):
+        raise InputError(f"{abs(len(data) - offset)} bytes too {'many' if offset < len(data) else 'few'}")
+
+
+def _binary_camera(data: bytes, offset: int, checks: ModelChecks) -> int:
+    camera_id, model, width, height = _CAMERA.unpack_from(data, offset)
+    if model not in _MODELS:
+        raise InputError(f"camera {camera_id} is of an unknown model ({model})")
+    name, length = _MODELS[model]
+    params = struct.unpack_from(f"<{length}d", data, offset + _CAMERA.size)
+    checks.camera(camera_id, name, width, height, params)
+    return offset + _CAMERA.size + 8 * length
+
+
+def _binary_image(data: bytes, offset: int, checks: ModelChecks) -> int:
+    image_id, *pose, camera_id = _IMAGE.unpack_from(data, offset)
+    end = data.index(b"\0", offset + _IMAGE.size)
+    name = data[offset + _IMAGE.size : end].decode()
+    (points,) = _COUNT.unpack_from(data, end + 1)
+    checks.image(image_id, pose, camera_id, name, points)
+    return end + 1 + _COUNT.size + points * _POINT2D_BYTES
+
+
+def _binary_point(data: bytes, offset: int, checks: ModelChecks) -> int:
+    point_id, x, y, z, *_ = _POINT3D.unpack_from(data, offset)
+    (length,) = _COUNT.unpack_from(data, offset + _POINT3D.size)
+    start = offset + _POINT3D.size + _COUNT.size
+    end = start + length * _TRACK_ELEMENT.size
+    if end <= len(data):
+        checks.point(point_id, (x, y, z), _TRACK_ELEMENT.iter_unpack(data[start:end]))
+    return end
+
+
+def _binary_frame(data: bytes, offset: int, checks: ModelChecks) -> int:
+    frame_id, _, *pose, images = _FRAME.unpack_from(data, offset)
+    checks.pose(f"frame {frame_id}", pose)
+    return offset + _FRAME.size + images * _FRAME_DATA_BYTES
+
+
+def _binary_rig(data: bytes, offset: int, checks: ModelChecks) -> int:
+    rig_id, sensors = _RIG.unpack_from(data, offset)
+    offset += _RIG.size + (_SENSOR.size if sensors else 0)  # the first sensor is the reference, without a pose
+    for _ in range(1, sensors):
+        (has_pose,) = struct.unpack_from("<B", data, offset + _SENSOR.size)
+        offset += _SENSOR.size + 1
+        if has_pose:
+            checks.pose(f"a sensor of rig {rig_id}", _POSE.unpack_from(data, offset))
+            offset += _POSE.size
     return offset
 
 
-def _binary_points(data: bytes, count: int, checks: ModelChecks) -> int:
-    offset = _COUNT.size
-    for _ in range(count):
-        point_id, x, y, z, *_ = _POINT3D.unpack_from(data, offset)
-        (length,) = _COUNT.unpack_from(data, offset + _POINT3D.size)
-        start = offset + _POINT3D.size + _COUNT.size
-        offset = start + length * _TRACK_ELEMENT.size
-        if offset > len(data):
-            raise InputError(f"{offset - len(data)} bytes too few")
-        checks.point(point_id, (x, y, z), _TRACK_ELEMENT.iter_unpack(data[start:offset]))
-    return offset
+Lines = Iterator[list[str]]  # the words of each line
 
 
-def _binary_frames(data: bytes, count: int, checks: ModelChecks) -> int:
-    offset = _COUNT.size
-    for _ in range(count):
-        frame_id, _, *pose, images = _FRAME.unpack_from(data, offset)
-        checks.pose(f"frame {frame_id}", pose)
-        offset += _FRAME.size + images * _FRAME_DATA_BYTES
-    return offset
-
-
-def _binary_rigs(data: bytes, count: int, checks: ModelChecks) -> int:
-    offset = _COUNT.size
-    for _ in range(count):
-        rig_id, sensors = _RIG.unpack_from(data, offset)
-        offset += _RIG.size + (_SENSOR.size if sensors else 0)  # the first sensor is the reference, without a pose
-        for _ in range(1, sensors):
-            (has_pose,) = struct.unpack_from("<B", data, offset + _SENSOR.size)
-            offset += _SENSOR.size + 1
-            if has_pose:
-                checks.pose(f"a sensor of rig {rig_id}", _POSE.unpack_from(data, offset))
-                offset += _POSE.size
-    return offset
-
-
-def _lines(file: Path) -> Iterator[list[str]]:
-    """Split every line into words, without comment lines. An empty line gives an empty list."""
-    for line in file.read_text(encoding="utf-8").split("\n"):
-        if not line.lstrip().startswith("#"):
-            yield line.split()
+def _walk_text(file: Path, record: Callable[[list[str], Lines, ModelChecks], None], checks: ModelChecks) -> None:
+    """Check a file line by line, without comments; ``record`` gets the words of a line and the lines after it."""
+    lines = (line.split() for line in file.read_text(encoding="utf-8").split("\n") if not line.lstrip().startswith("#"))
+    for words in lines:
+        if words:
+            record(words, lines, checks)
 
 
 def _numbers(words: Sequence[str]) -> list[float]:
     return [float(word) for word in words]
 
 
-def _text_cameras(file: Path, checks: ModelChecks) -> None:
-    lengths = dict(_MODELS.values())
-    for words in filter(None, _lines(file)):
-        if words[1] not in lengths or len(words) != 4 + lengths[words[1]]:
-            raise InputError(f"camera {words[0]} is of an unknown model or lacks parameters")
-        checks.camera(int(words[0]), words[1], int(words[2]), int(words[3]), _numbers(words[4:]))
+def _text_camera(words: list[str], _: Lines, checks: ModelChecks) -> None:
+    if dict(_MODELS.values()).get(words[1]) != len(words) - 4:
+        raise InputError(f"camera {words[0]} is of an unknown model or lacks parameters")
+    checks.camera(int(words[0]), words[1], int(words[2]), int(words[3]), _numbers(words[4:]))
 
 
-def _text_images(file: Path, checks: ModelChecks) -> None:
-    lines = _lines(file)
-    for words in lines:
-        if not words:
-            continue
-        points = next(lines, [])  # the line after an image holds its 2D points, and may be empty
-        if len(words) < 10 or len(points) % 3 or not all(map(math.isfinite, _numbers(points))):
-            raise InputError(f"image {words[0]} lacks numbers")
-        checks.image(int(words[0]), _numbers(words[1:8]), int(words[8]), words[9], len(points) // 3)
+def _text_image(words: list[str], lines: Lines, checks: ModelChecks) -> None:
+    points = next(lines, [])  # the line after an image holds its 2D points, and may be empty
+    if len(words) < 10 or len(points) % 3 or not all(map(math.isfinite, _numbers(points))):
+        raise InputError(f"image {words[0]} lacks numbers")
+    checks.image(int(words[0]), _numbers(words[1:8]), int(words[8]), words[9], len(points) // 3)
 
 
-def _text_points(file: Path, checks: ModelChecks) -> None:
-    for words in filter(None, _lines(file)):
-        track = [int(word) for word in words[8:]]
-        if len(words) < 8 or len(track) % 2 or not all(0 <= int(word) <= 255 for word in words[4:7]):
-            raise InputError(f"point {words[0]} lacks numbers or has no colour")
-        x, y, z, *_ = _numbers([*words[1:4], words[7]])
-        checks.point(int(words[0]), (x, y, z), zip(track[::2], track[1::2], strict=True))
+def _text_point(words: list[str], _: Lines, checks: ModelChecks) -> None:
+    track = [int(word) for word in words[8:]]
+    if len(words) < 8 or len(track) % 2 or not all(0 <= int(word) <= 255 for word in words[4:7]):
+        raise InputError(f"point {words[0]} lacks numbers or has no colour")
+    x, y, z, _error = _numbers([*words[1:4], words[7]])
+    checks.point(int(words[0]), (x, y, z), zip(track[::2], track[1::2], strict=True))
 
 
-def _text_rigs(file: Path, checks: ModelChecks) -> None:
-    for words in filter(None, _lines(file)):
-        sensors, at = int(words[1]), 4
-        for _ in range(1, sensors):
-            has_pose = int(words[at + 2])
-            if has_pose:
-                checks.pose(f"a sensor of rig {words[0]}", _numbers(words[at + 3 : at + 10]))
-            at += 10 if has_pose else 3
+def _text_rig(words: list[str], _: Lines, checks: ModelChecks) -> None:
+    at = 4
+    for _sensor in range(1, int(words[1])):
+        has_pose = int(words[at + 2])
+        if has_pose:
+            checks.pose(f"a sensor of rig {words[0]}", _numbers(words[at + 3 : at + 10]))
+        at += 10 if has_pose else 3
 
 
-def _text_frames(file: Path, checks: ModelChecks) -> None:
-    for words in filter(None, _lines(file)):
-        checks.pose(f"frame {words[0]}", _numbers(words[2:9]))
+def _text_frame(words: list[str], _: Lines, checks: ModelChecks) -> None:
+    checks.pose(f"frame {words[0]}", _numbers(words[2:9]))
 
 
-# The order matters: images refer to cameras, points to images.
-_BINARY_WALKS = {
-    "cameras": _walk_binary(_binary_cameras),
-    "images": _walk_binary(_binary_images),
-    "points3D": _walk_binary(_binary_points),
-    "rigs": _walk_binary(_binary_rigs),
-    "frames": _walk_binary(_binary_frames),
+_RECORDS = {
+    "cameras": (_binary_camera, _text_camera),
+    "images": (_binary_image, _text_image),
+    "points3D": (_binary_point, _text_point),
+    "rigs": (_binary_rig, _text_rig),
+    "frames": (_binary_frame, _text_frame),
 }
-_TEXT_WALKS = {
-    "cameras": _text_cameras, "images": _text_images, "points3D": _text_points, "rigs": _text_rigs,
-    "frames": _text_frames,
-}  # fmt: skip
 
 
 MAX_LENGTH = 1e6  # of a quaternion, and 1 / MAX_LENGTH is the minimum: COLMAP normalises quaternions of any length

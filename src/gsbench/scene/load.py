@@ -171,7 +171,7 @@ def _publish(work: Path, folder: Path) -> None:
 
 def _model_cameras(capture: Capture, model_dir: Path) -> dict[str, tuple[CameraModel, list[list[float]]]]:
     """The COLMAP camera at the file's size and the 3x4 pose of every image of the capture that has a pose."""
-    from gsbench.scene.colmap import read_model, rescaled_camera  # not needed if the views are cached
+    from gsbench.scene.colmap import plain_camera, read_model, rescaled_camera  # not needed if the views are cached
 
     model = read_model(model_dir)
     wanted = set(capture.image_names)
@@ -182,8 +182,7 @@ def _model_cameras(capture: Capture, model_dir: Path) -> dict[str, tuple[CameraM
         camera = model.cameras[image.camera_id]
         size = image_size(capture.images / image.name)
         check_size(capture.images / image.name, size, (camera.width, camera.height))
-        camera = rescaled_camera(camera, *size, camera_id=camera.camera_id)
-        plain = CameraModel(camera.model_name, *size, tuple(float(value) for value in camera.params))
+        plain = plain_camera(rescaled_camera(camera, *size, camera_id=camera.camera_id))
         cameras[image.name] = (plain, image.cam_from_world().matrix().tolist())
     if len(cameras) < MIN_IMAGES:
         raise InputError(
@@ -311,6 +310,8 @@ def undistort(image: NDArray[np.uint8], camera: CameraModel) -> tuple[NDArray[np
     """
     import pycolmap  # slow to load, and not needed for pinhole images
 
+    from gsbench.scene.colmap import plain_camera
+
     source = pycolmap.Camera(
         camera_id=1, model=camera.name, width=camera.width, height=camera.height, params=list(camera.params)
     )
@@ -325,5 +326,4 @@ def undistort(image: NDArray[np.uint8], camera: CameraModel) -> tuple[NDArray[np
         flat, pinhole = pycolmap.undistort_image(pycolmap.UndistortCameraOptions(), bitmap, source)
     except (ValueError, RuntimeError) as error:
         raise InputError(refusal) from error
-    params = tuple(float(value) for value in pinhole.params)
-    return np.array(flat.to_array()), to_pinhole(CameraModel("PINHOLE", pinhole.width, pinhole.height, params))
+    return np.array(flat.to_array()), to_pinhole(plain_camera(pinhole))

@@ -31,6 +31,7 @@ Matrix = Annotated[list[Row], Len(3, 4)]  # a fourth row is ignored
 ONE_FILE = "transforms.json"
 SPLIT_FILES = {"train": "transforms_train.json", "test": "transforms_test.json", "val": "transforms_val.json"}
 OPENGL = np.diag([1.0, -1.0, -1.0])  # from OpenCV's camera axes to OpenGL's, and back
+PosedCamera = tuple[CameraModel, Array, Array]  # with the world-to-camera rotation [3, 3] and translation [3]
 ROTATION_TOLERANCE = 1e-3  # largest error of an entry, for matrices written with few digits
 PERSPECTIVE, FISHEYE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"), "OPENCV_FISHEYE"
 
@@ -75,19 +76,9 @@ class TransformsRecord(Intrinsics):
     ply_file_path: Text | None = None
 
 
-@dataclass(frozen=True, eq=False)
-class PosedImage:
-    """An image's name below the folder, camera, and world-to-camera rotation [3, 3] and translation [3]."""
-
-    name: str
-    camera: CameraModel
-    rotation: Array
-    translation: Array
-
-
 @dataclass(frozen=True)
 class Transforms:
-    """Converted content of a folder's files: images by name, their split, and their points.
+    """Converted content of a folder's files: cameras by image name, their split, and their points.
 
     ``split`` are the names for training and for testing, or None if one file holds all images. ``points`` is a PLY
     file; ``applied.undo`` converts its coordinates to those of the cameras. ``has_mask_paths`` says that at least one
@@ -95,7 +86,7 @@ class Transforms:
     """
 
     files: tuple[Path, ...]
-    images: dict[str, PosedImage]
+    images: dict[str, PosedCamera]
     split: tuple[list[str], list[str]] | None
     points: Path | None
     applied: AppliedTransform
@@ -143,7 +134,7 @@ def read_transforms(folder: Path) -> Transforms:
     """Read the cameras in ``folder``; raises InputError, one line, for a file that cannot be understood."""
     files = find_files(folder)
     records = {split: read_typed(resolved(path), TransformsRecord) for split, path in files.items()}
-    images: dict[str, PosedImage] = {}
+    images: dict[str, PosedCamera] = {}
     names: dict[str, list[str]] = {split: [] for split in files}
     points, applied = None, AppliedTransform()
     for split, record in records.items():
@@ -156,7 +147,7 @@ def read_transforms(folder: Path) -> Transforms:
                 continue
             if name in images:
                 raise InputError(f"{path}: {name} is there twice: name each image once")
-            images[name] = PosedImage(name, _camera(folder / name, path, record, frame), *_pose(path, frame, applied))
+            images[name] = _camera(folder / name, path, record, frame), *_pose(path, frame, applied)
             names[split].append(name)
         if missing:
             log.warning(

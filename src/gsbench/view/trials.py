@@ -30,9 +30,9 @@ from gsbench.raster.base import Rasterizer, RenderOutput
 from gsbench.runs.keys import INIT
 from gsbench.runs.layout import GROUND_TRUTH, LINEAGE, POINT_CLOUD, RESULTS, STORE
 from gsbench.runs.store import Store
-from gsbench.scene.colmap import PINHOLE_MODELS, model_points, pinhole_camera, read_model
+from gsbench.scene.colmap import model_points, pinhole_camera, read_model
 from gsbench.scene.images import png_name, read_image
-from gsbench.scene.types import Camera, View
+from gsbench.scene.types import PINHOLE_NAMES, Camera, View
 from gsbench.view import ADDRESS
 
 DIMMED = 0.35  # brightness of the render behind Gaussians coloured by their causes
@@ -156,7 +156,7 @@ def read_test_views(trial: TrialResult, model_dir: Path) -> tuple[View, ...]:
         picture = read_image(path)  # [H, W, 3]
         height, width = picture.shape[:2]
         intrinsics = model.cameras[image.camera_id]
-        if intrinsics.model not in PINHOLE_MODELS:
+        if intrinsics.model_name not in PINHOLE_NAMES:
             intrinsics = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), intrinsics)
         camera: Camera = pinhole_camera(intrinsics, image.cam_from_world()).resized(width, height)
         if centred:

@@ -102,7 +102,7 @@ def _courtyard_step(options: SceneConfig) -> Step:
 
 def _transforms_step(transforms: Transforms) -> Step:
     """The step that writes the cameras and points of ``transforms.json`` as a COLMAP model."""
-    sizes = {name: [image.camera.width, image.camera.height] for name, image in transforms.images.items()}
+    sizes = {name: [camera.width, camera.height] for name, (camera, *_) in transforms.images.items()}
     inputs = {"transforms": [file_sha256(file) for file in transforms.sources], "sizes": sizes}
 
     def build(target: Path) -> None:
@@ -111,8 +111,7 @@ def _transforms_step(transforms: Transforms) -> Step:
             points, colors = read_points(transforms.points)
             grey = np.full(points.shape, GREY, dtype=np.uint8)
             cloud = transforms.applied.undo(points), grey if colors is None else colors
-        frames = {name: (image.camera, image.rotation, image.translation) for name, image in transforms.images.items()}
-        write_frames(target / SPARSE_FOLDERS[0], frames, cloud=cloud)
+        write_frames(target / SPARSE_FOLDERS[0], transforms.images, cloud=cloud)
 
     return step_of(CAPTURE, inputs, build)
 
