@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from gsbench.runs.code import PACKAGE
+from gsbench.runs.keys import PACKAGE
 from gsbench.system.install import conf_dir
 from tests.end_to_end.conftest import SMALL, Run
 

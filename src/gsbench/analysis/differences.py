@@ -17,7 +17,7 @@ from typing import Any
 import yaml
 
 from gsbench.analysis.results import Arm, TrialResult, canonical, group_by, seeds_words
-from gsbench.runs.code import SHOWN
+from gsbench.runs.keys import SHOWN
 from gsbench.system.install import conf_dir
 from gsbench.words import counted, listed
 

@@ -192,7 +192,7 @@ class TrialResult:
 
     @cached_property
     def rooms(self) -> dict[str, str]:
-        """The rooms (parts of gsbench's code) that made the trial, with their states then (`gsbench.runs.code`)."""
+        """The rooms (parts of gsbench's code) that made the trial, with their states then (`gsbench.runs.keys`)."""
         return {f"gsbench's {room}": state for room, state in self.record.code.rooms.items()}
 
     @property

@@ -25,7 +25,7 @@ from gsbench.analysis.pairing import BASELINE, are_equal, choose_pairs, controls
 from gsbench.analysis.quantities import Quantity, choose_quantities
 from gsbench.analysis.results import Arm, Experiment, TrialResult, group_by, seeds_words
 from gsbench.analysis.table_formats import Column, Row, Table, TableEntry
-from gsbench.runs.code import SHOWN
+from gsbench.runs.keys import SHOWN
 from gsbench.runs.layout import TUNING
 from gsbench.runs.trial_record import FROM_MODEL, FROM_RENDERS
 from gsbench.words import counted, some_of

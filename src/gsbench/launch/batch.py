@@ -16,8 +16,7 @@ from gsbench.errors import InputError
 from gsbench.files import FORBIDDEN, checked_runs_folder, make_runs_folder, storage_errors
 from gsbench.launch.jobs import Outcome, outcome_of_results, run_local, run_serial, run_slurm
 from gsbench.launch.record import add_to_plan, declare, declared_metrics
-from gsbench.runs.code import OWN
-from gsbench.runs.keys import STAGES
+from gsbench.runs.keys import OWN, STAGES
 from gsbench.runs.layout import STORE
 from gsbench.runs.store import Store
 from gsbench.system.install import install_command

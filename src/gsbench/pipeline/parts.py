@@ -33,9 +33,8 @@ from gsbench.external.settings import External
 from gsbench.init.base import Initializer
 from gsbench.raster import EXECUTORS, Rasterizer, create_rasterizer
 from gsbench.raster.executors import AUTO, offers, resolve
-from gsbench.runs.code import OWN, module_digest, unnamed_modules, user_modules
 from gsbench.runs.declaration import metric_and_question
-from gsbench.runs.keys import UserCode
+from gsbench.runs.keys import OWN, UserCode, module_digest, unnamed_modules, user_modules
 from gsbench.scene.options import SceneConfig
 from gsbench.settings import check_values, option_fields, unknown_setting
 from gsbench.system.resources import available_threads

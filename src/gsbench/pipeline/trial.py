@@ -34,9 +34,20 @@ from gsbench.pipeline.steps.scene import (
 )
 from gsbench.pipeline.steps.train import external_step, train_step
 from gsbench.runs import layout
-from gsbench.runs.code import user_modules
 from gsbench.runs.declaration import read_declarations
-from gsbench.runs.keys import EVALUATE, GROUND_TRUTH, INIT, STAGES, TRAIN, Stage, Step, config_hash, flatten, sha256_of
+from gsbench.runs.keys import (
+    EVALUATE,
+    GROUND_TRUTH,
+    INIT,
+    STAGES,
+    TRAIN,
+    Stage,
+    Step,
+    config_hash,
+    flatten,
+    sha256_of,
+    user_modules,
+)
 from gsbench.runs.layout import BUILDING, CONFIG, EVENTS, FAILED, LOG
 from gsbench.runs.store import Store, StoredResult, read_manifest
 from gsbench.runs.trial_folder import TrialFolder

@@ -32,8 +32,7 @@ from gsbench.pipeline.parts import Parts, build_metrics, make_evaluator
 from gsbench.pipeline.steps.evaluate import summary_of, write_per_view
 from gsbench.pipeline.trial import TrialSteps, versions
 from gsbench.runs import keys
-from gsbench.runs.code import ROOMS, states_of
-from gsbench.runs.keys import EVALUATE, sha256_of
+from gsbench.runs.keys import EVALUATE, ROOMS, sha256_of, states_of
 from gsbench.runs.layout import CONFIG, GROUND_TRUTH, IN_RUNS, MASKS, PER_VIEW, RENDERS, RESULTS, SEED, STORE
 from gsbench.runs.store import Store
 from gsbench.runs.trial_folder import TrialFolder

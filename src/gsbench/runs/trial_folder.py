@@ -31,8 +31,7 @@ from gsbench.parsing import (
     read_yaml,
 )
 from gsbench.runs import layout
-from gsbench.runs.code import changed_rooms
-from gsbench.runs.keys import STAGES, config_hash, sha256_of
+from gsbench.runs.keys import STAGES, changed_rooms, config_hash, sha256_of
 from gsbench.runs.store import read_manifest
 from gsbench.runs.trial_record import (
     Building,

@@ -57,7 +57,7 @@ class Budget(Record):
 class Code(Record):
     """The versions of the code: sha256 of a user's modules (``sources``), versions of gsbench's stages.
 
-    ``rooms`` has the states of the rooms that made the trial (`gsbench.runs.code`). ``commit`` is that of the checkout
+    ``rooms`` has the states of the rooms that made the trial (`gsbench.runs.keys`). ``commit`` is that of the checkout
     that trained; ``edited`` says whether files that git tracks had changed.
     """
 

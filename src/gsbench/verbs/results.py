@@ -17,7 +17,7 @@ from gsbench.analysis.table_formats import FORMATS
 from gsbench.analysis.tables import DEFAULT_ROWS, build_table, compared_pairs, format_cell
 from gsbench.errors import InputError
 from gsbench.files import writable_output, write_text
-from gsbench.runs.code import AS_RELEASED
+from gsbench.runs.keys import AS_RELEASED
 from gsbench.verbs.arguments import ArgumentParser, add_where, names, path
 from gsbench.words import some_of
 

@@ -16,8 +16,8 @@ from gsbench.config.trust import PERMISSIONS
 from gsbench.errors import GsbenchError, InputError
 from gsbench.launch.record import PlannedTrial, forget, read_plan, remove
 from gsbench.launch.states import TrialState, describe_plan, states_of_experiment
-from gsbench.runs.code import module_digest
 from gsbench.runs.experiments import experiment_home, list_experiments, trial_folders
+from gsbench.runs.keys import module_digest
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import FROM_RENDERS
 from gsbench.system.own_modules import allow_modules

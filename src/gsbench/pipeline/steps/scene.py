@@ -16,8 +16,20 @@ from gsbench.files import file_sha256
 from gsbench.init.base import MODEL_FOLDER, Initializer
 from gsbench.init.placed import GREY, read_points
 from gsbench.logs import Progress, progress
-from gsbench.runs.code import VIEWS_ROOMS, edited, states_of
-from gsbench.runs.keys import CAPTURE, GROUND_TRUTH, INIT, NO_USER_CODE, Step, UserCode, options_of, sha256_of, step_of
+from gsbench.runs.keys import (
+    CAPTURE,
+    GROUND_TRUTH,
+    INIT,
+    NO_USER_CODE,
+    VIEWS_ROOMS,
+    Step,
+    UserCode,
+    edited,
+    options_of,
+    sha256_of,
+    states_of,
+    step_of,
+)
 from gsbench.runs.layout import MASKS, VIEWS
 from gsbench.runs.store import Store
 from gsbench.scene.colmap import write_frames

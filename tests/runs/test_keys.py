@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from gsbench.runs import code
-from gsbench.runs.code import (
+from gsbench.runs import keys
+from gsbench.runs.keys import (
     AS_RELEASED,
     PACKAGE,
     ROOMS,
@@ -54,7 +54,7 @@ BESIDE: dict[str, tuple[str, ...]] = {
 def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """A copy of gsbench that is not the one that runs, without files of a release, read as by a new process."""
     copy = shutil.copytree(PACKAGE, tmp_path / "gsbench", ignore=shutil.ignore_patterns("__pycache__", "*.json"))
-    monkeypatch.setattr(code, "PACKAGE", copy)
+    monkeypatch.setattr(keys, "PACKAGE", copy)
     again()
     yield copy
     again()
@@ -62,7 +62,7 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 def again() -> None:
     """As in another process."""
-    for cached in (code._released, code._state, code._first_contents):
+    for cached in (keys._released, keys._state, keys._first_contents):
         cached.cache_clear()
 
 
@@ -125,7 +125,7 @@ def test_an_edit_is_seen_by_the_next_process_and_a_comment_is_not(package: Path)
     assert changed_rooms(before) == [], "this process has loaded what it was"
     again()
     assert changed_rooms(before) == ["train"]
-    assert states_of(ROOMS["scene"]) == {room: before.get(room) or code._state(room) for room in ROOMS["scene"]}
+    assert states_of(ROOMS["scene"]) == {room: before.get(room) or keys._state(room) for room in ROOMS["scene"]}
     loss.unlink()
     again()
     assert changed_rooms(before) == ["train"]
@@ -134,10 +134,10 @@ def test_an_edit_is_seen_by_the_next_process_and_a_comment_is_not(package: Path)
 
 def test_where_all_is_as_released_nothing_is_in_the_key(package: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert edited(states_of(ROOMS["train"])) == states_of(ROOMS["train"])  # before the first release
-    code.main()
+    keys.main()
     again()
     with monkeypatch.context() as patch:
-        patch.setattr(code, "syntax_of", lambda source: pytest.fail("a released room is parsed"))
+        patch.setattr(keys, "syntax_of", lambda source: pytest.fail("a released room is parsed"))
         released = states_of(ROOMS["train"])
     assert set(released.values()) == {AS_RELEASED}
     assert edited(released) == {}
@@ -146,7 +146,7 @@ def test_where_all_is_as_released_nothing_is_in_the_key(package: Path, monkeypat
     (package / "eval" / "ssim.py").write_text("C1 = 2\n")
     again()
     assert list(edited(states_of(ROOMS["train"]))) == changed_rooms(released) == ["eval/ssim.py"]
-    code.main()  # of the next release, where the version of the stage is bumped by hand, or the numbers are the same
+    keys.main()  # of the next release, where the version of the stage is bumped by hand, or the numbers are the same
     again()
     assert changed_rooms(released) == []
 
@@ -250,6 +250,6 @@ def test_what_was_imported_and_is_not_named_is_told(home: Path) -> None:
 def test_a_module_whose_file_is_gone_has_no_digest(tmp_path: Path) -> None:
     spec = importlib.util.spec_from_file_location("passing", tmp_path / "passing.py")
     assert spec is not None
-    assert code._digest_on_disk(spec) is None
+    assert keys._digest_on_disk(spec) is None
     (tmp_path / "passing.py").write_text(SOURCE)
-    assert code._digest_on_disk(spec) == hashlib.sha256(SOURCE.encode()).hexdigest()
+    assert keys._digest_on_disk(spec) == hashlib.sha256(SOURCE.encode()).hexdigest()
