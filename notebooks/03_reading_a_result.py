@@ -33,7 +33,7 @@ from gsbench.analysis.statistics import seeds_needed
 from gsbench.analysis.table_formats import to_markdown
 from gsbench.analysis.tables import build_table
 from gsbench.cli import run
-from gsbench.runs.declaration import Arm, Question, declared_now
+from gsbench.runs.experiments import Arm, Question, declared_now
 
 os.environ["GSBENCH_RUNS"] = tempfile.mkdtemp(prefix="gsbench-")
 runs = Path(os.environ["GSBENCH_RUNS"])

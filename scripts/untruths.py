@@ -26,7 +26,7 @@ from gsbench.analysis.judgement import Verdict
 from gsbench.analysis.pairing import Pairs, ScenePairs
 from gsbench.analysis.quantities import asked_quantity
 from gsbench.analysis.statistics import answer_family
-from gsbench.runs.declaration import Question
+from gsbench.runs.experiments import Question
 
 CLAIMS, RATE = 4, 0.05
 LOOKS = (2, 3, 4)

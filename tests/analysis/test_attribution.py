@@ -28,7 +28,7 @@ from gsbench.analysis.pairing import choose_pairs, controls_of
 from gsbench.analysis.report.build import build_report
 from gsbench.analysis.results import TrialResult, load_experiment
 from gsbench.analysis.tables import build_table
-from gsbench.runs.declaration import Arm
+from gsbench.runs.experiments import Arm
 from gsbench.runs.keys import config_hash
 from tests.analysis.synthetic import write_arms
 from tests.conftest import ROOT

@@ -19,7 +19,7 @@ from gsbench.analysis.results import Experiment, load_experiment
 from gsbench.analysis.statistics import answer_family
 from gsbench.analysis.tables import build_table
 from gsbench.analysis.verdicts import PairVerdicts, families, in_words, judge_pairs
-from gsbench.runs.declaration import (
+from gsbench.runs.experiments import (
     STAMP,
     Arm,
     Declaration,

@@ -17,7 +17,7 @@ from gsbench.analysis.report.build import build_report
 from gsbench.analysis.results import load_experiment
 from gsbench.analysis.table_formats import Table, to_latex
 from gsbench.errors import InputError
-from gsbench.runs.declaration import Arm
+from gsbench.runs.experiments import Arm
 from gsbench.verbs.results import tables
 from tests.analysis.synthetic import write_arms
 from tests.analysis.test_attribution import densifier

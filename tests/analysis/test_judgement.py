@@ -13,7 +13,7 @@ import pytest
 from gsbench.analysis.judgement import find_outlying, judge
 from gsbench.analysis.pairing import Pairs, choose_pairs, pair
 from gsbench.analysis.results import Experiment, TrialResult
-from gsbench.runs.declaration import Arm, Declaration, Question
+from gsbench.runs.experiments import Arm, Declaration, Question
 from tests.analysis.untruths import scene_pairs
 
 ADC, VOLUMETRIC = Arm("sfm", "adc"), Arm("sfm", "volumetric")

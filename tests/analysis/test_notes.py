@@ -11,7 +11,7 @@ import pytest
 from gsbench.analysis.fairness import counts_sentence
 from gsbench.analysis.results import TrialResult, load_experiment
 from gsbench.analysis.tables import build_table, held_out_notes, points_notes
-from gsbench.runs.declaration import Arm
+from gsbench.runs.experiments import Arm
 from tests.analysis.synthetic import Plan, write_runs
 
 ADC, VOLUMETRIC = Arm("sfm", "adc"), Arm("sfm", "volumetric")

@@ -9,7 +9,7 @@ from gsbench.analysis.fairness import fairness_table
 from gsbench.analysis.report.build import build_report
 from gsbench.analysis.results import Experiment, load_experiment
 from gsbench.analysis.tables import build_table
-from gsbench.runs.declaration import Arm
+from gsbench.runs.experiments import Arm
 from gsbench.verbs.results import explain_cell
 from tests.analysis.test_tables import one_trial
 

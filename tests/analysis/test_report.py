@@ -31,7 +31,7 @@ from gsbench.analysis.results import Experiment, load_experiment
 from gsbench.analysis.statistics import Interval
 from gsbench.analysis.verdicts import by_scene_lines, headline, judge_pairs
 from gsbench.errors import InputError
-from gsbench.runs.declaration import Arm
+from gsbench.runs.experiments import Arm
 from gsbench.runs.trial_record import Histogram
 from gsbench.verbs.results import report
 from tests.analysis.synthetic import Plan, write_arms, write_runs

@@ -16,7 +16,7 @@ from gsbench.analysis.results import read_experiment
 from gsbench.config.compose import Trial
 from gsbench.launch.jobs import Outcome, outcome_of_results
 from gsbench.launch.record import add_to_plan, declare
-from gsbench.runs.declaration import read_declarations
+from gsbench.runs.experiments import read_declarations
 from gsbench.runs.layout import CONFIG, RESULTS
 from gsbench.runs.trial_record import record_from
 from tests.analysis.synthetic import Plan, trial_data, write_trial

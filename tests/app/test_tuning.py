@@ -23,8 +23,7 @@ from gsbench.config.compose import Trial
 from gsbench.errors import GsbenchError
 from gsbench.launch.jobs import Outcome, outcome_of_error, outcome_of_results
 from gsbench.launch.record import add_to_plan, declare
-from gsbench.runs.declaration import Arm
-from gsbench.runs.experiments import TuningRecord, read_tuning
+from gsbench.runs.experiments import Arm, TuningRecord, read_tuning
 from gsbench.runs.layout import CONFIG, RESULTS
 from gsbench.runs.trial_record import record_from
 from hydra_plugins.gsbench import TUNE

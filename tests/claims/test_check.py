@@ -19,7 +19,7 @@ from gsbench.claims.stopping import KeyAndSeed, run_looks
 from gsbench.cli import run
 from gsbench.config.compose import Trial, with_seed
 from gsbench.errors import InputError
-from gsbench.runs.declaration import read_declarations
+from gsbench.runs.experiments import read_declarations
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.verbs.claims import describe
 from tests.analysis.synthetic import Plan, trial_data, write_trial

@@ -29,7 +29,7 @@ from gsbench.claims.gate import (
 from gsbench.claims.stopping import run_looks
 from gsbench.cli import run
 from gsbench.errors import InputError
-from gsbench.runs.declaration import Declaration
+from gsbench.runs.experiments import Declaration
 from gsbench.runs.trial_record import Code
 from tests.analysis.synthetic import Plan, trial_data, write_runs, write_trial
 

@@ -14,7 +14,7 @@ from gsbench.analysis.results import TrialResult, read_experiment
 from gsbench.claims.check import claim_verdicts
 from gsbench.claims.file import parse_claims
 from gsbench.claims.page import Page, make_page, to_html, to_text
-from gsbench.runs.declaration import Declaration
+from gsbench.runs.experiments import Declaration
 from tests.analysis.synthetic import Plan, write_runs
 from tests.claims.test_check import content
 

@@ -13,7 +13,7 @@ from gsbench.analysis.results import load_experiment
 from gsbench.claims.archive import unpack_archive, write_archive
 from gsbench.cli import run
 from gsbench.errors import InputError
-from gsbench.runs.declaration import Question, declared_now, record_text
+from gsbench.runs.experiments import Question, declared_now, record_text
 from tests.analysis.synthetic import Plan, write_runs
 from tests.claims.test_archive import rewrite
 from tests.view.browser import Browser

@@ -31,7 +31,7 @@ from gsbench.errors import InputError
 from gsbench.launch import states
 from gsbench.launch.record import read_plan
 from gsbench.launch.states import FinishedTrials, states_of_experiment
-from gsbench.runs.declaration import read_declarations
+from gsbench.runs.experiments import read_declarations
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.tracking.sinks import TrackedTrial, read_state
 from gsbench.verbs.results import explain_cell

@@ -15,7 +15,7 @@ from gsbench.cli import run
 from gsbench.config.compose import Trial, compose_one
 from gsbench.errors import InputError
 from gsbench.launch.record import declare, declare_questions, declared_metrics
-from gsbench.runs.declaration import Declaration, Question, read_declarations
+from gsbench.runs.experiments import Declaration, Question, read_declarations
 from tests.end_to_end.conftest import SMALL
 
 # later words win: a trial of seconds

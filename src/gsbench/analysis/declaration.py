@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from gsbench.analysis.results import TrialResult
-from gsbench.runs.declaration import Declaration, Question, read_declarations
+from gsbench.runs.experiments import Declaration, Question, read_declarations
 from gsbench.words import counted
 
 

@@ -25,7 +25,7 @@ from gsbench.analysis.statistics import (
     look_levels,
     t_test,
 )
-from gsbench.runs.declaration import Declaration, Question
+from gsbench.runs.experiments import Declaration, Question
 from gsbench.words import counted, signed
 
 OUTLYING = 5.0  # deviations from the other trials of its scene and arm, beyond which a trial is outlying

@@ -20,7 +20,7 @@ from gsbench.analysis.differences import differing_conditions
 from gsbench.analysis.quantities import asked_quantity, value_of
 from gsbench.analysis.results import TrialPair, TrialResult, group_by
 from gsbench.errors import InputError
-from gsbench.runs.declaration import Arm, Question
+from gsbench.runs.experiments import Arm, Question
 from gsbench.words import counted, some_of
 
 BASELINE = "adc"

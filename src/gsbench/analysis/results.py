@@ -17,9 +17,8 @@ from typing import Any, TypeVar
 from gsbench.errors import InputError
 from gsbench.files import require_no_links
 from gsbench.parsing import DamagedError, one_line
-from gsbench.runs.declaration import QUESTIONS, trial_key, unix_time
-from gsbench.runs.declaration import Arm as Arm
-from gsbench.runs.experiments import experiment_home, trial_folders
+from gsbench.runs.experiments import QUESTIONS, experiment_home, trial_folders, trial_key, unix_time
+from gsbench.runs.experiments import Arm as Arm
 from gsbench.runs.keys import NOT_HASHED, flatten
 from gsbench.runs.layout import CONFIG, FAILED, PER_VIEW, RESULTS, SEED
 from gsbench.runs.trial_folder import TrialFolder

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from gsbench.errors import InputError
-from gsbench.runs.declaration import ERROR_RATE
+from gsbench.runs.experiments import ERROR_RATE
 
 ALPHA = ERROR_RATE
 MIN_SCENES = 6  # for a statement about scenes like these: the fewest with which the sign test can reach 5 %

@@ -18,7 +18,7 @@ from gsbench.analysis.judgement import Verdict, judge
 from gsbench.analysis.quantities import Quantity, asked_quantity, choose_quantities
 from gsbench.analysis.results import Arm, TrialResult, group_by
 from gsbench.analysis.statistics import ALPHA, TOO_SMALL, Outcome, seeds_needed
-from gsbench.runs.declaration import Declaration, Question
+from gsbench.runs.experiments import Declaration, Question
 from gsbench.words import counted, some_of
 
 ArmPair = tuple[Arm, Arm]  # baseline, other arm

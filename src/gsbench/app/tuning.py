@@ -31,8 +31,7 @@ from gsbench.config.compose import Trial
 from gsbench.errors import GsbenchError, InputError
 from gsbench.eval.facts import known_keys
 from gsbench.files import checked_runs_folder, make_runs_folder, write_json
-from gsbench.runs.declaration import metric_and_question
-from gsbench.runs.experiments import SearchPoint, TuningRecord, make_home
+from gsbench.runs.experiments import SearchPoint, TuningRecord, make_home, metric_and_question
 from gsbench.runs.keys import flatten
 from gsbench.runs.layout import TUNING
 from gsbench.settings import check_settings

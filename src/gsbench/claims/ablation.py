@@ -14,7 +14,7 @@ from gsbench.analysis.quantities import asked_quantity
 from gsbench.analysis.results import TrialResult
 from gsbench.analysis.verdicts import WORDS
 from gsbench.errors import InputError
-from gsbench.runs.declaration import Arm, Declaration, Question
+from gsbench.runs.experiments import Arm, Declaration, Question
 from gsbench.settings import Switch, check_values
 from gsbench.words import did_you_mean, listed
 

@@ -37,7 +37,7 @@ from gsbench.claims.crate import crate_metadata
 from gsbench.errors import InputError
 from gsbench.files import atomic
 from gsbench.parsing import read_bytes, read_yaml
-from gsbench.runs.declaration import read_declarations
+from gsbench.runs.experiments import read_declarations
 from gsbench.runs.layout import CONFIG, DECLARED, FROM_PIXELS, GROUND_TRUTH, PER_VIEW, RENDERS, RESULTS
 from gsbench.settings import is_folder_name
 from gsbench.words import readable_bytes, without_folders

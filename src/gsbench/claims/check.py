@@ -19,7 +19,7 @@ from gsbench.claims.stopping import KeyAndSeed, trials_of_look
 from gsbench.config.compose import Trial, compose_one, with_seed
 from gsbench.errors import InputError
 from gsbench.parsing import read_if_sound
-from gsbench.runs.declaration import Declaration, declared_now, latest_declaration, read_declarations
+from gsbench.runs.experiments import Declaration, declared_now, latest_declaration, read_declarations
 from gsbench.runs.layout import FAILED, SEED
 from gsbench.runs.trial_record import Failure
 from gsbench.words import some_of, without_folders

@@ -34,7 +34,7 @@ from gsbench.analysis.statistics import ALPHA, FIRST_LOOK, plan_looks
 from gsbench.config.trust import PERMISSIONS
 from gsbench.errors import InputError
 from gsbench.parsing import read_yaml, resolved
-from gsbench.runs.declaration import Arm, Question
+from gsbench.runs.experiments import Arm, Question
 from gsbench.settings import check_values
 from gsbench.words import did_you_mean
 

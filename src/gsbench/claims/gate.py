@@ -18,7 +18,7 @@ from gsbench.claims.file import read_least
 from gsbench.claims.stopping import facts_for
 from gsbench.errors import InputError
 from gsbench.eval.facts import known_keys
-from gsbench.runs.declaration import ERROR_RATE, Declaration, Question, declared_now, trial_key
+from gsbench.runs.experiments import ERROR_RATE, Declaration, Question, declared_now, trial_key
 from gsbench.words import counted, did_you_mean, listed
 
 BASELINE, NEW = "baseline", "new"  # replace the configuration hash in trials' keys, since versions may share settings

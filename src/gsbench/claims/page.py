@@ -14,7 +14,7 @@ from gsbench.analysis.tables import cloud_notes, machine_notes
 from gsbench.analysis.verdicts import like_these_words, outlying_words
 from gsbench.claims.check import NOT_TESTABLE, ClaimVerdict
 from gsbench.claims.file import ClaimsFile
-from gsbench.runs.declaration import Declaration
+from gsbench.runs.experiments import Declaration
 from gsbench.runs.layout import SEED
 from gsbench.words import counted
 

@@ -22,7 +22,7 @@ from gsbench.analysis.results import Arm, TrialResult, group_by
 from gsbench.analysis.statistics import Interval, StudentT, t_test
 from gsbench.claims.archive import unpack_archive
 from gsbench.errors import InputError
-from gsbench.runs.declaration import Question
+from gsbench.runs.experiments import Question
 from gsbench.runs.keys import sha256_of
 
 MIN_STUDIES = 2

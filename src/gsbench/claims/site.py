@@ -21,7 +21,7 @@ from gsbench.analysis.tables import build_table, compared_pairs
 from gsbench.analysis.verdicts import headline, judge_pairs
 from gsbench.claims.archive import unpack_archive
 from gsbench.errors import InputError
-from gsbench.runs.declaration import latest_declaration, read_declarations
+from gsbench.runs.experiments import latest_declaration, read_declarations
 
 INDEX, REPORTS = "index.html", "reports"
 

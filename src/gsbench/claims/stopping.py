@@ -20,7 +20,7 @@ from gsbench.analysis.verdicts import in_words
 from gsbench.config.compose import Trial
 from gsbench.errors import InputError
 from gsbench.eval.facts import MetricFacts, facts_of, find_metric
-from gsbench.runs.declaration import Declaration, Question, declared_now
+from gsbench.runs.experiments import Declaration, Question, declared_now
 from gsbench.runs.keys import flatten
 from gsbench.runs.layout import SEED
 from gsbench.runs.trial_folder import TrialFolder

@@ -11,7 +11,7 @@ from pydantic import PositiveInt
 from gsbench.errors import InputError
 from gsbench.eval.facts import FPS, LPIPS, MORE, find_metric, further_keys, known_keys, lpips_variants
 from gsbench.eval.protocol import PROTOCOLS
-from gsbench.runs.declaration import AT, QUESTIONS, metric_and_question
+from gsbench.runs.experiments import AT, QUESTIONS, metric_and_question
 from gsbench.settings import MISSING, FolderName, PathName, check_settings
 from gsbench.words import did_you_mean
 

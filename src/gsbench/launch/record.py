@@ -1,7 +1,7 @@
 """Plan and declarations, which a command writes before its trials run. Loads no torch.
 
 ``<runs>/<experiment>/plan.json`` maps the folder of every trial of all commands to the overrides that describe it, so
-that missing trials can be listed. For ``declared.jsonl`` see `gsbench.runs.declaration`.
+that missing trials can be listed. For ``declared.jsonl`` see `gsbench.runs.experiments`.
 """
 
 import logging
@@ -19,15 +19,15 @@ from gsbench.config.compose import Trial
 from gsbench.errors import InputError
 from gsbench.files import require_no_links, write_json, write_text
 from gsbench.parsing import Amount, DamagedError, Record, read_typed
-from gsbench.runs.declaration import (
+from gsbench.runs.experiments import (
     Declaration,
     declared_now,
+    make_home,
     merge_planned,
     open_question,
     read_declarations,
     record_text,
 )
-from gsbench.runs.experiments import make_home
 from gsbench.runs.layout import DECLARED, PLAN, RESULTS
 from gsbench.settings import is_folder_name
 from gsbench.system.locks import hold

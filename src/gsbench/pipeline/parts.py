@@ -33,7 +33,7 @@ from gsbench.external.settings import External
 from gsbench.init.base import Initializer
 from gsbench.raster import EXECUTORS, Rasterizer, create_rasterizer
 from gsbench.raster.executors import AUTO, offers, resolve
-from gsbench.runs.declaration import metric_and_question
+from gsbench.runs.experiments import metric_and_question
 from gsbench.runs.keys import OWN, UserCode, module_digest, unnamed_modules, user_modules
 from gsbench.scene.options import SceneConfig
 from gsbench.settings import check_values, option_fields, unknown_setting

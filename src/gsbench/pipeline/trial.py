@@ -34,7 +34,7 @@ from gsbench.pipeline.steps.scene import (
 )
 from gsbench.pipeline.steps.train import external_step, train_step
 from gsbench.runs import layout
-from gsbench.runs.declaration import read_declarations
+from gsbench.runs.experiments import read_declarations
 from gsbench.runs.keys import (
     EVALUATE,
     GROUND_TRUTH,

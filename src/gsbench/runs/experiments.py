@@ -1,16 +1,35 @@
-"""The experiments in a runs folder, and ``tuning.json``, the record of a search that tunes an arm."""
+"""The experiments in a runs folder, the search that tunes an arm (``tuning.json``), and declared questions."""
 
+import calendar
+import json
 import logging
 import os
-from collections.abc import Iterator
-from dataclasses import dataclass
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
 
 from gsbench.errors import InputError
 from gsbench.files import require_no_links
-from gsbench.parsing import Count, Number, Record, Text, Whole, read_typed
-from gsbench.runs.layout import IN_RUNS, TUNING
+from gsbench.parsing import (
+    STRICT,
+    Amount,
+    Count,
+    DamagedError,
+    Number,
+    Record,
+    Text,
+    Whole,
+    iterate_rows,
+    read_bytes,
+    read_typed,
+)
+from gsbench.runs.keys import sha256_of
+from gsbench.runs.layout import DECLARED, IN_RUNS, TUNING
+from gsbench.runs.trial_record import Declared
 
 log = logging.getLogger(__name__)
 
@@ -106,3 +125,213 @@ class TuningRecord(Record):
 def read_tuning(home: Path) -> TuningRecord:
     """The search of the experiment in ``home``; raises FileNotFoundError and DamagedError."""
     return read_typed(home / TUNING, TuningRecord)
+
+
+# ---- the questions that were declared for an experiment before its trials ran: ``<runs>/<experiment>/declared.jsonl``
+#
+# Every line is a `Declaration`. A command writes it before its trials run, for ``eval.primary``, a file of claims or
+# ``launch.stop_when_decided``. A trial's ``results.json`` repeats the metric that was declared when it ran.
+# `gsbench.analysis.judgement` answers the questions.
+
+INTERPOLATION, EXTRAPOLATION = "interpolation", "extrapolation"
+QUESTIONS = {"every_nth": INTERPOLATION, "sector": EXTRAPOLATION}  # the question of each split (scene.split)
+AT = "@"  # psnr@extrapolation
+STAMP = "%Y-%m-%dT%H:%M:%SZ"  # UTC, as in the manifests of the store
+ERROR_RATE = 0.05
+
+TrialKey = Annotated[str, Field(pattern=r"^[^/]*/[^/]*/[^/]*$")]
+Planned = Mapping[str, tuple[int, ...]]  # seeds by scene, arm and hash of the configuration (`trial_key`)
+
+
+def trial_key(scene: str, arm: str, config_hash: str) -> str:
+    """The key that trials of an experiment share if they differ only in the seed: ``garden/sfm-adc/3fa9c1d2``."""
+    return f"{scene}/{arm}/{config_hash}"
+
+
+@dataclass(frozen=True, order=True)
+class Arm:
+    """An arm of a comparison: an initialiser, a densifier, and the swept settings that distinguish it.
+
+    ``variant`` holds (setting, value as text) pairs. The arms of a file of claims have its names and no ``init``.
+    """
+
+    __pydantic_config__ = STRICT
+
+    init: str
+    densify: str
+    variant: tuple[tuple[str, str], ...] = ()
+
+    def __str__(self) -> str:
+        name = f"{self.init}-{self.densify}" if self.init else self.densify
+        return " ".join([name, *(f"{key.rpartition('.')[2]}={value}" for key, value in self.variant)])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Question(Record):
+    """A question: does ``arm`` differ from ``baseline`` in ``metric`` in the direction ``sign``, by at least ``least``?
+
+    - ``sign``: of the claimed difference, arm minus baseline; 0 if no difference is claimed.
+    - ``least``: the smallest difference that matters, in the metric's unit or (``relative``) as a fraction of the
+      baseline's value; None if it is not known.
+    - ``scenes``: for each scene, the keys (`trial_key`) of baseline's and arm's trials; if empty, the trials are those
+      of the two arms on all scenes.
+    - ``seeds``: in the order of adding them; if empty, all seeds that both arms have.
+    - ``baseline`` and ``arm`` are None in a question about all compared arms, in the metric's own direction.
+    - ``about``: "interpolation" or "extrapolation", "" for both.
+    - ``versions``: the arms are versions of one trainer, so their code may differ, and the baseline's trials may be
+      older than the question.
+    """
+
+    metric: str
+    sign: int = 1
+    least: Amount | None = None
+    relative: bool = False
+    baseline: Arm | None = None
+    arm: Arm | None = None
+    scenes: dict[str, tuple[TrialKey, TrialKey]] = field(default_factory=dict)
+    seeds: tuple[Count, ...] = ()
+    about: str = ""
+    secondary: bool = False
+    versions: bool = False
+    name: str = ""
+
+    @property
+    def planned(self) -> Planned:
+        """The trials that the question names; {} without ``scenes``."""
+        return {key: self.seeds for keys in self.scenes.values() for key in keys}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Declaration(Record):
+    """Questions that were declared at ``time`` (UTC). ``error_rate`` is the chance that any answer is false.
+
+    ``looks`` are the rising numbers of seeds at which a question may be decided; without looks, all seeds are judged
+    at once. ``trials`` are the planned trials if the questions name none; None if they are not recorded. ``missing``
+    says by question what could not be tested, and why.
+    """
+
+    time: str
+    questions: tuple[Question, ...] = ()
+    error_rate: Amount = ERROR_RATE
+    looks: tuple[Count, ...] = ()
+    trials: dict[TrialKey, tuple[Count, ...]] | None = None
+    missing: dict[str, list[str]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if unix_time(self.time) is None:
+            raise ValueError("time is not a time")
+
+    @property
+    def moment(self) -> int:
+        """The time in Unix seconds."""
+        return unix_time(self.time) or 0
+
+    @property
+    def when(self) -> str:
+        """``2026-11-21 20:05 UTC``"""
+        return time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(self.moment))
+
+    @property
+    def of_claims(self) -> bool:
+        """Return whether it comes from a file of claims (or a gate): only their questions have names."""
+        return any(question.name for question in self.questions)
+
+    @property
+    def primary(self) -> str:
+        """The declared metric of a sweep, as in ``eval.primary``."""
+        first = self.questions[0]
+        return f"{first.metric}{AT}{first.about}" if first.about else first.metric
+
+    @property
+    def names_trials(self) -> bool:
+        """Return whether the planned trials are recorded. They are not in the part that a trial repeats."""
+        return self.trials is not None or any(question.scenes for question in self.questions)
+
+    @property
+    def planned(self) -> Planned:
+        """All planned trials."""
+        planned: dict[str, tuple[int, ...]] = dict(self.trials or {})
+        for question in self.questions:
+            planned = dict(merge_planned(planned, question.planned))
+        return planned
+
+    @property
+    def hash(self) -> str:
+        """sha256 of everything that affects the answers: different hashes are different declarations."""
+        return sha256_of(replace(self, time="1970-01-01T00:00:00Z", missing={}).to_json())
+
+    def summary(self) -> Declared:
+        """The part that a trial's results.json repeats."""
+        return Declared(metric=self.primary, time=self.time)
+
+
+def declared_now(**values: Any) -> Declaration:
+    """A declaration with the present time."""
+    return Declaration(time=time.strftime(STAMP, time.gmtime()), **values)
+
+
+def metric_and_question(primary: str) -> tuple[str, str]:
+    """The metric and the question that ``eval.primary`` names; the question is "" for both.
+
+    Examples:
+        >>> metric_and_question("psnr@extrapolation")
+        ('psnr', 'extrapolation')
+        >>> metric_and_question("psnr")
+        ('psnr', '')
+    """
+    metric, _, question = primary.partition(AT)
+    return metric, question
+
+
+def open_question(primary: str) -> Question:
+    """The question of ``eval.primary``, about all compared arms in one metric."""
+    metric, about = metric_and_question(primary)
+    return Question(metric=metric, sign=0, about=about)
+
+
+def read_declarations(folder: Path, repeated: Iterable[Declared | None] = ()) -> list[Declaration]:
+    """All declarations of the experiment in ``folder``, the oldest first.
+
+    ``repeated`` are the declarations in its trials' results. They are added if the file lacks them.
+    """
+    path = folder / DECLARED
+    try:
+        content = read_bytes(path)
+    except FileNotFoundError:
+        content = b""
+    except DamagedError as error:
+        log.warning("left out: %s", error)
+        content = b""
+    declarations = [one for _, one in iterate_rows(content, Declaration, path) if one.questions]
+    in_file = {(one.primary, one.time) for one in declarations}
+    for metric, when in dict.fromkeys((one.metric, one.time) for one in repeated if one is not None):
+        if (metric, when) not in in_file and unix_time(when) is not None:
+            declarations.append(Declaration(time=when, questions=(open_question(metric),)))
+    return sorted(declarations, key=lambda declaration: declaration.moment)
+
+
+def latest_declaration(declarations: Sequence[Declaration]) -> Declaration:
+    """The latest of ``declarations`` (in the order of time), with the time since which it has been in force."""
+    first = len(declarations) - 1
+    while first > 0 and declarations[first - 1].hash == declarations[-1].hash:
+        first -= 1
+    return declarations[first]
+
+
+def merge_planned(one: Planned, other: Planned) -> Planned:
+    """The trials of both plans."""
+    return {key: tuple(sorted({*one.get(key, ()), *other.get(key, ())})) for key in {**one, **other}}
+
+
+def record_text(declarations: Iterable[Declaration]) -> str:
+    """The content of ``declared.jsonl``, in the order of time."""
+    ordered = sorted(declarations, key=lambda declaration: declaration.moment)
+    return "".join(json.dumps(declaration.to_json()) + "\n" for declaration in ordered)
+
+
+def unix_time(text: object) -> int | None:
+    """The Unix time of a time stamp (`STAMP`); None if the text is not one."""
+    try:
+        return calendar.timegm(time.strptime(str(text), STAMP))
+    except (ValueError, OverflowError):
+        return None

@@ -88,7 +88,7 @@ class TrialFolder:
 
     @property
     def key(self) -> str:
-        """The folder within its experiment, without the seed (`gsbench.runs.declaration.trial_key`)."""
+        """The folder within its experiment, without the seed (`gsbench.runs.experiments.trial_key`)."""
         return self.path.relative_to(self.home).as_posix().rpartition(layout.SEED)[0]
 
     @property

@@ -89,7 +89,7 @@ class Earlier(Record):
 
 @dataclass(frozen=True, kw_only=True)
 class Declared(Record):
-    """The metric that was declared for the verdict, and when (`gsbench.runs.declaration`)."""
+    """The metric that was declared for the verdict, and when (`gsbench.runs.experiments`)."""
 
     metric: str
     time: str

@@ -33,7 +33,7 @@ from gsbench.files import make_runs_folder, writable_output, write_text
 from gsbench.launch.batch import missing_folders, run_batch
 from gsbench.launch.record import declare_questions
 from gsbench.launch.states import describe_plan
-from gsbench.runs.declaration import Question, read_declarations
+from gsbench.runs.experiments import Question, read_declarations
 from gsbench.runs.layout import SEED
 from gsbench.settings import Switch
 from gsbench.verbs.arguments import ArgumentParser, names, path
