@@ -12,9 +12,8 @@ from typing import Any
 import pytest
 import yaml
 
-from gsbench.claims.check import Check, ClaimVerdict, prepare
+from gsbench.claims.check import Check, ClaimVerdict, make_page, prepare, to_html
 from gsbench.claims.file import parse_claims
-from gsbench.claims.page import make_page, to_html
 from gsbench.claims.stopping import KeyAndSeed, run_looks
 from gsbench.cli import run
 from gsbench.config.compose import Trial, with_seed

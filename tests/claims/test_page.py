@@ -11,9 +11,8 @@ import pytest
 
 from gsbench.analysis.judgement import judge
 from gsbench.analysis.results import TrialResult, read_experiment
-from gsbench.claims.check import claim_verdicts
+from gsbench.claims.check import Page, claim_verdicts, make_page, to_html, to_text
 from gsbench.claims.file import parse_claims
-from gsbench.claims.page import Page, make_page, to_html, to_text
 from gsbench.runs.experiments import Declaration
 from tests.analysis.synthetic import Plan, write_runs
 from tests.claims.test_check import content

@@ -36,6 +36,7 @@ from gsbench.config.command_words import (
     key_of,
     parse,
     parse_word,
+    value_text,
 )
 from gsbench.config.compose import (
     Trial,
@@ -389,4 +390,4 @@ def words_of_grids(
 def _text(key: object, value: object) -> str:
     if value is None or isinstance(value, list | dict):
         raise InputError(f"{GRIDS}: {key} must list values as on the command line, such as 1,2,3, got {value!r}")
-    return str(value).lower() if isinstance(value, bool) else str(value)
+    return value_text(value)

@@ -81,10 +81,10 @@ class Stepper:
         forward, loss_time, backward, adam = (1e3 * (b - a) for a, b in itertools.pairwise(marks))
         return {
             "forward_ms": forward,
-            "backward_ms": backward,
-            "step_ms": 1e3 * (marks[-1] - marks[0]),
             "loss_ms": loss_time,
+            "backward_ms": backward,
             "adam_ms": adam,
+            "step_ms": 1e3 * (marks[-1] - marks[0]),
             "cpu_ms": 1e3 * (time.process_time() - cpu),
         }
 

@@ -19,6 +19,7 @@ import hashlib
 import io
 import json
 import re
+import time
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
@@ -33,7 +34,6 @@ from gsbench import __version__
 from gsbench.analysis.images import PixelMeasures, textured_error
 from gsbench.analysis.quantities import TEXTURED
 from gsbench.analysis.results import Experiment, TrialResult, read_experiment, read_views
-from gsbench.claims.crate import crate_metadata
 from gsbench.errors import InputError
 from gsbench.files import atomic
 from gsbench.parsing import read_bytes, read_yaml
@@ -57,6 +57,16 @@ FOLDERS = re.compile(r"(?<=:)///+\S*/")  # folders in a file's URL, such as sqli
 SEED_KEY = "seed"
 NO_CONFIGURATION = f"it has no {CONFIG}"
 NAMED_GROUPS = ("scene", "init", "densify")  # groups of settings whose names results.json repeats
+SPECIFICATION = "https://w3id.org/ro/crate/1.2"
+PICTURE = ("image/png", "A test view of a trial: its render, or the photograph")
+FILES = {  # media types and descriptions
+    TRIALS: ("application/jsonl", "Results of every trial, one JSON object a line: metrics, counts, hashes, code"),
+    CONFIGURATIONS: ("application/jsonl", "Every configuration, with the trials that had it"),
+    PER_VIEW: ("text/csv", "Metrics of every test view of every trial"),
+    PIXELS: ("application/jsonl", "What declared claims ask of the trials' pictures, measured"),
+    DECLARED: ("application/jsonl", "What was declared before the trials were run"),
+    MANIFEST: ("application/json", "Version of the archive, and the sha256 of its files"),
+}
 
 
 def write_archive(experiment: Experiment, out: Path, pictures: bool = False) -> list[str]:
@@ -317,3 +327,38 @@ def _table(rows: Sequence[tuple[str, str, Mapping[str, float]]]) -> bytes:
     for folder, view, metrics in rows:
         writer.writerow([folder, view, *(repr(metrics[name]) if name in metrics else "" for name in names)])
     return text.getvalue().encode()
+
+
+def crate_metadata(name: str, trials: Sequence[TrialResult], sizes: Mapping[str, int]) -> dict[str, Any]:
+    """The archive in the terms of RO-Crate; ``sizes`` are the bytes of each of its files."""
+    scenes = sorted({trial.scene for trial in trials})
+    arms = sorted({f"{trial.init}-{trial.densify}" for trial in trials})
+    protocols = sorted({trial.record.protocol for trial in trials})
+    day = time.strftime("%Y-%m-%d", time.gmtime(max(trial.measured for trial in trials)))
+    root = {
+        "@id": "./",
+        "@type": "Dataset",
+        "name": f"{name}: results of gsbench",
+        "description": f"{len(trials)} trainings of 3D Gaussian Splatting: {', '.join(arms)} on {', '.join(scenes)}, "
+        f"measured by {', '.join(protocols)}. No models.",
+        "datePublished": day,
+        "hasPart": [{"@id": file} for file in sizes],
+    }
+    files = [
+        {
+            "@id": file,
+            "@type": "File",
+            "name": file,
+            "description": FILES.get(file, PICTURE)[1],
+            "encodingFormat": FILES.get(file, PICTURE)[0],
+            "contentSize": str(size),
+        }
+        for file, size in sizes.items()
+    ]
+    descriptor = {
+        "@id": CRATE,
+        "@type": "CreativeWork",
+        "conformsTo": {"@id": SPECIFICATION},
+        "about": {"@id": "./"},
+    }
+    return {"@context": f"{SPECIFICATION}/context", "@graph": [descriptor, root, *files]}

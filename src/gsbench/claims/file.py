@@ -31,6 +31,7 @@ from annotated_types import Ge, Interval, MinLen, Predicate, doc
 
 from gsbench.analysis.quantities import askable_names, asked_quantity
 from gsbench.analysis.statistics import ALPHA, FIRST_LOOK, plan_looks
+from gsbench.config.command_words import value_text
 from gsbench.config.trust import PERMISSIONS
 from gsbench.errors import InputError
 from gsbench.parsing import read_yaml, resolved
@@ -116,7 +117,7 @@ class ClaimsFile:
     def words(self, claim: Claim, scene: str, arm: str) -> list[str]:
         """The settings of a claim's trials with this scene and arm, as command-line words without seed and name."""
         chosen = self.settings | self.scenes[scene] | self.arms[arm] | claim.split | claim.budget
-        return [f"{key}={_text(value)}" for key, value in chosen.items()]
+        return [f"{key}={value_text(value)}" for key, value in chosen.items()]
 
     @property
     def looks(self) -> tuple[int, ...]:
@@ -138,7 +139,7 @@ class ClaimsFile:
         )
 
     def _arm(self, name: str) -> Arm:
-        return Arm("", name, tuple((key, _text(value)) for key, value in self.arms[name].items()))
+        return Arm("", name, tuple((key, value_text(value)) for key, value in self.arms[name].items()))
 
 
 def read_claims(path: Path) -> ClaimsFile:
@@ -276,14 +277,3 @@ def _check_metric(claim: Claim, file: ClaimsFile) -> None:
         raise InputError(f"{where}: least of {claim.metric} must be a part, such as 10%, got {effect}")
     if claim.metric in ("ssim", "flip") and not effect.relative and effect.size >= 1:
         raise InputError(f"{where}: least {effect} is more than {claim.metric} can differ by")
-
-
-def _text(value: object) -> str:
-    """A YAML value as text for a command line."""
-    if value is None:
-        return "null"
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, list):
-        return f"[{','.join(_text(entry) for entry in value)}]"
-    return str(value)

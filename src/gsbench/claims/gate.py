@@ -110,11 +110,7 @@ def describe(verdict: Verdict) -> str:
     if answer is None or answer.interval is None:
         return f"{NOT_DECIDED}: {'; '.join(('trials are missing', *verdict.notes))}"
     least = f"{100 * question.least:g} %" if question.relative else f"{question.least:g}"  # type: ignore[operator]
-    words = {
-        SUPPORTED: f"{PASSED}, better",
-        TOO_SMALL: f"{PASSED}, any difference is below {least}",
-        REFUTED: WORSE,
-    }
+    words = {SUPPORTED: f"{PASSED}, better", TOO_SMALL: f"{PASSED}, any difference is below {least}", REFUTED: WORSE}
     word = words.get(verdict.outcome, f"{PASSED}, not worse by {least}" if _not_worse(verdict) else NOT_DECIDED)
     return (
         f"{word} in {verdict.quantity.name}: {verdict.shown(answer.mean)} ({100 * (1 - answer.level):.3g} % interval "

@@ -7,7 +7,7 @@ import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any
 
 import yaml
 
@@ -23,13 +23,11 @@ from gsbench.eval.facts import MetricFacts, facts_of, find_metric
 from gsbench.runs.experiments import Declaration, Question, declared_now
 from gsbench.runs.keys import flatten
 from gsbench.runs.layout import SEED
-from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import TrialRecord
 from gsbench.words import counted
 
 log = logging.getLogger(__name__)
 
-T = TypeVar("T", bound=Trial)
 KeyAndSeed = tuple[str, int]  # a trial's key (its folder within the experiment without the seed) and its seed
 
 
@@ -47,9 +45,7 @@ def trials_of_look(declaration: Declaration, indices: Sequence[int], seeds: int)
 
 
 def run_looks(
-    declaration: Declaration,
-    judged: Callable[[], list[Verdict]],
-    run: Callable[[list[KeyAndSeed]], object],
+    declaration: Declaration, judged: Callable[[], list[Verdict]], run: Callable[[list[KeyAndSeed]], object]
 ) -> list[Verdict]:
     """Add seeds look by look until all questions are decided, and return the verdicts.
 
@@ -72,16 +68,16 @@ def run_looks(
 
 
 @dataclass(frozen=True)
-class SweepInLooks(Generic[T]):
+class SweepInLooks:
     """The trials of a sweep that stops when decided, with its declaration."""
 
     declaration: Declaration
     home: Path
-    trials: Mapping[KeyAndSeed, T]
+    trials: Mapping[KeyAndSeed, Trial]
 
     def judged(self) -> list[Verdict]:
         """The verdicts on the pairs of arms from the trials that are done."""
-        return judge(read_experiment(self.home).trials if self.home.is_dir() else (), self.declaration)
+        return judge(read_experiment(self.home).trials, self.declaration)
 
     def describe(self) -> str:
         """A line about the looks for a dry run."""
@@ -95,9 +91,9 @@ class SweepInLooks(Generic[T]):
         )
 
 
-def plan_sweep(trials: Sequence[T]) -> SweepInLooks[T]:
+def plan_sweep(trials: Sequence[Trial]) -> SweepInLooks:
     """Plan the looks of a sweep's trials; raises InputError, one line, if the sweep cannot be run in looks."""
-    homes = {TrialFolder.of(trial.values).home for trial in trials}
+    homes = {trial.files.home for trial in trials}
     metrics = {trial.values["eval"].get("primary") for trial in trials}
     if len(homes) > 1 or len(metrics) > 1:
         raise InputError("launch.stop_when_decided: all trials of the sweep need one name and one eval.primary")
@@ -144,7 +140,7 @@ def headline(verdict: Verdict) -> str:
 
 def _expected(trial: Trial) -> TrialResult:
     """A trial that has not run as a `TrialResult` without results, so that arms can be paired beforehand."""
-    values, folder = trial.values, TrialFolder.of(trial.values).path
+    values, folder = trial.values, trial.folder
     record = TrialRecord(
         status="complete",  # the only status that the type allows; no file has this record
         experiment=values["name"],

@@ -159,6 +159,13 @@ def bare_key(key: str) -> str:
     return key.lstrip("+~")
 
 
+def value_text(value: object) -> str:
+    """A plain value as a word's value."""
+    if isinstance(value, list):
+        return f"[{','.join(map(value_text, value))}]"
+    return "null" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
+
+
 def bracket_depth(word: str) -> int:
     """The largest number of brackets that are open at once."""
     return max(accumulate(((letter in "[{(") - (letter in "]})") for letter in word), initial=0))

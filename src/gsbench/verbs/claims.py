@@ -23,9 +23,10 @@ from gsbench.claims.ablation import (
     run_name,
     runs_to_train,
 )
-from gsbench.claims.check import Check, prepare, recheck
+from gsbench.claims.check import Check, make_page, prepare, recheck, to_html, to_text
 from gsbench.claims.file import ClaimsFile, read_claims
 from gsbench.claims.stopping import KeyAndSeed, run_looks
+from gsbench.config.command_words import value_text
 from gsbench.config.compose import Trial
 from gsbench.config.trust import PERMISSIONS
 from gsbench.errors import InputError
@@ -89,8 +90,6 @@ def _recheck(file: ClaimsFile, archive: Path, out: Path | None) -> int:
 
     Raises InputError for an ``out`` of another format.
     """
-    from gsbench.claims.page import make_page, to_html, to_text
-
     if out is not None and out.suffix != ".html":
         raise InputError(f"--out {out}: a page ends in .html")
     with tempfile.TemporaryDirectory() as folder:
@@ -140,7 +139,6 @@ def describe(check: Check) -> list[str]:
 
 
 def _run(check: Check) -> None:
-    from gsbench.claims.page import make_page, to_html
 
     make_runs_folder(check.runs)
     check = replace(check, declaration=declare_questions(check.home, check.declaration))
@@ -296,11 +294,7 @@ def _class_switches(trial: Trial) -> dict[str, Switch]:
 def _words(settings: dict[str, Any], first: Trial) -> list[str]:
     """The words that give the densifier these settings; a key that it lacks needs Hydra's plus."""
     densify = first.values["densify"]
-    return [f"{'' if key in densify else '+'}densify.{key}={_text(value)}" for key, value in settings.items()]
-
-
-def _text(value: Any) -> str:
-    return "null" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
+    return [f"{'' if key in densify else '+'}densify.{key}={value_text(value)}" for key, value in settings.items()]
 
 
 def _names_experiment(words: Sequence[str]) -> bool:

@@ -28,21 +28,7 @@ OPTIONAL = {  # module -> what needs it, and the extra that brings it
     "viser": ("gsbench view", "view"),
     "wandb": ("tracking=wandb", "wandb"),
 }
-COLUMNS = (  # of the table of `bench`
-    "raster",
-    "size",
-    "count",
-    "forward_ms",
-    "loss_ms",
-    "backward_ms",
-    "adam_ms",
-    "step_ms",
-    "step_ratio",
-    "cpu_ms",
-    "steps_per_second",
-    "fps",
-    "peak_memory_mb",
-)
+NOT_SHOWN = ("scene", "threads", "device")  # columns that only the JSON of `bench` has
 RATIO_DIGITS = 2
 MAX_SIDE = 16_384  # px
 MAX_COUNT = 1_000_000_000
@@ -170,9 +156,7 @@ def _bench_parser() -> ArgumentParser:
         description="Time rasterizers and the training step side by side: medians of steps that take turns.",
     )
     parser.add_argument(
-        "--raster",
-        default="cpu",
-        help=f"names, comma between: {names}, or your own, mine.MyRasterizer",
+        "--raster", default="cpu", help=f"names, comma between: {names}, or your own, mine.MyRasterizer"
     )
     parser.add_argument("--size", default="500x375", help="image sizes, comma between")
     parser.add_argument("--count", default="100000", help="numbers of Gaussians, comma between")
@@ -210,14 +194,7 @@ def bench(argv: Sequence[str], _runs: Path | None = None) -> int:
     from gsbench.bench import run_bench
 
     rows = run_bench(
-        rasters,
-        sizes,
-        counts,
-        options.ply,
-        options.repeats,
-        options.threads,
-        not options.no_memory,
-        options.scene,
+        rasters, sizes, counts, options.ply, options.repeats, options.threads, not options.no_memory, options.scene
     )
     print(json.dumps(rows, indent=2) if options.json else table(rows))
     return 0
@@ -225,8 +202,8 @@ def bench(argv: Sequence[str], _runs: Path | None = None) -> int:
 
 def table(rows: list[dict[str, Any]]) -> str:
     """The results as aligned columns of text. Columns that no result has are left out."""
-    used = [key for key in COLUMNS if any(row.get(key) is not None for row in rows)]
-    cells = [used] + [[_cell(key, row.get(key)) for key in used] for row in rows]
+    used = [key for key in rows[0] if key not in NOT_SHOWN and any(row[key] is not None for row in rows)]
+    cells = [used] + [[_cell(key, row[key]) for key in used] for row in rows]
     widths = [max(len(line[k]) for line in cells) for k in range(len(used))]
     lines = ["  ".join(text.rjust(width) for text, width in zip(line, widths, strict=True)) for line in cells]
     return "\n".join(lines)

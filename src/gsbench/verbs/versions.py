@@ -118,10 +118,9 @@ def _seeds(baseline: Mapping[str, Sequence[TrialResult]], most: int | None) -> l
 def _done(home: Path, trials: Sequence[Trial]) -> list[TrialResult]:
     """The results of those ``trials`` that are done. Results of earlier code do not count as done."""
     by_folder = {trial.folder: trial for trial in trials}
-    results = read_experiment(home).trials if home.is_dir() else ()
     return [
         result
-        for result in results
+        for result in read_experiment(home).trials
         if (trial := by_folder.get(result.path)) is not None and not trial.files.why_not_done(trial.values)
     ]
 
