@@ -24,7 +24,7 @@ STATE = {"a.weight": torch.arange(6.0).reshape(2, 3), "a.bias": torch.zeros(2)}
 
 def spec(content: bytes | None = None, url: str | None = None, digits: int = 64, name: str = "net.pth") -> WeightsFile:
     sha256 = None if content is None else hashlib.sha256(content).hexdigest()[:digits]
-    return WeightsFile((name, f"other/{name}"), url, sha256, "free", "example.org")
+    return WeightsFile((name, f"other/{name}"), url, sha256, "example.org")
 
 
 @pytest.fixture(autouse=True)
@@ -108,7 +108,7 @@ def test_download_shows_a_bar_on_a_terminal(server: Server):
     pty = pytest.importorskip("pty", reason="needs terminals as Unix has them")
     code = (
         "from gsbench.weights import WeightsFile, find_weights\n"
-        f"find_weights(WeightsFile(('net.pth',), {served(server, b'g' * 2_500_000)!r}, None, 'free', 'example.org'))"
+        f"find_weights(WeightsFile(('net.pth',), {served(server, b'g' * 2_500_000)!r}, None, 'example.org'))"
     )
     ours, theirs = pty.openpty()
     environment = dict(os.environ) | {"TERM": "xterm", "COLUMNS": "100"}

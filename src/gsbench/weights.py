@@ -40,14 +40,13 @@ class WeightsFile:
 
     ``names`` are the accepted file names, of which a download gets the first. ``sha256`` is the checksum in
     hexadecimal, complete or its first digits, or None if none is published; then only the shapes are checked.
-    ``source`` says in a few words where the file comes from.
+    ``source`` says where a file without an address comes from.
     """
 
     names: tuple[str, ...]
     url: str | None
-    sha256: str | None
-    licence: str
-    source: str
+    sha256: str | None = None
+    source: str = ""
 
 
 def find_weights(spec: WeightsFile, folder: Path | None = None, download: bool = True) -> Path:

@@ -12,7 +12,8 @@ import torch
 
 from gsbench.errors import InputError
 from gsbench.gaussians.ply import read_ply, write_ply
-from gsbench.init import GAUSSIANS_FILE, MODEL_FOLDER, Carved, Dataset, Ply, Random, read_cloud
+from gsbench.init import MODEL_FOLDER, Carved, Dataset, Ply, Random, read_cloud
+from gsbench.init.base import GAUSSIANS_FILE
 from gsbench.init.sfm import shifted_copies
 from gsbench.scene.types import Capture
 from tests.gaussians.helpers import random_gaussians

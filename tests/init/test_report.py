@@ -73,9 +73,7 @@ def test_gauge_of_the_papers_threshold():
 def test_figures_of_a_model(capture: Capture):
     model = model_of(CENTERS, shift_px=0.75)
     counts = {"features": 7}
-    report = make_report(
-        "x", "shared", capture, model, 1.0, settings={}, seconds={}, packages=("pycolmap",), counts=counts
-    )
+    report = make_report("x", "shared", capture, model, 1.0, ("pycolmap",), settings={}, seconds={}, counts=counts)
     assert report.counts == counts
     assert (report.num_images, report.num_registered, report.num_points) == (4, 4, 2)
     assert report.mean_reprojection_error == pytest.approx(0.75)
@@ -88,7 +86,7 @@ def test_missing_images_and_doubtful_numbers_are_warnings(tmp_path: Path):
     capture = Capture("hand", tmp_path, (*NAMES, "e.png"), (), None, False, "0")
     model = model_of(CENTERS, shift_px=3.0)
     model.cameras[1].params = [4000.0, 4000.0, 50.0, 40.0]
-    report = make_report("x", "own", capture, model, None, settings={}, seconds={}, packages=())
+    report = make_report("x", "own", capture, model, None, (), settings={}, seconds={})
     assert report.unregistered == ("e.png",)
     text = "\n".join(report.warnings)
     for part in ("only 4 of 5 images have a pose (missing: e.png)", "only 2 points", "3.00 px is large", "implausible"):
@@ -122,7 +120,7 @@ def test_a_model_is_doubted_beyond_each_limit(
     capture: Capture, sound: dict[str, object], doubtful: dict[str, object], said: str
 ) -> None:
     model = model_of(CENTERS)
-    report = make_report("x", "own", capture, model, None, settings={}, seconds={}, packages=())
+    report = make_report("x", "own", capture, model, None, (), settings={}, seconds={})
     report = replace(report, num_images=10, num_registered=10, unregistered=tuple("abcdef"), num_points=100)
     assert find_warnings(report, model) == ()
     assert find_warnings(replace(report, **sound), model) == ()
@@ -136,7 +134,7 @@ def test_a_field_of_view_beyond_5_to_150_degrees_is_doubted(capture: Capture, fo
     assert math.degrees(2 * math.atan(50 / focal)) == pytest.approx(view, abs=0.05)
     model = model_of(CENTERS)
     model.cameras[1].params = [focal, focal, 50.0, 40.0]
-    report = make_report("x", "own", capture, model, None, settings={}, seconds={}, packages=())
+    report = make_report("x", "own", capture, model, None, (), settings={}, seconds={})
     assert any("implausible" in warning for warning in report.warnings) == (not 5 < view < 150)
 
 

@@ -15,8 +15,8 @@ import pytest
 from PIL import Image
 
 from gsbench.errors import InputError
-from gsbench.init import MODEL_FOLDER, Dataset, Initializer, Sfm, SiftKornia, read_cloud
-from gsbench.init.base import REPORT_FILE, PointsFrom
+from gsbench.init import MODEL_FOLDER, Dataset, Sfm, SiftKornia, read_cloud
+from gsbench.init.base import REPORT_FILE, Initializer, PointsFrom
 from gsbench.runs.keys import options_of
 from gsbench.scene.colmap import read_model
 from gsbench.scene.types import Capture

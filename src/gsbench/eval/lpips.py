@@ -95,14 +95,12 @@ def _squeezenet1_1() -> nn.Sequential:
 
 def _torchvision(name: str, sha256: str) -> WeightsFile:
     url = f"https://download.pytorch.org/models/{name}"
-    return WeightsFile((name,), url, sha256, licence="BSD-3-Clause", source="torchvision, ImageNet")
+    return WeightsFile((name,), url, sha256)  # BSD-3-Clause
 
 
 def _heads(net: str, sha256: str) -> WeightsFile:
     url = f"https://raw.githubusercontent.com/richzhang/PerceptualSimilarity/master/lpips/weights/v0.1/{net}.pth"
-    return WeightsFile(
-        (f"lpips_v0.1_{net}.pth", f"{net}.pth"), url, sha256, licence="BSD-2-Clause", source="LPIPS v0.1"
-    )
+    return WeightsFile((f"lpips_v0.1_{net}.pth", f"{net}.pth"), url, sha256)  # BSD-2-Clause
 
 
 # A copy of the convolutional layers of torchvision's file, small enough to keep in a project.
@@ -110,7 +108,6 @@ SQUEEZE_FEATURES_ONLY = WeightsFile(
     ("squeezenet1_1_features.pth",),
     None,
     "435cedb387e95bc8291893f61a3a64f0345b8c23a05139aceef43947efb3d52d",
-    licence="BSD-3-Clause",
     source="torchvision, ImageNet",
 )
 

@@ -149,10 +149,6 @@ class InitReport:
         """Plain values for JSON."""
         return json.loads(json.dumps(asdict(self), default=str))  # str: paths among the settings
 
-    def write(self, path: Path) -> None:
-        """Write the report as JSON."""
-        path.write_text(json.dumps(self.to_dict(), indent=2) + "\n")
-
 
 @dataclass(frozen=True)
 class Preparation:

@@ -33,52 +33,31 @@ logger = logging.getLogger(__name__)
 
 SUPERPOINT_LICENCE = "Magic Leap: academic or non-profit noncommercial research use only"
 
-EXTRACTOR_WEIGHTS: dict[str, WeightsFile] = {
+EXTRACTOR_WEIGHTS = {
     "superpoint": WeightsFile(
-        names=(
-            "superpoint.safetensors",
-            "superpoint/model.safetensors",
-            "lightglue_superpoint/model.safetensors",
-        ),
-        url="https://huggingface.co/magic-leap-community/superpoint/resolve/main/model.safetensors",
-        sha256=None,
-        licence=SUPERPOINT_LICENCE,
-        source="huggingface.co/magic-leap-community/superpoint",
+        ("superpoint.safetensors", "superpoint/model.safetensors", "lightglue_superpoint/model.safetensors"),
+        "https://huggingface.co/magic-leap-community/superpoint/resolve/main/model.safetensors",
     ),
-    "disk": WeightsFile(
-        names=("depth-save.pth",),
-        url="https://raw.githubusercontent.com/cvlab-epfl/disk/master/depth-save.pth",
-        sha256=None,
-        licence="Apache-2.0",
-        source="github.com/cvlab-epfl/disk",
+    "disk": WeightsFile(  # Apache-2.0
+        ("depth-save.pth",), "https://raw.githubusercontent.com/cvlab-epfl/disk/master/depth-save.pth"
     ),
 }
-
-_ALIKED_SHA256 = {
-    "n16": "5be8704840ed662d9d8c561bf7279c222092674e7eb05fd0feab94899e9d82f2",
-    "n16rot": None,
-    "n32": "055283fd1624d3ab46a05c3b617b1a79a3f28d1f551737eef2d653e8c8232890",
-    "t16": "56782336919db220144a884e710e2b6af13b3b8f8da15b915a239078ab471085",
-}
-ALIKED_WEIGHTS: dict[str, WeightsFile] = {
+ALIKED_WEIGHTS = {  # BSD-3-Clause
     model: WeightsFile(
-        names=(f"aliked-{model}.pth",),
-        url=f"https://github.com/Shiaoming/ALIKED/raw/main/models/aliked-{model}.pth",
-        sha256=sha256,
-        licence="BSD-3-Clause",
-        source="github.com/Shiaoming/ALIKED",
+        (f"aliked-{model}.pth",), f"https://github.com/Shiaoming/ALIKED/raw/main/models/aliked-{model}.pth", sha256
     )
-    for model, sha256 in _ALIKED_SHA256.items()
+    for model, sha256 in {
+        "n16": "5be8704840ed662d9d8c561bf7279c222092674e7eb05fd0feab94899e9d82f2",
+        "n16rot": None,
+        "n32": "055283fd1624d3ab46a05c3b617b1a79a3f28d1f551737eef2d653e8c8232890",
+        "t16": "56782336919db220144a884e710e2b6af13b3b8f8da15b915a239078ab471085",
+    }.items()
 }
-
-LIGHTGLUE_WEIGHTS: dict[str, WeightsFile] = {
+LIGHTGLUE_WEIGHTS = {  # Apache-2.0
     extractor: WeightsFile(
         # kornia and cvg/LightGlue use the first name, with "-pth", in the torch hub cache
-        names=(f"{extractor}_lightglue_v0-1_arxiv-pth", f"{extractor}_lightglue.pth"),
-        url=f"https://github.com/cvg/LightGlue/releases/download/v0.1_arxiv/{extractor}_lightglue.pth",
-        sha256=None,
-        licence="Apache-2.0",
-        source="github.com/cvg/LightGlue",
+        (f"{extractor}_lightglue_v0-1_arxiv-pth", f"{extractor}_lightglue.pth"),
+        f"https://github.com/cvg/LightGlue/releases/download/v0.1_arxiv/{extractor}_lightglue.pth",
     )
     for extractor in ("superpoint", "disk", "aliked")
 }
@@ -124,7 +103,7 @@ class FeatureInitializer(ColmapInitializer):
     def prepare(self, capture: Capture, work_dir: Path, reference: Path | None, progress: Progress) -> Preparation:
         from gsbench.init.networks.extract_and_match import NetworkJob, extract_and_match
 
-        job = NetworkJob(self, self.feature_settings(), self.device, capture, reference, work_dir, *self.find_weights())
+        job = NetworkJob(self, self.feature_settings(), capture, reference, work_dir, *self.find_weights())
         return run_with_progress(extract_and_match, job, progress, what=f"{self.name}: features and matches")
 
     def fill_database(self, task: DatabaseTask, progress: Progress, timer: Timer) -> dict[str, int]:
@@ -132,8 +111,7 @@ class FeatureInitializer(ColmapInitializer):
         from gsbench.init.colmap.reconstruct import verification_options
         from gsbench.init.networks.extract_and_match import NetworkJob, choose_pairs, open_store
 
-        weights = self.find_weights()
-        job = NetworkJob(self, self.feature_settings(), self.device, task.capture, None, task.work_dir, *weights)
+        job = NetworkJob(self, self.feature_settings(), task.capture, None, task.work_dir, *self.find_weights())
         store = open_store(job)
         write_keypoints(task.database, {name: store.require_features(name).colmap_keypoints for name in task.names})
         pairs = choose_pairs(job, task.names, task.pairs)

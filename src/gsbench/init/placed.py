@@ -64,8 +64,8 @@ class GivenCameras(Initializer):
         return run_with_progress(_build, (self, capture, output_dir, reference), progress, what=self.name)
 
     @abstractmethod
-    def set_points(self, model: pycolmap.Reconstruction, capture: Capture, work: Path) -> TrainingPoints | None:
-        """Set the points of the reference ``model``; runs in the isolated process. ``work`` is a temporary folder."""
+    def set_points(self, model: pycolmap.Reconstruction, capture: Capture, output_dir: Path) -> TrainingPoints | None:
+        """Set the points of the reference ``model``; runs in the isolated process."""
 
 
 def _build(job: tuple[GivenCameras, Capture, Path, Path | None], progress: Progress) -> InitReport:
@@ -78,7 +78,7 @@ def _build(job: tuple[GivenCameras, Capture, Path, Path | None], progress: Progr
         model = load_reference(capture, reference)
     assert model is not None
     with timer.phase("place"):
-        training_points = initializer.set_points(model, capture, output_dir / WORK_FOLDER)
+        training_points = initializer.set_points(model, capture, output_dir)
     settings: dict[str, Any] = asdict(initializer)  # type: ignore[call-overload]
     result = report.make_report(
         initializer.name,
@@ -86,9 +86,9 @@ def _build(job: tuple[GivenCameras, Capture, Path, Path | None], progress: Progr
         capture,
         model,
         1.0,
+        ("pycolmap", "numpy"),
         settings=settings,
         seconds=timer.rounded(),
-        packages=("pycolmap", "numpy"),
         training_points=training_points,
     )
     report.write_result(model, result, output_dir)
@@ -106,7 +106,7 @@ class Dataset(GivenCameras):
 
     points_from: PointsFrom = "all"
 
-    def set_points(self, model: pycolmap.Reconstruction, capture: Capture, work: Path) -> TrainingPoints | None:
+    def set_points(self, model: pycolmap.Reconstruction, capture: Capture, output_dir: Path) -> TrainingPoints | None:
         from gsbench.init.colmap.database import readable_images
         from gsbench.init.colmap.reconstruct import keep_training_points
 
@@ -114,7 +114,8 @@ class Dataset(GivenCameras):
             raise InputError(f"init=dataset: the model of scene {capture.name} has no points: use init=sfm or random")
         if self.points_from == "all":
             return None
-        work.mkdir(parents=True, exist_ok=True)
+        work = output_dir / WORK_FOLDER
+        work.mkdir(exist_ok=True)
         try:
             images = readable_images(capture.images, capture.train_names, work)
             return keep_training_points(model, capture.train_names, images)
@@ -129,7 +130,7 @@ class PlacedCloud(GivenCameras):
         """Return whether `run` needs a ``reference`` because the capture came without cameras."""
         return capture.model is None
 
-    def set_points(self, model: pycolmap.Reconstruction, capture: Capture, work: Path) -> TrainingPoints | None:
+    def set_points(self, model: pycolmap.Reconstruction, capture: Capture, output_dir: Path) -> TrainingPoints | None:
         import pycolmap
 
         cloud = self.cloud(capture, model)
@@ -372,18 +373,9 @@ class Ply(CloudFromFile):
 
         check_ply(self.file)
 
-    def run(
-        self,
-        capture: Capture,
-        output_dir: Path,
-        progress: Progress = no_progress,
-        reference: Path | None = None,
-        work_dir: Path | None = None,
-    ) -> InitReport:
-        """Run as `PlacedCloud.run` does, and write the Gaussians to `GAUSSIANS_FILE`."""
-        result = super().run(capture, output_dir, progress, reference, work_dir)
+    def set_points(self, model: pycolmap.Reconstruction, capture: Capture, output_dir: Path) -> TrainingPoints | None:
         shutil.copyfile(self.file, output_dir / GAUSSIANS_FILE)
-        return result
+        return super().set_points(model, capture, output_dir)
 
     def cloud(self, capture: Capture, model: pycolmap.Reconstruction) -> PointCloud:
         from gsbench.gaussians.model import dc_to_rgb

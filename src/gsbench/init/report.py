@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from importlib import metadata
 from math import floor, log10
@@ -15,7 +16,7 @@ import pycolmap
 from PIL import Image, ImageDraw
 
 from gsbench.gaussians.paper_values import VOLUME_THRESHOLD
-from gsbench.init.base import MODEL_FOLDER, PICTURE_FILE, REPORT_FILE, Gauge, InitReport, PoseErrors, TrainingPoints
+from gsbench.init.base import MODEL_FOLDER, PICTURE_FILE, REPORT_FILE, Gauge, InitReport, PoseErrors
 from gsbench.init.colmap.alignment import Similarity, rotation_angles, transformed_rotations
 from gsbench.init.colmap.reconstruct import common_poses, poses_by_name, save_reconstruction
 from gsbench.scene.colmap import model_points
@@ -158,18 +159,11 @@ def make_report(
     capture: Capture,
     model: pycolmap.Reconstruction,
     scale_to_reference: float | None,
-    *,
-    settings: Mapping[str, Any],
-    seconds: Mapping[str, float],
     packages: Sequence[str],
-    own_gauge: Gauge | None = None,
-    pose_errors: PoseErrors | None = None,
-    counts: Mapping[str, int] | None = None,
-    mapped_by: str | None = None,
     warnings: Sequence[str] = (),
-    training_points: TrainingPoints | None = None,
+    **further: Any,
 ) -> InitReport:
-    """The report on ``model``, with the installed versions of ``packages``."""
+    """The report on ``model``, with the installed versions of ``packages`` and ``further`` fields of `InitReport`."""
     placed = set(poses_by_name(model))
     observed = any(point.track.length() > 0 for point in model.points3D.values())
     report = InitReport(
@@ -183,14 +177,8 @@ def make_report(
         mean_track_length=model.compute_mean_track_length() if observed else None,
         focal_lengths=tuple(camera.mean_focal_length() for _, camera in sorted(model.cameras.items())),
         gauge=measure_gauge(training_extent(model, capture), scale_to_reference),
-        seconds=seconds,
-        settings=settings,
         versions={package: metadata.version(package) for package in packages},
-        own_gauge=own_gauge,
-        pose_errors=pose_errors,
-        counts=counts or {},
-        mapped_by=mapped_by,
-        training_points=training_points,
+        **further,
     )
     return replace(report, warnings=(*warnings, *find_warnings(report, model)))
 
@@ -200,7 +188,7 @@ def write_result(model: pycolmap.Reconstruction, report: InitReport, output_dir:
     save_reconstruction(model, output_dir / MODEL_FOLDER)
     title = f"{report.init}, {report.poses} poses: {report.num_points:,} points, {report.num_registered} cameras"
     draw_cloud(model, output_dir / PICTURE_FILE, f"{title}, from above")
-    report.write(output_dir / REPORT_FILE)
+    (output_dir / REPORT_FILE).write_text(json.dumps(report.to_dict(), indent=2) + "\n")
 
 
 def find_warnings(report: InitReport, model: pycolmap.Reconstruction) -> tuple[str, ...]:

@@ -16,7 +16,6 @@ from pydantic import PositiveFloat, PositiveInt
 from gsbench.errors import InputError
 from gsbench.init.base import (
     MIN_IMAGES,
-    MODEL_FOLDER,
     WORK_FOLDER,
     Initializer,
     InitReport,
@@ -166,13 +165,9 @@ class ColmapInitializer(Initializer):
         """Do the work that comes before COLMAP; none by default."""
         return Preparation()
 
-
-# COLMAP's defaults
-DEFAULT_PEAK_THRESHOLD = 0.02 / 3
-DEFAULT_EDGE_THRESHOLD = 10.0
-# Together they give 2.9 times the points on low-contrast ground, at a lower error.
-DENSE_PEAK_THRESHOLD = 0.02 / 12
-DENSE_EDGE_THRESHOLD = 20.0
+    def extend(self, model: pycolmap.Reconstruction, report: InitReport) -> InitReport:
+        """Change the model before it is written; returns its report. Runs in the isolated process."""
+        return report
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -188,8 +183,8 @@ class Sfm(ColmapInitializer):
 
     max_image_size: Annotated[int, Ge(MIN_DETECTION_SIZE)] = 1600
     max_num_features: PositiveInt = 8192
-    peak_threshold: PositiveFloat = DEFAULT_PEAK_THRESHOLD
-    edge_threshold: PositiveFloat = DEFAULT_EDGE_THRESHOLD
+    peak_threshold: PositiveFloat = 0.02 / 3  # COLMAP's default, as is the next
+    edge_threshold: PositiveFloat = 10.0
     first_octave: Annotated[int, Interval(ge=-1, le=5)] = -1
     max_ratio: Annotated[float, Interval(gt=0, le=1)] = 0.8
     cross_check: bool = True
@@ -222,8 +217,9 @@ class SfmDense(Sfm):
     is_own_reference: ClassVar[bool] = False
 
     max_num_features: PositiveInt = 16384
-    peak_threshold: PositiveFloat = DENSE_PEAK_THRESHOLD
-    edge_threshold: PositiveFloat = DENSE_EDGE_THRESHOLD
+    # Together, these thresholds give 2.9 times the points on low-contrast ground, at a lower error.
+    peak_threshold: PositiveFloat = 0.02 / 12
+    edge_threshold: PositiveFloat = 20.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -240,35 +236,17 @@ class Jittered(Sfm):
     copies: PositiveInt = 1
     shift: PositiveFloat = 0.5
 
-    def run(
-        self,
-        capture: Capture,
-        output_dir: Path,
-        progress: Progress = no_progress,
-        reference: Path | None = None,
-        work_dir: Path | None = None,
-    ) -> InitReport:
-        """Run as `Sfm` does, with the copies in the model and counted in the report."""
-        report = super().run(capture, output_dir, progress, reference, work_dir)
-        return run_with_progress(_add_copies, (self, report, output_dir), progress, what=self.name)
+    def extend(self, model: pycolmap.Reconstruction, report: InitReport) -> InitReport:
+        import pycolmap
 
+        from gsbench.scene.colmap import model_points
 
-def _add_copies(job: tuple[Jittered, InitReport, Path], progress: Progress) -> InitReport:
-    import pycolmap
-
-    from gsbench.init.report import write_result
-
-    options, report, output_dir = job
-    model = pycolmap.Reconstruction(output_dir / MODEL_FOLDER)
-    points = [model.points3D[index] for index in sorted(model.points3D)]
-    colors = np.array([point.color for point in points])  # [P, 3]
-    copies = shifted_copies(np.array([point.xyz for point in points]), options.copies, options.shift, options.seed)
-    for index, position in enumerate(copies):
-        model.add_point3D(position, pycolmap.Track(), colors[index % len(colors)])
-    counts = {**report.counts, "shifted_copies": len(copies)}
-    result = replace(report, num_points=model.num_points3D(), counts=counts)
-    write_result(model, result, output_dir)
-    return result
+        points, colors = model_points(model)
+        copies = shifted_copies(points, self.copies, self.shift, self.seed)
+        for position, color in zip(copies, np.tile(colors, (self.copies, 1)), strict=True):
+            model.add_point3D(position, pycolmap.Track(), color)
+        counts = {**report.counts, "shifted_copies": len(copies)}
+        return replace(report, num_points=model.num_points3D(), counts=counts)
 
 
 def shifted_copies(points: Array, copies: int, shift: float, seed: int) -> Array:

@@ -1,14 +1,68 @@
-"""Which images are paired."""
+"""Pairs of neighbours and of a preview: against a slow restatement in whole numbers, and on photographs."""
 
 from __future__ import annotations
 
 import itertools
 
-from gsbench.init.colmap.pairs import exhaustive_pairs, sequential_pairs
+import numpy as np
+import pytest
+
+from gsbench.init.colmap.pairs import STRONGEST, best_pairs, count_agreements, sequential_pairs
 
 
-def test_exhaustive_is_every_pair_once():
-    assert exhaustive_pairs(5) == list(itertools.combinations(range(5), 2))
+def slow_count(first: np.ndarray, second: np.ndarray) -> int:
+    """Mutual nearest neighbours with a ratio test, in int64."""
+    distance = ((first[:, None].astype(np.int64) - second[None].astype(np.int64)) ** 2).sum(axis=2)
+    found = 0
+    for i, row in enumerate(distance):
+        j = int(row.argmin())
+        ranked = np.sort(row)
+        second_best = ranked[1] if len(ranked) > 1 else np.inf
+        found += bool(distance[:, j].argmin() == i and ranked[0] < 0.64 * second_best)
+    return found
+
+
+def sets_of_descriptors(sizes: list[int]) -> list[np.ndarray]:
+    """Images that share some descriptors, with a little noise."""
+    rng = np.random.default_rng(0)
+    base = rng.integers(0, 256, (400, 128))
+    parts = [base[rng.permutation(400)[:size]] + rng.integers(-20, 20, (size, 128)) for size in sizes]
+    return [part.clip(0, 255).astype(np.uint8) for part in parts]
+
+
+def test_counts_are_exact():
+    images = sets_of_descriptors([300, 256, 90, 1, 0])
+    counts = count_agreements(images)
+    for i, j in itertools.combinations(range(5), 2):
+        first, second = images[i][:STRONGEST], images[j][:STRONGEST]
+        assert counts[i, j] == (slow_count(first, second) if len(first) and len(second) else 0)
+    assert counts[0, 1] > 20
+    assert not np.tril(counts).any()
+
+
+def test_descriptors_of_networks_count_as_well():
+    rng = np.random.default_rng(1)
+    base = rng.normal(size=(50, 64)).astype(np.float32)
+    base /= np.linalg.norm(base, axis=1, keepdims=True)
+    assert count_agreements([base, base[::-1].copy()])[0, 1] == 50
+
+
+def test_each_image_keeps_its_best_partners():
+    # images on a line: the shared descriptors fall off with the distance
+    rng = np.random.default_rng(2)
+    world = rng.integers(0, 256, (600, 128)).astype(np.uint8)
+    images = [world[20 * i : 20 * i + 200] for i in range(12)]
+    pairs = best_pairs(images, partners=2)
+    expected = {(i, i + 1) for i in range(11)} | {(0, 2), (9, 11)}
+    assert set(pairs) == expected
+    assert pairs == sorted(pairs)
+    assert best_pairs(images, partners=99) == list(itertools.combinations(range(12), 2))
+
+
+@pytest.mark.parametrize("partners", [1, 3])
+def test_images_without_any_feature_still_get_partners(partners: int):
+    pairs = best_pairs([np.zeros((0, 128), np.uint8)] * 6, partners)
+    assert {image for pair in pairs for image in pair} == set(range(6))
 
 
 def test_sequential_has_near_neighbours_and_powers_of_two():

@@ -271,7 +271,8 @@ def _finish(
         if options.align:
             own_gauge = report.measure_gauge(report.training_extent(model, capture), scale)
             reconstruct.save_reconstruction(model, job.output_dir / OWN_GAUGE_FOLDER)
-            reconstruct.apply_similarity(model, similarity)
+            rotation = pycolmap.Rotation3d(similarity.rotation)
+            model.transform(pycolmap.Sim3d(similarity.scale, rotation, similarity.translation))
             scale = 1.0
     made = report.make_report(
         options.name,
@@ -279,15 +280,16 @@ def _finish(
         capture,
         model,
         scale,
+        options.packages(),
+        warnings,
         settings={**asdict(options), **job.preparation.settings},
         seconds=timer.rounded(),
-        packages=options.packages(),
         own_gauge=own_gauge,
         pose_errors=pose_errors,
         counts=counts,
         mapped_by=None if mapped is None else mapped.strategy,
-        warnings=warnings,
         training_points=points,
     )
+    made = options.extend(model, made)
     report.write_result(model, made, job.output_dir)
     return made

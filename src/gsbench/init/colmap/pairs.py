@@ -7,6 +7,7 @@ nearer views already contain most of their tracks.
 """
 
 from collections.abc import Callable, Sequence
+from itertools import combinations
 from typing import Literal
 
 import numpy as np
@@ -15,16 +16,6 @@ from numpy.typing import NDArray
 Pair = tuple[int, int]
 
 Pairing = Literal["exhaustive", "auto", "sequential"]
-
-
-def exhaustive_pairs(count: int) -> list[Pair]:
-    """List every pair of ``count`` images.
-
-    Examples:
-        >>> exhaustive_pairs(3)
-        [(0, 1), (0, 2), (1, 2)]
-    """
-    return [(i, j) for i in range(count) for j in range(i + 1, count)]
 
 
 def sequential_pairs(count: int, overlap: int) -> list[Pair]:
@@ -67,10 +58,8 @@ def proposed_pairs(names: Sequence[str], strongest: Callable[[str], NDArray[np.g
     ``strongest`` returns the descriptors of an image's strongest features.
     """
     if len(names) <= ALL_PAIRS_UP_TO:
-        pairs = exhaustive_pairs(len(names))
-    else:
-        pairs = best_pairs([strongest(name) for name in names])
-    return [(names[first], names[second]) for first, second in pairs]
+        return list(combinations(names, 2))
+    return [(names[first], names[second]) for first, second in best_pairs([strongest(name) for name in names])]
 
 
 def count_agreements(descriptors: Sequence[NDArray[np.generic]]) -> NDArray[np.int64]:

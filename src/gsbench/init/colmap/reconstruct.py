@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,7 +17,7 @@ import pycolmap
 from gsbench.errors import InputError
 from gsbench.init.base import TrainingPoints
 from gsbench.init.colmap.alignment import Similarity, align_poses
-from gsbench.init.colmap.pairs import exhaustive_pairs, sequential_pairs
+from gsbench.init.colmap.pairs import sequential_pairs
 from gsbench.logs import Progress
 from gsbench.scene.colmap import MIN_TRACK, read_reference
 from gsbench.scene.types import Array, Capture
@@ -44,10 +45,8 @@ def load_reference(capture: Capture, reference: Path | None) -> pycolmap.Reconst
 def select_pairs(names: Sequence[str], options: ColmapInitializer) -> list[tuple[str, str]]:
     """The pairs of image names to match; for ``auto`` and ``lowres`` all pairs, from which features select later."""
     if options.pairs == "sequential":
-        pairs = sequential_pairs(len(names), options.overlap)
-    else:
-        pairs = exhaustive_pairs(len(names))
-    return [(names[first], names[second]) for first, second in pairs]
+        return [(names[first], names[second]) for first, second in sequential_pairs(len(names), options.overlap)]
+    return list(combinations(names, 2))
 
 
 def triangulate(
@@ -109,12 +108,10 @@ def common_poses(
     """Centres [N, 3] and rotations [N, 3, 3] of the model, then of the reference, for images with a pose in both."""
     model_poses, reference_poses = poses_by_name(model), poses_by_name(reference)
     names = sorted(model_poses.keys() & reference_poses.keys())
-    arrays = [
-        np.array([poses[name][index] for name in names], dtype=np.float64).reshape(-1, *shape)
-        for poses in (model_poses, reference_poses)
-        for index, shape in ((0, (3,)), (1, (3, 3)))
-    ]
-    return arrays[0], arrays[1], arrays[2], arrays[3]
+    poses = [source[name] for source in (model_poses, reference_poses) for name in names]
+    centers = np.array([center for center, _ in poses]).reshape(2, -1, 3)
+    rotations = np.array([rotation for _, rotation in poses]).reshape(2, -1, 3, 3)
+    return centers[0], rotations[0], centers[1], rotations[1]
 
 
 def similarity_to(model: pycolmap.Reconstruction, reference: pycolmap.Reconstruction) -> Similarity | None:
@@ -129,11 +126,6 @@ def save_reconstruction(model: pycolmap.Reconstruction, folder: Path) -> None:
     """Write ``model`` in COLMAP's binary format."""
     folder.mkdir(parents=True, exist_ok=True)
     model.write_binary(folder)
-
-
-def apply_similarity(model: pycolmap.Reconstruction, similarity: Similarity) -> None:
-    """Transform points and poses of ``model`` in place."""
-    model.transform(pycolmap.Sim3d(similarity.scale, pycolmap.Rotation3d(similarity.rotation), similarity.translation))
 
 
 def pipeline_options(options: ColmapInitializer) -> pycolmap.IncrementalPipelineOptions:
@@ -155,7 +147,8 @@ def keep_training_points(model: pycolmap.Reconstruction, names: Collection[str],
 
     Positions do not change. Colours are read again, from the photographs in the folder ``images``.
     """
-    before, kept = model.num_points3D(), _image_ids(model, names)
+    before = model.num_points3D()
+    kept = {image.image_id for image in model.images.values() if image.has_pose and image.name in names}
     for point_id in sorted(model.points3D):
         point = model.points3D[point_id]
         observations = [
@@ -177,8 +170,3 @@ def keep_training_points(model: pycolmap.Reconstruction, names: Collection[str],
             "out fewer views"
         )
     return TrainingPoints("train", count, before, 1 - count / before if before else 0.0)
-
-
-def _image_ids(model: pycolmap.Reconstruction, names: Collection[str]) -> set[int]:
-    wanted = set(names)
-    return {image.image_id for image in model.images.values() if image.has_pose and image.name in wanted}

@@ -283,7 +283,6 @@ class NetworkJob:
 
     options: FeatureInitializer
     settings: FeatureSettings
-    device: str
     capture: Capture
     reference: Path | None
     work_dir: Path
@@ -305,7 +304,7 @@ def extract_and_match(job: NetworkJob, progress: Progress) -> Preparation:
     """
     options, capture = job.options, job.capture
     torch.set_num_threads(options.num_threads)
-    device = choose_device(job.device)
+    device = choose_device(options.device)
     store = open_store(job)
     reference = load_reference(capture, job.reference)
     names = options.select_images(capture, reference)
@@ -350,7 +349,7 @@ def choose_pairs(job: NetworkJob, names: Sequence[str], pairs: list[tuple[str, s
     """The pairs to match, chosen by the stored features of the images ``names``."""
     if job.options.pairs == "auto":
         store = open_store(job)
-        return proposed_pairs(names, lambda name: store.require_features(name).strongest(STRONGEST).descriptors)
+        return proposed_pairs(names, lambda name: store.require_features(name).descriptors[:STRONGEST])
     if job.options.pairs == "lowres":
         small = open_store(at_low_resolution(job))
         return [pair for pair in pairs if len(small.require_matches(*pair)) > LOWRES_MATCHES]

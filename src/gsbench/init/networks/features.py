@@ -47,18 +47,12 @@ class Features:
         height, width = mask.shape
         columns, rows = np.floor(self.colmap_keypoints).astype(np.int64).T  # [K] each
         kept = mask[rows.clip(0, height - 1), columns.clip(0, width - 1)]
-        chosen = self.keypoints[kept], self.descriptors[kept], self.scores[kept]
-        return Features(*chosen, self.network_size, self.file_size)
+        return self[kept]
 
-    def strongest(self, count: int) -> Features:
-        """The first ``count`` features."""
-        return Features(
-            self.keypoints[:count],
-            self.descriptors[:count],
-            self.scores[:count],
-            self.network_size,
-            self.file_size,
-        )
+    def __getitem__(self, chosen: slice | NDArray[np.bool_]) -> Features:
+        """The features with the ``chosen`` indices."""
+        arrays = self.keypoints[chosen], self.descriptors[chosen], self.scores[chosen]
+        return Features(*arrays, self.network_size, self.file_size)
 
 
 @dataclass(frozen=True, kw_only=True)
