@@ -9,7 +9,7 @@ import torch
 
 from gsbench.densify import DensifyContext, Volumetric
 from gsbench.densify.budget import admit, allowance
-from gsbench.densify.volumetric import child_log_scales, log_condition, log_volume
+from gsbench.densify.volumetric import log_condition, log_volume
 from gsbench.gaussians.paper_values import LearningRates
 from gsbench.gaussians.trainable import TrainableGaussians
 from tests.gaussians.helpers import random_gaussians
@@ -23,7 +23,7 @@ def test_isotropic_keeps_its_size() -> None:
     sphere = scales((0.2, 0.2, 0.2))
     assert math.exp(log_volume(sphere)) == pytest.approx(4 / 3 * math.pi * 0.008)
     assert math.exp(log_condition(sphere)) == pytest.approx(1)
-    torch.testing.assert_close(child_log_scales(sphere), sphere)
+    torch.testing.assert_close(Volumetric().child_log_scales(sphere), sphere)
 
 
 def test_elongated_by_two() -> None:
@@ -31,19 +31,21 @@ def test_elongated_by_two() -> None:
     4^1.5."""
     parent = scales((2.0, 1.0, 1.0))
     assert math.exp(log_condition(parent)) == pytest.approx(4)
-    child = child_log_scales(parent)
+    child = Volumetric().child_log_scales(parent)
     torch.testing.assert_close(child.exp(), torch.tensor([[1.0, 0.5, 0.5]], dtype=torch.float64))
     assert math.exp(log_volume(parent) - log_volume(child)) == pytest.approx(8)
-    as_adc = child_log_scales(parent, "nothing", plain_shrink=1.6)  # no eq. 7
+    as_adc = Volumetric(condition_of="nothing").child_log_scales(parent)  # no eq. 7
     torch.testing.assert_close(as_adc.exp(), parent.exp() / 1.6)
-    in_scales = child_log_scales(parent, "scales")  # s / kappa
+    in_scales = Volumetric(condition_of="scales").child_log_scales(parent)  # s / kappa
     torch.testing.assert_close(in_scales.exp(), torch.tensor([[0.5, 0.25, 0.25]], dtype=torch.float64))
 
 
 def test_needle_vanishes_and_the_limit_prevents_it() -> None:
     needle = scales((1.0, 1e-3, 1e-3))  # kappa = 1e6
-    torch.testing.assert_close(child_log_scales(needle).exp(), torch.tensor([[1e-3, 1e-6, 1e-6]], dtype=torch.float64))
-    limited = child_log_scales(needle, max_condition=4.0)
+    torch.testing.assert_close(
+        Volumetric().child_log_scales(needle).exp(), torch.tensor([[1e-3, 1e-6, 1e-6]], dtype=torch.float64)
+    )
+    limited = Volumetric(max_condition=4.0).child_log_scales(needle)
     torch.testing.assert_close(limited.exp(), torch.tensor([[0.5, 5e-4, 5e-4]], dtype=torch.float64))
 
 

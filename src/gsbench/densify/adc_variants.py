@@ -155,18 +155,12 @@ class QuantileADC(ADC):
 
 
 class Saddles(NamedTuple):
-    """Candidates for growth, with the result of `SteepGS.steepest`."""
+    """Candidates for growth, with the result of `SteepGS.steepest` for each."""
 
-    indices: Tensor  # [C], rising
-    values: Tensor  # [C], least eigenvalues
-    directions: Tensor  # [C, 3], their eigenvectors
+    candidates: Tensor  # mask [N]
     large: Tensor  # mask [N] of all large Gaussians
-
-    def mask(self) -> Tensor:
-        """Mask [N] of the candidates."""
-        mask = torch.zeros_like(self.large)
-        mask[self.indices] = True
-        return mask
+    values: Tensor  # [N], least eigenvalues
+    directions: Tensor  # [N, 3], their eigenvectors
 
 
 @dataclass
@@ -205,14 +199,14 @@ class SteepGS(ADC):
         if step < self.stop:
             self.statistics["splitting_sum"] += render.require_splitting_matrix()
 
-    def steepest(self, index: Tensor) -> tuple[Tensor, Tensor]:
-        """The least eigenvalue [S] of the mean splitting matrix of the Gaussians at ``index`` [S], and its eigenvector
-        [S, 3].
+    def steepest(self, where: Tensor) -> tuple[Tensor, Tensor]:
+        """The least eigenvalue [S] of the mean splitting matrix of the S Gaussians at the mask ``where`` [N], and its
+        eigenvector [S, 3].
 
         Eigenvalues are in units of the loss per squared extent. The largest component of each eigenvector is positive.
         """
-        seen = self.statistics["visible_count"][index].clamp_min(1)  # [S]
-        mean = self.statistics["splitting_sum"][index].double() / seen[:, None, None]  # [S, 3, 3]
+        seen = self.statistics["visible_count"][where].clamp_min(1)  # [S]
+        mean = self.statistics["splitting_sum"][where].double() / seen[:, None, None]  # [S, 3, 3]
         values, vectors = torch.linalg.eigh(mean)  # in rising order
         directions = vectors[..., 0]
         largest = directions.gather(-1, directions.abs().argmax(-1, keepdim=True))  # [S, 1]
@@ -221,16 +215,16 @@ class SteepGS(ADC):
     def saddles(self, refinement: Refinement) -> Saddles:
         """The candidates of ADC whose split lowers the loss."""
         over, large = super().candidates(refinement)
-        index = over.nonzero().squeeze(-1)  # [C]
-        values, directions = self.steepest(index)
+        values = torch.zeros(len(over), dtype=torch.float64, device=over.device)
+        directions = values.new_zeros(len(over), 3)
+        values[over], directions[over] = self.steepest(over)
         if self.eigenvalue_threshold is not None:
-            lowering = values < self.eigenvalue_threshold
-            index, values, directions = index[lowering], values[lowering], directions[lowering]
-        return Saddles(index, values, directions, large)
+            over = over & (values < self.eigenvalue_threshold)
+        return Saddles(over, large, values, directions)
 
     def candidates(self, refinement: Refinement) -> tuple[Tensor, Tensor]:
         saddles = self.saddles(refinement)
-        return saddles.mask(), saddles.large
+        return saddles.candidates, saddles.large
 
     def grown(self, refinement: Refinement) -> Grown:
         values = refinement.gaussians.values
@@ -245,12 +239,10 @@ class SteepGS(ADC):
         """Replace each candidate by two halves."""
         gaussians = refinement.gaussians
         saddles = self.saddles(refinement)
-        gains = torch.zeros(len(gaussians), dtype=torch.float64, device=gaussians.device)
-        gains[saddles.indices] = -saddles.values
-        selected, blocked = admit(saddles.mask(), gains, 1, self.allowance(refinement))
+        selected, blocked = admit(saddles.candidates, -saddles.values, 1, self.allowance(refinement))
         indices = selected.nonzero().squeeze(-1)  # [S]
         parents, is_large = gaussians.values.detach().select(indices), saddles.large[indices].unsqueeze(-1)
-        direction = saddles.directions[selected[saddles.indices]].to(parents.means)  # [S, 3]
+        direction = saddles.directions[indices].to(parents.means)  # [S, 3]
         noise = standard_normal((2 * len(parents), 3), refinement.rng, parents.means)
         lengths = (noise * parents.scales.repeat(2, 1)).norm(dim=-1, keepdim=True)  # [2 S, 1]
         lengths = torch.where(is_large.repeat(2, 1), lengths, gaussians.position_rate)

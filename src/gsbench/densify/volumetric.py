@@ -23,7 +23,6 @@ from gsbench.gaussians.paper_values import VOLUME_THRESHOLD
 from gsbench.settings import OpenFraction, Switch
 
 LOG_SPHERE = math.log(4 * math.pi / 3)
-ConditionOf = Literal["eigenvalues", "scales", "nothing"]
 
 
 def log_volume(log_scales: Tensor) -> Tensor:
@@ -34,27 +33,6 @@ def log_volume(log_scales: Tensor) -> Tensor:
 def log_condition(log_scales: Tensor) -> Tensor:
     """log kappa = 2 (log s_max - log s_min) (eq. 6: the ratio of the eigenvalues s^2), [N] from [N, 3], at least 0."""
     return 2 * (log_scales.amax(-1) - log_scales.amin(-1))
-
-
-def child_log_scales(
-    log_scales: Tensor,
-    applied_to: ConditionOf = "eigenvalues",
-    max_condition: float | None = None,
-    plain_shrink: float = 1.6,
-) -> Tensor:
-    """Log scales of children (eq. 7), [N, 3], given those of their parents.
-
-    ``eigenvalues``: lambda' = lambda / kappa, so log s' = log s - log(kappa) / 2. ``scales``: s' = s / kappa.
-    ``nothing``: s' = s / ``plain_shrink``, as in ADC, instead of eq. 7. ``max_condition`` (at least 1) limits kappa in
-    these divisions.
-    """
-    if applied_to == "nothing":
-        return log_scales - math.log(plain_shrink)
-    condition = log_condition(log_scales)  # [N]
-    if max_condition is not None:
-        condition = condition.clamp_max(math.log(max_condition))
-    factor = 0.5 if applied_to == "eigenvalues" else 1.0
-    return log_scales - (factor * condition).unsqueeze(-1)
 
 
 ThresholdMode = Literal["absolute", "extent_relative", "quantile", "auto"]
@@ -93,7 +71,9 @@ class Volumetric(ADC):
     volume_threshold: PositiveFloat = VOLUME_THRESHOLD
     threshold_mode: ThresholdMode = "absolute"
     volume_quantile: OpenFraction = 0.9978  # 99.78 % of the volumes of Mip-NeRF 360 lie below 0.03
-    condition_of: ConditionOf = "eigenvalues"  # kappa divides eigenvalues (eq. 7) or scales; nothing: as ADC
+    condition_of: Literal["eigenvalues", "scales", "nothing"] = (
+        "eigenvalues"  # kappa divides eigenvalues (eq. 7) or scales; nothing: as ADC
+    )
     max_condition: Annotated[float, Ge(1)] | None = None  # limits kappa, so that children of needles do not vanish
     split_isotropic: bool = True  # False: do not split a Gaussian whose children would be above the threshold again
     volume_children: Annotated[int, Interval(ge=2, le=MAX_CHILDREN)] = 2
@@ -133,8 +113,18 @@ class Volumetric(ADC):
         return start < step < stop and step % (self.volume_interval or self.interval) == 0
 
     def child_log_scales(self, log_scales: Tensor) -> Tensor:
-        """Log scales [N, 3] of children, given those of parents that are split by volume."""
-        return child_log_scales(log_scales, self.condition_of, self.max_condition, self.split_shrink)
+        """Log scales of children (eq. 7), [N, 3], given those of their parents.
+
+        ``condition_of`` says what kappa divides. ``eigenvalues``: lambda' = lambda / kappa, so log s' = log s -
+        log(kappa) / 2. ``scales``: s' = s / kappa. ``nothing``: s' = s / ``split_shrink``, as in ADC, instead of eq. 7.
+        """
+        if self.condition_of == "nothing":
+            return log_scales - math.log(self.split_shrink)
+        condition = log_condition(log_scales)  # [N]
+        if self.max_condition is not None:
+            condition = condition.clamp_max(math.log(self.max_condition))
+        factor = 0.5 if self.condition_of == "eigenvalues" else 1.0
+        return log_scales - (factor * condition).unsqueeze(-1)
 
     @property
     def volume_gain(self) -> int:

@@ -3,15 +3,17 @@
 A metric of your own needs no entry here: ``eval.extra.NAME._target_=mine.MyMetric`` (docs/metric.md).
 """
 
-import math
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, fields
+from typing import Annotated, Literal
 
-from gsbench.errors import InputError
+from annotated_types import Interval, Predicate
+from pydantic import PositiveFloat, StrictStr
+
 from gsbench.runs.trial_record import MetricRecord
+from gsbench.settings import check_values
 
 MORE = "eval.more"  # the setting that lists metrics which are computed only on request
 LPIPS = "lpips_"  # prefix of the keys of LPIPS; the rest is the variant, as in ``eval.lpips``
-DECIMALS = 3  # default of a user's metric
 
 
 @dataclass(frozen=True)
@@ -19,11 +21,13 @@ class MetricFacts:
     """The facts about a metric that tables, verdicts and reports need."""
 
     key: str  # in results, per-view files and ``--metrics``
-    label: str  # in tables
-    direction: int  # +1: more is better; -1: less is better; 0: not known, so there is no verdict
-    decimals: int  # in tables
-    unit: str = ""
-    worthwhile: float | None = None  # the smallest difference worth resolving, about what papers claim as improvements
+    label: Annotated[StrictStr, Predicate(lambda text: bool(text.strip()))]  # in tables
+    direction: Literal[-1, 0, 1] = 0  # 1: more is better; -1: less is better; 0: not known, so there is no verdict
+    decimals: Annotated[int, Interval(ge=0, le=12)] = 3  # in tables
+    unit: StrictStr = ""
+    worthwhile: PositiveFloat | None = (
+        None  # the smallest difference worth resolving, about what papers claim as improvements
+    )
     perceptual: bool = False  # meant to agree with human vision
     setting: str = ""  # the setting that requests it; empty: it is always computed
     lowest: float | None = None  # lower bound of its values; None: none or unknown
@@ -40,7 +44,7 @@ def _lpips(variant: str, label: str, words: str) -> MetricFacts:
     return MetricFacts(f"{LPIPS}{variant}", label, -1, 3, "", 0.005, True, "eval.lpips", 0.0, words=words)
 
 
-def _structural(key: str, label: str, direction: int, highest: float, words: str) -> MetricFacts:
+def _structural(key: str, label: str, direction: Literal[-1, 1], highest: float, words: str) -> MetricFacts:
     """A metric of structure without weights, computed if ``eval.more`` names it."""
     return MetricFacts(key, label, direction, 4, "", 0.002, True, MORE, 0.0, highest, words)
 
@@ -91,37 +95,15 @@ def find_metric(key: str) -> MetricFacts | None:
 
 def facts_of(key: str, metric: object) -> MetricFacts:
     """The facts about a user's metric, from the attributes of its class; raises InputError for a wrong attribute."""
-    label, unit = getattr(metric, "label", key), getattr(metric, "unit", "")
-    direction, decimals = getattr(metric, "direction", 0), getattr(metric, "decimals", DECIMALS)
-    worthwhile = getattr(metric, "worthwhile", None)
-    rules = [
-        ("direction", direction in (-1, 0, 1), "1 (more is better), -1 (less is better) or 0", direction),
-        ("decimals", _is_count(decimals), "a whole number from 0 to 12", decimals),
-        ("label", isinstance(label, str) and bool(label.strip()), "a text", label),
-        ("unit", isinstance(unit, str), "a text", unit),
-        ("worthwhile", worthwhile is None or _is_positive(worthwhile), "a number above 0", worthwhile),
-    ]
-    for name, holds, rule, value in rules:
-        if not holds:
-            raise InputError(f"{type(metric).__qualname__}.{name} must be {rule}, got {value!r}")
-    return MetricFacts(key, label, direction, decimals, unit, worthwhile)
+    given = {field.name: getattr(metric, field.name) for field in fields(MetricRecord) if hasattr(metric, field.name)}
+    return MetricFacts(key, **({"label": key} | check_values(MetricFacts, given, type(metric).__qualname__)))
 
 
 def to_record(facts: MetricFacts) -> MetricRecord:
     """The facts about a user's metric for its results, so that tables need not import its class."""
-    return MetricRecord(**{entry.name: getattr(facts, entry.name) for entry in fields(MetricRecord)})
+    return MetricRecord(**{field.name: getattr(facts, field.name) for field in fields(MetricRecord)})
 
 
 def from_record(key: str, record: MetricRecord | None) -> MetricFacts:
     """The facts about a user's metric from its results; without a record, only its key is known."""
-    if record is None:
-        return MetricFacts(key, key, 0, DECIMALS)
-    return MetricFacts(key, record.label, record.direction, record.decimals, record.unit, record.worthwhile)
-
-
-def _is_count(value: object) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= 12
-
-
-def _is_positive(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value) and value > 0
+    return MetricFacts(key, label=key) if record is None else MetricFacts(key, **asdict(record))

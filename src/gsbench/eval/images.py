@@ -57,6 +57,13 @@ def mix_channels(images: Tensor, weights: tuple[float, float, float]) -> Tensor:
     return images[:, :1] * red + images[:, 1:2] * green + images[:, 2:] * blue
 
 
+def halved(images: Tensor, padding: str) -> Tensor:
+    """Means [B, C, H / 2, W / 2] of 2x2 px of [B, C, H, W]; odd sides are padded in torch's mode ``padding``."""
+    height, width = images.shape[-2:]
+    padded = torch.nn.functional.pad(images, [0, width % 2, 0, height % 2], mode=padding)
+    return torch.nn.functional.avg_pool2d(padded, 2)
+
+
 def similarity(first: Tensor, second: Tensor, constant: float) -> Tensor:
     """``(2 a b + c) / (a² + b² + c)`` of two maps of the same shape: 1 where they are equal."""
     return (2 * first * second + constant) / (first.square() + second.square() + constant)

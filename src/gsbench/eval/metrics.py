@@ -4,11 +4,21 @@ Images are torch tensors in [0, 1], either one image [H, W, 3] (the value is a 0
 [B, 3, H, W] (the values are [B]).
 """
 
+from typing import Any
+
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
-from gsbench.eval.images import LUMA, as_batch, check_pair, check_size, gradient_magnitude, mix_channels, similarity
+from gsbench.eval.images import (
+    LUMA,
+    as_batch,
+    check_pair,
+    check_size,
+    gradient_magnitude,
+    halved,
+    mix_channels,
+    similarity,
+)
 from gsbench.eval.protocol import FLIP_PPD
 
 
@@ -29,27 +39,24 @@ def flip(image: Tensor, target: Tensor, ppd: float = FLIP_PPD) -> Tensor:
     Andersson et al. 2020, "FLIP: a difference evaluator for alternating images", computed by NVIDIA's library
     ``flip-evaluator``. Raises ModuleNotFoundError if it is not installed.
     """
-    import flip_evaluator
-
     check_pair(image, target)
-    tests = as_batch(image).permute(0, 2, 3, 1).float().cpu().contiguous().numpy()  # [B, H, W, 3]
-    references = as_batch(target).permute(0, 2, 3, 1).float().cpu().contiguous().numpy()  # [B, H, W, 3]
-    means = [
-        flip_evaluator.evaluate(reference, test, "LDR", applyMagma=False, parameters={"ppd": ppd})[1]
-        for reference, test in zip(references, tests, strict=True)
-    ]
-    values = torch.tensor(means, device=image.device)  # [B]
+    pairs = zip(*(as_batch(x).permute(0, 2, 3, 1) for x in (image, target)), strict=True)
+    values = torch.tensor([_mean_and_errors(x, y, ppd)[0] for x, y in pairs], device=image.device)  # [B]
     return values[0] if image.ndim == 3 else values
 
 
 def flip_map(image: Tensor, target: Tensor, ppd: float = FLIP_PPD) -> Tensor:
     """The FLIP error of every pixel, [H, W], of images [H, W, 3]; otherwise as `flip`."""
+    check_pair(image, target)
+    return torch.as_tensor(_mean_and_errors(image, target, ppd)[1], device=image.device).reshape(image.shape[:2])
+
+
+def _mean_and_errors(image: Tensor, target: Tensor, ppd: float) -> tuple[float, Any]:
     import flip_evaluator
 
-    check_pair(image, target)
     test, reference = (x.float().cpu().contiguous().numpy() for x in (image, target))
-    errors, *_ = flip_evaluator.evaluate(reference, test, "LDR", applyMagma=False, parameters={"ppd": ppd})
-    return torch.as_tensor(errors, device=image.device).reshape(image.shape[:2])
+    errors, mean, _ = flip_evaluator.evaluate(reference, test, "LDR", applyMagma=False, parameters={"ppd": ppd})
+    return mean, errors
 
 
 PREWITT = (1 / 3, 1 / 3, 1 / 3)
@@ -66,13 +73,8 @@ def gmsd(image: Tensor, target: Tensor) -> Tensor:
     """
     check_pair(image, target)
     check_size(as_batch(image), GMSD_MIN_SIZE, "GMSD")
-    first, second = (gradient_magnitude(_halved_luminance(as_batch(x)), PREWITT) for x in (image, target))
+    first, second = (
+        gradient_magnitude(halved(mix_channels(as_batch(x), LUMA), "constant"), PREWITT) for x in (image, target)
+    )
     values = similarity(first, second, CONSTANT).flatten(1).std(dim=1, correction=0)  # [B]
     return values[0] if image.ndim == 3 else values
-
-
-def _halved_luminance(images: Tensor) -> Tensor:
-    """[B, 3, H, W] -> [B, 1, H / 2, W / 2], rounded up."""
-    luminance = mix_channels(images, LUMA)
-    height, width = luminance.shape[-2:]
-    return F.avg_pool2d(F.pad(luminance, [0, width % 2, 0, height % 2]), 2)

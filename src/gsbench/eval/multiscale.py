@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from gsbench.eval.images import LUMA, as_batch, check_pair, check_size, mix_channels
+from gsbench.eval.images import LUMA, as_batch, check_pair, check_size, halved, mix_channels
 from gsbench.eval.ssim import WINDOW_SIZE, ssim_parts
 
 # Weights of the scales, from the finest: Wang, Simoncelli and Bovik 2003, section 3.2. IW-SSIM uses the same.
@@ -40,7 +40,7 @@ def ms_ssim(image: Tensor, target: Tensor) -> Tensor:
         luminance, structure = ssim_parts(x, y, "valid")
         compared = structure if scale < SCALES - 1 else luminance * structure
         values = values * compared.mean(dim=(2, 3)).clamp_min(0) ** weight
-        x, y = _halved(x), _halved(y)
+        x, y = halved(x, "replicate"), halved(y, "replicate")
     means = values.mean(dim=1)  # [B]
     return means[0] if image.ndim == 3 else means
 
@@ -59,11 +59,6 @@ def iw_ssim(image: Tensor, target: Tensor) -> Tensor:
     check_size(x, MIN_SIZE, "IW-SSIM")
     values = [_iw_ssim(one, other) for one, other in zip(x.split(1), y.split(1), strict=True)]
     return values[0] if image.ndim == 3 else torch.stack(values)
-
-
-def _halved(images: Tensor) -> Tensor:
-    height, width = images.shape[-2:]
-    return F.avg_pool2d(F.pad(images, [0, width % 2, 0, height % 2], mode="replicate"), 2)
 
 
 def _iw_ssim(image: Tensor, target: Tensor) -> Tensor:

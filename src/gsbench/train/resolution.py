@@ -60,9 +60,8 @@ def scale_schedule(images: Sequence[NDArray[np.uint8]], until: int) -> ScaleSche
     scales = [largest, *(1 / _first_reaching(fractions, mean, energy) for energy in energies[1:-1]), 1.0]
     begins = [int(until * math.log(e / first) / math.log(whole / first)) if whole > first else 0 for e in energies]
     begins[-1] = until
-    # Of several points at the same iteration, keep the last.
-    kept = [i for i in range(NUM_POINTS) if i == NUM_POINTS - 1 or begins[i] < begins[i + 1]]
-    return ScaleSchedule(tuple(begins[i] for i in kept), tuple(float(scales[i]) for i in kept))
+    points = dict(zip(begins, map(float, scales), strict=True))  # of several points at one iteration, the last
+    return ScaleSchedule(tuple(points), tuple(points.values()))
 
 
 def _window_sizes(shapes: set[tuple[int, ...]]) -> NDArray[np.float64]:

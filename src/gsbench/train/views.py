@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -83,42 +83,37 @@ class Targets:
         return image.pin_memory().to(self._device, non_blocking=True)
 
 
+@dataclass(frozen=True)
 class SceneViews:
     """Training views for densifiers, rendered and measured as in training (`gsbench.densify.scores.TrainingViews`).
 
-    ``sh_degree`` maps an iteration to its degree of spherical harmonics. Pixels that a mask ignores are replaced by
-    those of the photograph, so that they have no error and no gradient.
+    Pixels that a mask ignores are replaced by those of the photograph, so that they have no error and no gradient.
     """
 
-    def __init__(
-        self,
-        views: Sequence[View],
-        targets: Targets,
-        rasterizer: Rasterizer,
-        background: Tensor,
-        loss: PhotometricLoss,
-        sh_degree: Callable[[int], int],
-    ) -> None:
-        self._views, self._targets, self._rasterizer = views, targets, rasterizer
-        self._background, self._loss, self._sh_degree = background, loss, sh_degree
+    views: Sequence[View]
+    targets: Targets
+    rasterizer: Rasterizer
+    background: Tensor
+    photometric_loss: PhotometricLoss
+    sh_degree: Callable[[int], int]  # at an iteration
 
     def __len__(self) -> int:
-        return len(self._views)
+        return len(self.views)
 
     def image(self, index: int) -> Tensor:
-        return self._targets.get(index)
+        return self.targets.get(index)
 
     def render(self, index: int, gaussians: Gaussians, step: int) -> RenderOutput:
-        camera, degree = self._views[index].camera, self._sh_degree(step)
-        render = self._rasterizer.render(gaussians, camera, degree, self._background)
-        mask = self._targets.mask(index)
+        camera, degree = self.views[index].camera, self.sh_degree(step)
+        render = self.rasterizer.render(gaussians, camera, degree, self.background)
+        mask = self.targets.mask(index)
         if mask is None:
             return render
-        return replace(render, image=replace_ignored(render.image, self._targets.get(index), mask))
+        return replace(render, image=replace_ignored(render.image, self.targets.get(index), mask))
 
     def dissimilarity(self, index: int, image: Tensor) -> Tensor:
-        target = as_unit_range(self._targets.get(index), image.dtype)
+        target = as_unit_range(self.targets.get(index), image.dtype)
         return (1 - ssim_map(image, target).mean(0)).clamp_min(0)
 
     def loss(self, index: int, image: Tensor) -> Tensor:
-        return self._loss(image, self._targets.get(index))[0].detach()
+        return self.photometric_loss(image, self.targets.get(index))[0].detach()
