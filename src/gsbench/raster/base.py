@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -42,18 +42,50 @@ def slope_limits(camera: Camera, constants: RasterConstants = CONSTANTS) -> tupl
     )
 
 
-def projection_numbers(camera: Camera) -> list[float]:
-    """A camera as numbers for compiled kernels: focal lengths, px; principal point, px, with integer pixel centres;
-    limits of the slopes; rotation by rows; centre."""
-    return [
-        camera.fx,
-        camera.fy,
-        camera.cx - 0.5,
-        camera.cy - 0.5,
-        *slope_limits(camera),
-        *map(float, camera.rotation.ravel()),
-        *map(float, camera.center),
-    ]
+class CameraNumbers(NamedTuple):
+    """A camera as plain numbers for compiled kernels."""
+
+    width: int  # px
+    height: int
+    tiles_x: int
+    tiles_y: int
+    fx: float
+    fy: float
+    pixel_cx: float  # px, integer pixel centres
+    pixel_cy: float
+    slope_x_min: float  # limits of x/z in the Jacobian
+    slope_x_max: float
+    slope_y_min: float
+    slope_y_max: float
+    r00: float
+    r01: float
+    r02: float
+    r10: float
+    r11: float
+    r12: float
+    r20: float
+    r21: float
+    r22: float
+    center_x: float
+    center_y: float
+    center_z: float
+
+    @classmethod
+    def of(cls, camera: Camera) -> CameraNumbers:
+        tile = CONSTANTS.tile
+        return cls(
+            camera.width,
+            camera.height,
+            -(-camera.width // tile),
+            -(-camera.height // tile),
+            camera.fx,
+            camera.fy,
+            camera.cx - 0.5,
+            camera.cy - 0.5,
+            *slope_limits(camera),
+            *map(float, camera.rotation.ravel()),
+            *map(float, camera.center),
+        )
 
 
 @dataclass(frozen=True)

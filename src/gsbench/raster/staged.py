@@ -145,6 +145,7 @@ class RenderRequest(NamedTuple):
     degree: int
     background: Tensor
     absolute: Tensor | None
+    lifetime: Lifetime  # of the frame's memory: the graph and the footprint refer to this request
 
 
 class Gradients(NamedTuple):
@@ -169,10 +170,8 @@ class StagedRasterizer(ABC, Generic[FrameT]):
         """Raise ValueError if the stages cannot use tensors of this dtype or device."""
 
     @abstractmethod
-    def forward(
-        self, lifetime: Lifetime, gaussians: Gaussians, request: RenderRequest
-    ) -> tuple[Tensor, Tensor, Tensor, FrameT]:
-        """Return image [H, W, 3], alpha [H, W], radii [N] and the frame, whose memory is leased for ``lifetime``."""
+    def forward(self, gaussians: Gaussians, request: RenderRequest) -> tuple[Tensor, Tensor, Tensor, FrameT]:
+        """Return image [H, W, 3], alpha [H, W], radii [N] and the frame, with memory for ``request.lifetime``."""
 
     @abstractmethod
     def backward(
@@ -187,7 +186,9 @@ class StagedRasterizer(ABC, Generic[FrameT]):
         """Compute the gradients, given those by image and alpha."""
 
     @abstractmethod
-    def footprint(self, frame: FrameT, gaussians: Gaussians, camera: Camera, values: Tensor | None = None) -> Footprint:
+    def footprint(
+        self, frame: FrameT, gaussians: Gaussians, request: RenderRequest, values: Tensor | None = None
+    ) -> Footprint:
         """See ``raster.base.RenderOutput``."""
 
     def render(
@@ -205,30 +206,11 @@ class StagedRasterizer(ABC, Generic[FrameT]):
         screen_points = torch.zeros_like(gaussians.means[:, :2], requires_grad=True)
         absolute = torch.zeros_like(screen_points) if absolute_gradient else None
         probe = screen_points.new_zeros(len(gaussians), 3, 3, requires_grad=True) if splitting_matrix else None
-        request = RenderRequest(camera, sh_degree, background.detach().contiguous(), absolute)
-        state: _RenderState[FrameT] = _RenderState()
+        request = RenderRequest(camera, sh_degree, background.detach().contiguous(), absolute, Lifetime())
         tensors = gaussians.tensors().values()
-        image, alpha, radii = _Render.apply(self, state, request, background, screen_points, probe, *tensors)
-        footprint = partial(_footprint, self, state, gaussians.map(Tensor.detach), camera)
+        image, alpha, radii, frame = _Render.apply(self, request, background, screen_points, probe, *tensors)
+        footprint = partial(self.footprint, frame, gaussians.detach(), request)
         return RenderOutput(image, alpha, radii, screen_points, absolute, footprint, probe)
-
-
-class _RenderState(Generic[FrameT]):
-    """State of a render for its backward pass and its footprint, with the token of the leased memory."""
-
-    frame: FrameT
-    lifetime: Lifetime
-
-
-def _footprint(
-    rasterizer: StagedRasterizer[FrameT],
-    state: _RenderState[FrameT],
-    gaussians: Gaussians,
-    camera: Camera,
-    values: Tensor | None = None,
-) -> Footprint:
-    """See ``raster.base.RenderOutput``. The reference to ``state`` keeps the frame's memory leased."""
-    return rasterizer.footprint(state.frame, gaussians, camera, values)
 
 
 class _Render(torch.autograd.Function):
@@ -237,35 +219,32 @@ class _Render(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any,
-        rasterizer: StagedRasterizer[Any],
-        state: _RenderState[Any],
+        rasterizer: StagedRasterizer[FrameT],
         request: RenderRequest,
         background: Tensor,
         screen_points: Tensor,
         probe: Tensor | None,
         *tensors: Tensor,
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    ) -> tuple[Tensor, Tensor, Tensor, FrameT]:
         gaussians = Gaussians(*(tensor.contiguous() for tensor in tensors))
-        state.lifetime = Lifetime()
-        image, alpha, radii, state.frame = rasterizer.forward(state.lifetime, gaussians, request)
-        ctx.rasterizer, ctx.state, ctx.request = rasterizer, state, request
-        _, _, _, wants_background, *_ = ctx.needs_input_grad
+        image, alpha, radii, frame = rasterizer.forward(gaussians, request)
+        ctx.rasterizer, ctx.frame, ctx.request = rasterizer, frame, request
+        _, _, wants_background, *_ = ctx.needs_input_grad
         ctx.save_for_backward(alpha if wants_background else None, *gaussians.tensors().values())
         ctx.set_materialize_grads(False)
         ctx.mark_non_differentiable(radii)
-        return image, alpha, radii
+        return image, alpha, radii, frame
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, g_image: Tensor | None, g_alpha: Tensor | None, _: None) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, g_image: Tensor | None, g_alpha: Tensor | None, *_: None) -> tuple[Tensor | None, ...]:
         alpha, *tensors = ctx.saved_tensors
         request: RenderRequest = ctx.request
         if g_image is None:
             g_image = request.background.new_zeros(request.camera.height, request.camera.width, 3)
         g_image = g_image.contiguous()
         g_alpha = None if g_alpha is None else g_alpha.contiguous()
-        _, _, _, _, _, wants_splitting, *_ = ctx.needs_input_grad
-        frame, gaussians = ctx.state.frame, Gaussians(*tensors)
-        gradients = ctx.rasterizer.backward(frame, gaussians, request, g_image, g_alpha, wants_splitting)
+        _, _, _, _, wants_splitting, *_ = ctx.needs_input_grad
+        gradients = ctx.rasterizer.backward(ctx.frame, Gaussians(*tensors), request, g_image, g_alpha, wants_splitting)
         g_background = None if alpha is None else (g_image * (1 - alpha).unsqueeze(-1)).sum((0, 1))
-        return None, None, None, g_background, gradients.screen, gradients.splitting, *gradients.tensors
+        return None, None, g_background, gradients.screen, gradients.splitting, *gradients.tensors

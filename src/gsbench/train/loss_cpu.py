@@ -32,7 +32,7 @@ BYTE_MAX = np.float32(255)
 
 
 @inlined
-def _blur_row(source: Any, start: int, target: Any, place: int, numbers: int) -> None:
+def _blur_row(source, start, target, place, numbers):
     """Filter the padded row at ``source[start:]`` horizontally into ``target[place:]``, without padding."""
     for i in range(0, numbers, LANES):
         center = start + PAD + i
@@ -44,7 +44,7 @@ def _blur_row(source: Any, start: int, target: Any, place: int, numbers: int) ->
 
 
 @inlined
-def _blur_column(ring: Any, first: int, i: int, row: int, stride: int) -> Any:
+def _blur_column(ring, first, i, row, stride):
     """Filter vertically around ``row`` at number ``i``. Rows of the ring start at ``first``, ``stride`` apart."""
     total = load(ring, first + row % TAPS * stride + i) * WEIGHTS[0]
     for k in range(1, WINDOW_RADIUS + 1):
@@ -56,14 +56,14 @@ def _blur_column(ring: Any, first: int, i: int, row: int, stride: int) -> Any:
 
 
 @inlined
-def _sum(vector: Any, scratch: Any) -> float:
+def _sum(vector, scratch):
     """The sum of the 16 lanes as float64."""
     store(scratch, 0, lane_sums((vector, vector)))
     return np.float64(scratch[0])
 
 
 @inlined
-def _read_row(image: Any, row: int, numbers: int, divisor: Any, out: Any) -> None:
+def _read_row(image, row, numbers, divisor, out):
     """Read a row of a float32 or uint8 image, divided by ``divisor``, into ``out`` behind its PAD zeros."""
     start = row * numbers
     if numbers < LANES:
@@ -76,7 +76,7 @@ def _read_row(image: Any, row: int, numbers: int, divisor: Any, out: Any) -> Non
 
 
 @inlined
-def _write_row(line: Any, row: int, numbers: int, image: Any) -> None:
+def _write_row(line, row, numbers, image):
     """The inverse of ``_read_row``; ``line`` has no padding."""
     start = row * numbers
     if numbers < LANES:
@@ -89,18 +89,7 @@ def _write_row(line: Any, row: int, numbers: int, image: Any) -> None:
 
 
 @kernel
-def similarity_rows(
-    memory: Any,
-    begin: int,
-    end: int,
-    height: int,
-    width: int,
-    image: Any,
-    target: Any,
-    divisor: Any,
-    derivatives: Any,
-    sums: Any,
-) -> None:
+def similarity_rows(memory, begin, end, height, width, image, target, divisor, derivatives, sums):
     """Write the sums of SSIM and of |image - target| of the rows ``begin`` to ``end`` to ``sums`` [H, 2].
 
     ``derivatives`` [3, H, PAD + 3 W rounded up + PAD], if not empty, gets the derivatives of the sum of SSIM by the
@@ -170,19 +159,8 @@ def similarity_rows(
 
 @kernel
 def gradient_rows(
-    memory: Any,
-    begin: int,
-    end: int,
-    height: int,
-    width: int,
-    image: Any,
-    target: Any,
-    divisor: Any,
-    derivatives: Any,
-    l1_factor: Any,
-    ssim_factor: Any,
-    gradient: Any,
-) -> None:
+    memory, begin, end, height, width, image, target, divisor, derivatives, l1_factor, ssim_factor, gradient
+):
     """Compute the rows ``begin`` to ``end`` of ``gradient`` [H * W * 3]. The symmetric blur is its own adjoint."""
     numbers = width * CHANNELS
     length = (numbers + LANES - 1) // LANES * LANES

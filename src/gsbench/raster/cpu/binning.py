@@ -6,7 +6,6 @@ because the Gaussian is invisible there.
 """
 
 import math
-from typing import Any
 
 import numpy as np
 
@@ -26,7 +25,7 @@ PASSES = 3  # over the 31 bits of a positive float32
 
 
 @kernel
-def sort_by_depth(begins: Any, visible: Any, keys: Any, order: Any, spare: Any, counts: Any) -> None:
+def sort_by_depth(begins, visible, keys, order, spare, counts):
     """Sort the ``keys`` of all shards by depth into ``order``; shard s has ``visible[s]`` keys from ``begins[s]`` on.
 
     The sort is stable. ``spare`` is as long as ``order``; ``counts`` [PASSES, BUCKETS] is scratch. It is a radix sort,
@@ -57,14 +56,14 @@ def sort_by_depth(begins: Any, visible: Any, keys: Any, order: Any, spare: Any, 
 
 
 @inlined
-def _put(key: Any, digit: int, counts: Any, target: Any) -> None:
+def _put(key, digit, counts, target):
     bucket = (key >> np.uint64(32 + DIGIT * digit)) & np.uint64(BUCKETS - 1)
     target[counts[digit, bucket]] = key
     counts[digit, bucket] += 1
 
 
 @inlined
-def _columns(records: Any, base: int, tile_y: int, first: int, past: int, reach: Any, flatness: Any) -> Any:
+def _columns(records, base, tile_y, first, past, reach, flatness):
     """The tiles of row ``tile_y``, within ``first`` to ``past``, that the contour reaches: first, past-the-last.
 
     The contour is t^2 = ``reach`` - ``flatness`` dy^2, with t = dx + shear dy.
@@ -86,19 +85,7 @@ def _columns(records: Any, base: int, tile_y: int, first: int, past: int, reach:
 
 
 @kernel
-def pair_shards(
-    first: int,
-    past: int,
-    edges: Any,
-    keys: Any,
-    records: Any,
-    record_ints: Any,
-    tiles_x: int,
-    cutoff: Any,
-    counts: Any,
-    pairs: Any,
-    made: Any,
-) -> None:
+def pair_shards(first, past, edges, keys, records, record_ints, tiles_x, cutoff, counts, pairs, made):
     """Write all pairs of tile (high word) and record, for the shards ``first`` to ``past`` of the sorted ``keys``.
 
     Shard s has the keys from ``edges[s]`` to ``edges[s + 1]`` and writes to ``pairs[s]``. ``counts[s]`` [tiles] gets
@@ -110,9 +97,7 @@ def pair_shards(
 
 
 @inlined
-def _pair(
-    begin: int, end: int, keys: Any, records: Any, record_ints: Any, tiles_x: int, cutoff: Any, counts: Any, pairs: Any
-) -> int:
+def _pair(begin, end, keys, records, record_ints, tiles_x, cutoff, counts, pairs):
     for tile in range(len(counts)):
         counts[tile] = 0
     room = np.uint64(len(pairs))
@@ -139,7 +124,7 @@ def _pair(
 
 
 @kernel
-def start_tiles(counts: Any, starts: Any) -> None:
+def start_tiles(counts, starts):
     """Replace ``counts`` [shards, tiles] by places of first entries; fill ``starts`` [tiles + 1], those of tiles."""
     shards, tiles = counts.shape
     place = 0
@@ -153,7 +138,7 @@ def start_tiles(counts: Any, starts: Any) -> None:
 
 
 @kernel
-def fill_shards(first: int, past: int, made: Any, pairs: Any, places: Any, entries: Any) -> None:
+def fill_shards(first, past, made, pairs, places, entries):
     """Write the records of the shards ``first`` to ``past`` to the lists of their tiles.
 
     Shard s has ``made[s]`` of ``pairs[s]``; ``places[s]`` [tiles] is where its next entry of each tile goes.
@@ -167,7 +152,7 @@ def fill_shards(first: int, past: int, made: Any, pairs: Any, places: Any, entri
 
 
 @kernel
-def balance_tiles(starts: Any, shards: int, bounds: Any, tile_shard: Any) -> None:
+def balance_tiles(starts, shards, bounds, tile_shard):
     """Divide the tiles into ``shards`` runs of similar work; fill ``bounds`` [shards + 1] and ``tile_shard``."""
     tiles = len(tile_shard)
     total = starts[tiles] + TILE_WORK * tiles

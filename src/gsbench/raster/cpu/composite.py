@@ -5,7 +5,6 @@ record may touch; the forward pass stores it in ``masks`` for the backward pass.
 """
 
 import math
-from typing import Any
 
 import numpy as np
 
@@ -57,7 +56,7 @@ PIXEL_Y = np.concatenate([block // BLOCK * BLOCK + LANE_Y for block in range(LAN
 
 
 @inlined
-def _touched_blocks(records: Any, base: int, tile_x: Any, tile_y: Any, column: Any, row: Any) -> Any:
+def _touched_blocks(records, base, tile_x, tile_y, column, row):
     """Bit b: block b of the tile at pixel (tile_x, tile_y) may have a pixel with alpha >= 1/255.
 
     Within a block, alpha is largest at the mean or, if the mean is outside, on an edge that faces the mean. The maximum
@@ -82,14 +81,7 @@ def _touched_blocks(records: Any, base: int, tile_x: Any, tile_y: Any, column: A
 
 
 @kernel
-def composite_tiles(
-    memory: Any,
-    first: int,
-    past: int,
-    frame: Any,
-    image: Any,
-    alpha: Any,
-) -> None:
+def composite_tiles(memory, first, past, frame, image, alpha):
     """Blend the tiles ``first`` to ``past`` into ``image`` [H * W * 3] and ``alpha`` [H * W].
 
     It fills ``masks``, ``processed``, ``transmittance`` and ``last`` of ``frame`` for the backward pass. ``last`` is
@@ -215,22 +207,13 @@ def composite_tiles(
 
 
 @inlined
-def place_in_tile(x: int, y: int) -> int:
+def place_in_tile(x, y):
     """The index of pixel (x, y) of a tile in the order by block and lane."""
     return (((y >> 2) * 4 + (x >> 2)) << 4) + (y & 3) * 4 + (x & 3)
 
 
 @kernel
-def composite_backward_tiles(
-    memory: Any,
-    first: int,
-    past: int,
-    frame: Any,
-    g_image: Any,
-    g_alpha: Any,
-    all_rows: Any,
-    want_absolute: bool,
-) -> None:
+def composite_backward_tiles(memory, first, past, frame, g_image, g_alpha, all_rows, want_absolute):
     """Add the gradient sums of the tiles ``first`` to ``past``, back to front, to the rows of their shards in
     ``all_rows`` [shards, N * 16].
 
@@ -354,16 +337,7 @@ def composite_backward_tiles(
 
 
 @kernel
-def cover_tiles(
-    memory: Any,
-    first: int,
-    past: int,
-    frame: Any,
-    values: Any,
-    covered: Any,
-    sums: Any,
-    distances: Any,
-) -> None:
+def cover_tiles(memory, first, past, frame, values, covered, sums, distances):
     """Add the footprints of the tiles ``first`` to ``past`` to ``covered`` [N] int32, ``sums`` and ``distances`` [N] of
     their shards.
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gsbench.gaussians.model import Gaussians
-from gsbench.raster.base import CONSTANTS, Footprint, view_depths
+from gsbench.raster.base import CONSTANTS, CameraNumbers, Footprint, view_depths
 from gsbench.raster.cpu import layout as at
 from gsbench.raster.cpu.binning import (
     BUCKETS,
@@ -25,7 +25,6 @@ from gsbench.raster.cpu.projection import BAD_VALUE, VISIBLE, backproject_shards
 from gsbench.raster.cpu.shuffle import REST
 from gsbench.raster.cpu.workspace import HEADROOM, Arena, ArenaPool, ShardRunner, TensorPool
 from gsbench.raster.staged import Gradients, Lifetime, RenderRequest, StagedRasterizer, raise_for_values
-from gsbench.scene.types import Camera
 from gsbench.system.resources import available_cores
 
 # Fixed numbers, so that results have the same bits for any number of threads. Each shard of tiles sums gradients in its
@@ -70,14 +69,12 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
         if means.dtype != torch.float32 or means.device.type != "cpu":
             raise ValueError(f"means: raster=cpu needs float32 on the cpu, got {means.dtype} on {means.device}")
 
-    def forward(
-        self, lifetime: Lifetime, gaussians: Gaussians, request: RenderRequest
-    ) -> tuple[Tensor, Tensor, Tensor, ForwardPass]:
+    def forward(self, gaussians: Gaussians, request: RenderRequest) -> tuple[Tensor, Tensor, Tensor, ForwardPass]:
         """Project, sort, bin, composite; see `StagedRasterizer`."""
-        count, view = len(gaussians), at.make_camera(request.camera)
+        count, view = len(gaussians), CameraNumbers.of(request.camera)
         image, alpha = self._tensors.empty((view.height, view.width, 3)), self._tensors.empty((view.height, view.width))
         radii = torch.empty(count, dtype=torch.int32)
-        arena = self._frames.lease(lifetime)
+        arena = self._frames.lease(request.lifetime)
         records = arena.take("records", (count * at.RECORD,), np.float32)
         record_ints = records.view(np.int32)
         keys = arena.take("keys", (count,), np.uint64)
@@ -120,7 +117,7 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
         return image, alpha, radii, ForwardPass(frame, request.degree, flags[:, VISIBLE])
 
     def _list_tiles(
-        self, arena: Arena, view: at.CpuCamera, order: NDArray[np.uint64], records: NDArray[np.float32]
+        self, arena: Arena, view: CameraNumbers, order: NDArray[np.uint64], records: NDArray[np.float32]
     ) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
         """Starts of the lists of tiles, [tiles + 1], and the records of all lists, front to back."""
         tiles = view.tiles_x * view.tiles_y
@@ -218,7 +215,7 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
         return Gradients(list(gradients.tensors().values()), g_screen, g_splitting)
 
     def footprint(
-        self, passed: ForwardPass, gaussians: Gaussians, camera: Camera, values: Tensor | None = None
+        self, passed: ForwardPass, gaussians: Gaussians, request: RenderRequest, values: Tensor | None = None
     ) -> Footprint:
         """See ``raster.base.RenderOutput``."""
         count = len(gaussians)
@@ -231,7 +228,7 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
 
         self._runner.run(TILE_SHARDS, cover)
         totals = (torch.from_numpy(shards.sum(0, dtype=shards.dtype)) for shards in (covered, sums, distances))
-        return Footprint(next(totals), view_depths(gaussians, camera), *totals)
+        return Footprint(next(totals), view_depths(gaussians, request.camera), *totals)
 
 
 def _edges(count: int) -> NDArray[np.int64]:

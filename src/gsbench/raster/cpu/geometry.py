@@ -6,7 +6,6 @@ and multiply that by the coefficients.
 """
 
 import math
-from typing import Any
 
 import numpy as np
 
@@ -28,12 +27,12 @@ MATRIX = LANES * LANES
 
 
 @inlined
-def exponential(x: Any) -> Any:
+def exponential(x):
     return exp2(maximum(minimum(x * LOG2_E, MAX_LOG2), -MAX_LOG2))
 
 
 @inlined
-def rotation_matrix(w: Any, x: Any, y: Any, z: Any) -> Any:
+def rotation_matrix(w, x, y, z):
     """The rows of the rotation matrix of a unit quaternion."""
     return (
         (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
@@ -43,7 +42,7 @@ def rotation_matrix(w: Any, x: Any, y: Any, z: Any) -> Any:
 
 
 @inlined
-def from_camera(mean: Any, v: Any) -> Any:
+def from_camera(mean, v):
     """The vector from the camera centre to the mean, in world axes.
 
     It is computed first: rotating the difference loses no digits, even if the scene is far from the origin.
@@ -52,7 +51,7 @@ def from_camera(mean: Any, v: Any) -> Any:
 
 
 @inlined
-def to_view(offset: Any, v: Any) -> Any:
+def to_view(offset, v):
     x = offset[0] * v.r00 + offset[1] * v.r01 + offset[2] * v.r02
     y = offset[0] * v.r10 + offset[1] * v.r11 + offset[2] * v.r12
     z = offset[0] * v.r20 + offset[1] * v.r21 + offset[2] * v.r22
@@ -60,7 +59,7 @@ def to_view(offset: Any, v: Any) -> Any:
 
 
 @inlined
-def image_axes(slope_x: Any, slope_y: Any, inverse_z: Any, v: Any) -> Any:
+def image_axes(slope_x, slope_y, inverse_z, v):
     """A = J W, the derivative of the pixel by the world position, as two rows; and the clamped slopes."""
     slope_x = minimum(maximum(slope_x, v.slope_x_min), v.slope_x_max)
     slope_y = minimum(maximum(slope_y, v.slope_y_min), v.slope_y_max)
@@ -69,7 +68,7 @@ def image_axes(slope_x: Any, slope_y: Any, inverse_z: Any, v: Any) -> Any:
 
 
 @inlined
-def image_rows(slope_x: Any, slope_y: Any, inverse_z: Any, v: Any) -> Any:
+def image_rows(slope_x, slope_y, inverse_z, v):
     """The derivative of the pixel by the world position at given slopes x/z, y/z, as two rows."""
     jx, jy = inverse_z * v.fx, inverse_z * v.fy
     first = (jx * (v.r00 - slope_x * v.r20), jx * (v.r01 - slope_x * v.r21), jx * (v.r02 - slope_x * v.r22))
@@ -78,12 +77,12 @@ def image_rows(slope_x: Any, slope_y: Any, inverse_z: Any, v: Any) -> Any:
 
 
 @inlined
-def dot(a: Any, b: Any) -> Any:
+def dot(a, b):
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @inlined
-def times(row: Any, matrix: Any) -> Any:
+def times(row, matrix):
     """``row`` [3] times ``matrix`` [3, 3]."""
     return (
         row[0] * matrix[0][0] + row[1] * matrix[1][0] + row[2] * matrix[2][0],
@@ -93,17 +92,17 @@ def times(row: Any, matrix: Any) -> Any:
 
 
 @inlined
-def scaled(row: Any, scales: Any) -> Any:
+def scaled(row, scales):
     return row[0] * scales[0], row[1] * scales[1], row[2] * scales[2]
 
 
 @inlined
-def gather_vectors(array: Any, indices: Any) -> Any:
+def gather_vectors(array, indices):
     return gather(array, indices, 3, 0), gather(array, indices, 3, 1), gather(array, indices, 3, 2)
 
 
 @inlined
-def gather_quaternions(quaternions: Any, indices: Any) -> Any:
+def gather_quaternions(quaternions, indices):
     """The unit quaternions, and the inverse norm and the squared norm of the stored ones."""
     w, x = gather(quaternions, indices, 4, 0), gather(quaternions, indices, 4, 1)
     y, z = gather(quaternions, indices, 4, 2), gather(quaternions, indices, 4, 3)
@@ -113,7 +112,7 @@ def gather_quaternions(quaternions: Any, indices: Any) -> Any:
 
 
 @inlined
-def spread(m0: Any, m1: Any) -> Any:
+def spread(m0, m1):
     """xx, xy, yy of the covariance C = M M^T + BLUR I, for the rows of M; and a = yy / det C.
 
     1/a is the variance of x given y. det(M M^T) is the squared cross product of the rows. Dividing one row by sqrt(yy)
@@ -128,14 +127,14 @@ def spread(m0: Any, m1: Any) -> Any:
 
 
 @inlined
-def normalized(offset: Any) -> Any:
+def normalized(offset):
     """``offset`` scaled to length 1, and the inverse of its length."""
     inverse = 1 / square_root(dot(offset, offset))
     return scaled(offset, (inverse, inverse, inverse)), inverse
 
 
 @inlined
-def fill_basis(degree: int, x: Any, y: Any, z: Any, matrix: Any) -> None:
+def fill_basis(degree, x, y, z, matrix):
     """Write basis function k + 1 at the unit directions (x, y, z) to column k of ``matrix`` [16 * 16].
 
     Each row is one Gaussian. The columns of functions above ``degree`` and the last column are zero.
@@ -165,7 +164,7 @@ def fill_basis(degree: int, x: Any, y: Any, z: Any, matrix: Any) -> None:
 
 
 @inlined
-def direction_gradient(degree: int, x: Any, y: Any, z: Any, matrix: Any) -> Any:
+def direction_gradient(degree, x, y, z, matrix):
     """The gradient of ``sum_k g[k] basis[k + 1]`` by (x, y, z), not yet projected to the tangent of the unit sphere.
 
     ``matrix`` [16 * 16] has g of one Gaussian in each row; this function transposes it.

@@ -1,13 +1,12 @@
-"""Memory layout of the data that kernels exchange: camera, records, gradient rows."""
+"""Memory layout of the data that kernels exchange: records, gradient rows."""
 
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gsbench.raster.base import projection_numbers
+from gsbench.raster.base import CameraNumbers
 from gsbench.raster.cpu.simd import LANES, SUM_LANES
-from gsbench.scene.types import Camera
 
 TILE = 16  # px; a tile is 4x4 blocks, row by row. Fixed by the 16-bit masks; must equal RasterConstants.tile
 TILE_PIXELS = TILE * TILE
@@ -41,35 +40,6 @@ def kernel_memory() -> tuple[NDArray[np.float32], NDArray[np.int64]]:
     return np.empty(8 * TILE_PIXELS, np.float32), np.empty(2 * LANES, np.int64)
 
 
-class CpuCamera(NamedTuple):
-    """A camera as plain numbers for the kernels."""
-
-    width: int
-    height: int
-    tiles_x: int
-    tiles_y: int
-    fx: float
-    fy: float
-    pixel_cx: float  # px, integer pixel centres
-    pixel_cy: float
-    slope_x_min: float  # limits of x/z in the Jacobian
-    slope_x_max: float
-    slope_y_min: float
-    slope_y_max: float
-    r00: float
-    r01: float
-    r02: float
-    r10: float
-    r11: float
-    r12: float
-    r20: float
-    r21: float
-    r22: float
-    center_x: float
-    center_y: float
-    center_z: float
-
-
 class Parameters(NamedTuple):
     """The tensors of Gaussians, or their gradients, as numpy arrays on the same memory."""
 
@@ -84,7 +54,7 @@ class Parameters(NamedTuple):
 class CpuFrame(NamedTuple):
     """Arrays of one render: kernels of the forward pass fill them, kernels of the backward pass read them."""
 
-    camera: CpuCamera
+    camera: CameraNumbers
     background: NDArray[np.float32]  # [3]
     records: NDArray[np.float32]  # [N * RECORD]
     record_ints: NDArray[np.int32]  # the same memory as ``records``
@@ -96,8 +66,3 @@ class CpuFrame(NamedTuple):
     last: NDArray[np.float32]  # [tiles * TILE_PIXELS] number of entries before the one that stopped the pixel
     bounds: NDArray[np.int64]  # [shards + 1] first tile of each shard
     tile_shard: NDArray[np.uint8]  # [tiles] shard of each tile
-
-
-def make_camera(camera: Camera) -> CpuCamera:
-    tiles = -(-camera.width // TILE), -(-camera.height // TILE)
-    return CpuCamera(camera.width, camera.height, *tiles, *projection_numbers(camera))

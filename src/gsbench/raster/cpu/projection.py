@@ -5,7 +5,6 @@ the order of their indices.
 """
 
 import math
-from typing import Any
 
 import numpy as np
 
@@ -78,7 +77,7 @@ VISIBLE, BAD_VALUE = 0, 1  # entries of a shard's flags: number of visible Gauss
 
 
 @inlined
-def _tile_range(low: Any, high: Any, tiles: int) -> Any:
+def _tile_range(low, high, tiles):
     """First and past-the-last tile for the pixels ``low`` to ``high`` - 1, within the grid."""
     first = floor(minimum(maximum(low * (1.0 / at.TILE), ZERO), np.float32(tiles)))
     past = floor(minimum(maximum((high + (at.TILE - 1)) * (1.0 / at.TILE), ZERO), np.float32(tiles)))
@@ -86,20 +85,7 @@ def _tile_range(low: Any, high: Any, tiles: int) -> Any:
 
 
 @kernel
-def project_shards(
-    memory: Any,
-    first: int,
-    past: int,
-    edges: Any,
-    gaussians: Any,
-    degree: int,
-    v: Any,
-    records: Any,
-    record_ints: Any,
-    keys: Any,
-    radii: Any,
-    flags: Any,
-) -> None:
+def project_shards(memory, first, past, edges, gaussians, degree, v, records, record_ints, keys, radii, flags):
     """Project the shards ``first`` to ``past``; shard s has the Gaussians from ``edges[s]`` to ``edges[s + 1]``.
 
     Fills ``records`` [N * 16], ``keys`` [N] (depth in the high word, record in the low word), ``radii`` [N] and
@@ -111,19 +97,7 @@ def project_shards(
 
 
 @inlined
-def _project(
-    memory: Any,
-    begin: int,
-    end: int,
-    gaussians: Any,
-    degree: int,
-    v: Any,
-    records: Any,
-    record_ints: Any,
-    keys: Any,
-    radii: Any,
-    flags: Any,
-) -> None:
+def _project(memory, begin, end, gaussians, degree, v, records, record_ints, keys, radii, flags):
     floats, indices = memory
     basis, rows, scratch = floats[:MATRIX], floats[MATRIX : 2 * MATRIX], floats[2 * MATRIX :]
     out = begin
@@ -236,7 +210,7 @@ def _project(
 
 
 @inlined
-def _row_sums(array: Any, place: int) -> Any:
+def _row_sums(array, place):
     """The sums of the 16 rows of the 16x16 matrix at ``array[place:]``; row k in lane k."""
     transpose(array, place)
     total = load(array, place)
@@ -246,9 +220,7 @@ def _row_sums(array: Any, place: int) -> Any:
 
 
 @inlined
-def _take_rows(
-    record: int, count: int, past: int, v: Any, record_ints: Any, tile_shard: Any, rows: Any, indices: Any, sums: Any
-) -> None:
+def _take_rows(record, count, past, v, record_ints, tile_shard, rows, indices, sums):
     """Sum the gradient rows of ``count`` records over the shards of their tiles, and clear the rows.
 
     ``sums`` [16 * 16] gets one row per entry of a gradient row; ``indices`` [16] gets the Gaussians. If there are fewer
@@ -282,20 +254,8 @@ def _take_rows(
 
 @kernel
 def backproject_shards(
-    memory: Any,
-    first: int,
-    past: int,
-    edges: Any,
-    visible: Any,
-    gaussians: Any,
-    degree: int,
-    frame: Any,
-    rows: Any,
-    gradients: Any,
-    g_screen: Any,
-    g_absolute: Any,
-    g_splitting: Any,
-) -> None:
+    memory, first, past, edges, visible, gaussians, degree, frame, rows, gradients, g_screen, g_absolute, g_splitting
+):
     """Write all ``gradients`` of the shards ``first`` to ``past``; shard s has the Gaussians from ``edges[s]`` to
     ``edges[s + 1]``, of which ``visible[s]`` have records.
 
@@ -309,9 +269,7 @@ def backproject_shards(
 
 
 @inlined
-def _backproject(
-    memory: Any, begin: int, end: int, visible: int, gaussians: Any, degree: int, frame: Any, rows: Any, outputs: Any
-) -> None:
+def _backproject(memory, begin, end, visible, gaussians, degree, frame, rows, outputs):
     gradients, g_screen, g_absolute, g_splitting = outputs
     v, record_ints, tile_shard = frame.camera, frame.record_ints, frame.tile_shard
     g_means, g_log_scales, g_quaternions = gradients.means, gradients.log_scales, gradients.quaternions
@@ -447,7 +405,7 @@ def _backproject(
 
 
 @inlined
-def _scatter_splitting(g_splitting: Any, indices: Any, d00: Any, d01: Any, d11: Any, shear: Any, rows: Any) -> None:
+def _scatter_splitting(g_splitting, indices, d00, d01, d11, shear, rows):
     """Write the splitting matrices F^T U^T (D G D - h D) U F. F = ``rows`` is the derivative of the projected mean;
     ``d00``, ``d01`` and ``d11`` are the entries of D G D - h D.
 
@@ -471,13 +429,13 @@ def _scatter_splitting(g_splitting: Any, indices: Any, d00: Any, d01: Any, d11: 
 
 
 @inlined
-def _difference(a: Any, b: Any) -> Any:
+def _difference(a, b):
     """a^2 - b^2 without cancellation, and without overflow of the squares."""
     return (a - b) * (a + b)
 
 
 @inlined
-def _unclamped(record: int, count: int, record_ints: Any, sums: Any, colors: Any) -> Any:
+def _unclamped(record, count, record_ints, sums, colors):
     """The gradients by red, green and blue, 0 if the channel was clamped; also written to ``colors`` [3 * 16]."""
     for lane in range(LANES):
         clamped = record_ints[(record + min(lane, count - 1)) * at.RECORD + at.CLAMPED]
@@ -488,7 +446,7 @@ def _unclamped(record: int, count: int, record_ints: Any, sums: Any, colors: Any
 
 
 @inlined
-def _clear(gradient: Any, first: int, past: int) -> None:
+def _clear(gradient, first, past):
     """Set the rows ``first`` to ``past`` of ``gradient`` [N, C] to 0."""
     for i in range(first, past):
         for c in range(gradient.shape[1]):

@@ -4,7 +4,6 @@ Kernels hold one quantity of 16 Gaussians in a vector, but in memory the values 
 coefficients) are adjacent. These functions convert between the two layouts.
 """
 
-from collections.abc import Sequence
 from typing import Any
 
 from llvmlite import ir
@@ -30,10 +29,10 @@ def _store(builder: Any, value: Any, pointer: Any, place: int) -> None:
 
 
 @intrinsic
-def transpose(typing_context: Any, array: Any, index: Any) -> Any:
+def transpose(typing_context, array, index):
     """Transpose the 16x16 matrix at ``array.flat[index : index + 256]`` in place."""
 
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    def codegen(context, builder, sig, args):
         pointer = address(context, builder, sig, args)
         rows = [_load(builder, pointer, LANES * k) for k in range(LANES)]
         half = LANES // 2
@@ -63,10 +62,10 @@ def _row_pointers(context: Any, builder: Any, sig: Any, args: Any, numbers: int)
 
 
 @intrinsic
-def store_block(typing_context: Any, array: Any, index: Any, stride: Any, values: Any) -> Any:
+def store_block(typing_context, array, index, stride, values):
     """Write the 16 pixels of a block to an image with one number per pixel and rows ``stride`` apart."""
 
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    def codegen(context, builder, sig, args):
         for row, pointer in enumerate(_row_pointers(context, builder, sig, args, BLOCK)):
             lanes = lane_indices(range(BLOCK * row, BLOCK * (row + 1)))
             builder.store(builder.shuffle_vector(args[3], args[3], lanes), pointer, align=4)
@@ -76,10 +75,10 @@ def store_block(typing_context: Any, array: Any, index: Any, stride: Any, values
 
 
 @intrinsic
-def store_colors(typing_context: Any, array: Any, index: Any, stride: Any, red: Any, green: Any, blue: Any) -> Any:
+def store_colors(typing_context, array, index, stride, red, green, blue):
     """Write the 16 pixels of a block to an image with three numbers per pixel and rows ``stride`` numbers apart."""
 
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    def codegen(context, builder, sig, args):
         red, green, blue = args[3:]
         for row, pointer in enumerate(_row_pointers(context, builder, sig, args, CHANNELS * BLOCK)):
             lanes = list(range(BLOCK * row, BLOCK * (row + 1)))
@@ -93,10 +92,10 @@ def store_colors(typing_context: Any, array: Any, index: Any, stride: Any, red: 
 
 
 @intrinsic
-def load_colors(typing_context: Any, array: Any, index: Any, stride: Any) -> Any:
+def load_colors(typing_context, array, index, stride):
     """The inverse of ``store_colors``: red, green and blue of the 16 pixels of a block."""
 
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    def codegen(context, builder, sig, args):
         pointers = _row_pointers(context, builder, sig, args, CHANNELS * BLOCK)
         rows = [builder.load(pointer, align=4) for pointer in pointers]
         channels = []
@@ -110,20 +109,20 @@ def load_colors(typing_context: Any, array: Any, index: Any, stride: Any) -> Any
 
 
 @intrinsic
-def as_integers(typing_context: Any, value: Any) -> Any:
+def as_integers(typing_context, value):
     """Convert whole numbers to int32, kept as the bits of float32 lanes: only store them, or read them as int32."""
 
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    def codegen(context, builder, sig, args):
         return builder.bitcast(builder.fptosi(args[0], VECTOR.bits_ir), VECTOR.ir)
 
     return VECTOR(value), codegen
 
 
 @intrinsic
-def as_span(typing_context: Any, first: Any, past: Any) -> Any:
+def as_span(typing_context, first, past):
     """``first + past * 65536`` as int32, kept as the bits of float32 lanes."""
 
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    def codegen(context, builder, sig, args):
         low, high = (builder.fptosi(value, VECTOR.bits_ir) for value in args)
         return builder.bitcast(builder.or_(low, builder.shl(high, VECTOR.bits(16))), VECTOR.ir)
 
@@ -131,10 +130,10 @@ def as_span(typing_context: Any, first: Any, past: Any) -> Any:
 
 
 @intrinsic
-def index_bits(typing_context: Any, start: Any) -> Any:
+def index_bits(typing_context, start):
     """``start`` + lane as int32, kept as the bits of float32 lanes."""
 
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    def codegen(context, builder, sig, args):
         first = context.cast(builder, args[0], sig.args[0], types.int32)
         undefined = ir.Constant(VECTOR.bits_ir, ir.Undefined)
         placed = builder.insert_element(undefined, first, ir.Constant(ir.IntType(32), 0))
@@ -145,10 +144,10 @@ def index_bits(typing_context: Any, start: Any) -> Any:
 
 
 @intrinsic
-def load_rest(typing_context: Any, array: Any, index: Any) -> Any:
+def load_rest(typing_context, array, index):
     """Load the 45 numbers ``array.flat[index : index + 45]`` as three vectors that start at ``REST_STARTS``."""
 
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    def codegen(context, builder, sig, args):
         pointer = address(context, builder, sig, args)
         return context.make_tuple(builder, sig.return_type, [_load(builder, pointer, start) for start in REST_STARTS])
 
@@ -156,10 +155,10 @@ def load_rest(typing_context: Any, array: Any, index: Any) -> Any:
 
 
 @intrinsic
-def store_rest(typing_context: Any, array: Any, index: Any, values: Any) -> Any:
+def store_rest(typing_context, array, index, values):
     """The inverse of ``load_rest``."""
 
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    def codegen(context, builder, sig, args):
         pointer = address(context, builder, sig, args)
         for k, start in enumerate(REST_STARTS):
             _store(builder, builder.extract_value(args[2], k), pointer, start)
@@ -169,10 +168,10 @@ def store_rest(typing_context: Any, array: Any, index: Any, values: Any) -> Any:
 
 
 @intrinsic
-def by_channel(typing_context: Any, rest: Any) -> Any:
+def by_channel(typing_context, rest):
     """Red, green and blue of the result of ``load_rest``: coefficient k in lane k; lane 15 repeats lane 14."""
 
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    def codegen(context, builder, sig, args):
         first, second, third = (builder.extract_value(args[0], k) for k in range(CHANNELS))
         channels = []
         for channel in range(CHANNELS):
@@ -187,10 +186,10 @@ def by_channel(typing_context: Any, rest: Any) -> Any:
 
 
 @intrinsic
-def outer_rest(typing_context: Any, basis: Any, red: Any, green: Any, blue: Any) -> Any:
+def outer_rest(typing_context, basis, red, green, blue):
     """``basis[k]`` times a colour, in the layout of ``load_rest``; ``basis`` has coefficient k in lane k."""
 
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    def codegen(context, builder, sig, args):
         row, *colors = args
         undefined = ir.Constant(VECTOR.ir, ir.Undefined)
         color = undefined
@@ -198,7 +197,7 @@ def outer_rest(typing_context: Any, basis: Any, red: Any, green: Any, blue: Any)
             scalar = context.cast(builder, value, sig.args[channel + 1], types.float32)
             color = builder.insert_element(color, scalar, ir.Constant(ir.IntType(32), channel))
 
-        def spread(vector: Any, lanes: Sequence[int]) -> Any:
+        def spread(vector, lanes):
             return builder.shuffle_vector(vector, undefined, lane_indices(lanes))
 
         products = []

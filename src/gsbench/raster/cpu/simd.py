@@ -144,11 +144,11 @@ def _vector_of(array: Any) -> Vector:
 
 
 @intrinsic
-def load(typing_context: Any, array: Any, index: Any) -> Any:
+def load(typing_context, array, index):
     """The vector ``array.flat[index : index + 16]``."""
     vector = _vector_of(array)
 
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    def codegen(context, builder, sig, args):
         # LLVM aligns the stack to 16 bytes only. Vectors that it spills to the stack could then cross cache lines, in
         # some processes and threads but not in others, which would cost a quarter of a kernel's time.
         builder.function.attributes.alignstack = 4 * LANES
@@ -160,13 +160,13 @@ def load(typing_context: Any, array: Any, index: Any) -> Any:
 
 
 @intrinsic
-def load_numbers(typing_context: Any, array: Any, index: Any) -> Any:
+def load_numbers(typing_context, array, index):
     """``load``, also from a uint8 array."""
     is_bytes = isinstance(array, types.Array) and array.layout == "C" and array.dtype == types.uint8
     vector = VECTOR if is_bytes else _vector_of(array)
     kind = ir.VectorType(ir.IntType(8), LANES) if is_bytes else vector.ir
 
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    def codegen(context, builder, sig, args):
         value = builder.load(builder.bitcast(address(context, builder, sig, args), kind.as_pointer()), align=1)
         return builder.uitofp(value, vector.ir) if is_bytes else value
 
@@ -174,11 +174,11 @@ def load_numbers(typing_context: Any, array: Any, index: Any) -> Any:
 
 
 @intrinsic
-def store(typing_context: Any, array: Any, index: Any, value: Any) -> Any:
+def store(typing_context, array, index, value):
     """Write the vector ``value`` to ``array.flat[index : index + 16]``."""
     vector = _vector_of(array)
 
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    def codegen(context, builder, sig, args):
         pointer = builder.bitcast(address(context, builder, sig, args), vector.ir.as_pointer())
         operand = as_vector(context, builder, args[2], sig.args[2], vector)
         builder.store(operand, pointer, align=vector.element.bitwidth // 8)
@@ -198,10 +198,10 @@ def _places(context: Any, builder: Any, sig: Any, args: Any) -> Iterator[Any]:
 
 
 @intrinsic
-def gather(typing_context: Any, array: Any, indices: Any, stride: Any, offset: Any) -> Any:
+def gather(typing_context, array, indices, stride, offset):
     """``array.flat[indices[k] * stride + offset]`` in lane k; ``indices`` is an int64 array [16]."""
 
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    def codegen(context, builder, sig, args):
         vector = ir.Constant(VECTOR.ir, ir.Undefined)
         for lane, place in enumerate(_places(context, builder, sig, args)):
             vector = builder.insert_element(vector, builder.load(place), ir.Constant(ir.IntType(32), lane))
@@ -211,11 +211,11 @@ def gather(typing_context: Any, array: Any, indices: Any, stride: Any, offset: A
 
 
 @intrinsic
-def scatter(typing_context: Any, array: Any, indices: Any, stride: Any, offset: Any, value: Any) -> Any:
+def scatter(typing_context, array, indices, stride, offset, value):
     """Write lane k of ``value`` to ``array.flat[indices[k] * stride + offset]``; of equal indices the last wins."""
     _vector_of(array)
 
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    def codegen(context, builder, sig, args):
         for lane, place in enumerate(_places(context, builder, sig, args)):
             builder.store(builder.extract_element(args[4], ir.Constant(ir.IntType(32), lane)), place)
         return context.get_dummy_value()
@@ -224,10 +224,10 @@ def scatter(typing_context: Any, array: Any, indices: Any, stride: Any, offset: 
 
 
 @intrinsic
-def prefetch(typing_context: Any, array: Any, index: Any) -> Any:
+def prefetch(typing_context, array, index):
     """Prefetch the cache line of ``array.flat[index]``; never faults."""
 
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    def codegen(context, builder, sig, args):
         byte_pointer, word = ir.IntType(8).as_pointer(), ir.IntType(32)
         kind = ir.FunctionType(ir.VoidType(), [byte_pointer, word, word, word])
         function = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
@@ -261,62 +261,62 @@ def _function(emit: Callable[..., Any], *kinds: Any) -> Any:
 
 
 @intrinsic
-def splat(typing_context: Any, scalar: Any) -> Any:
+def splat(typing_context, scalar):
     """A vector with ``scalar`` in all lanes."""
 
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    def codegen(context, builder, sig, args):
         return as_vector(context, builder, args[0], sig.args[0], VECTOR)
 
     return VECTOR(scalar), codegen
 
 
 @intrinsic
-def fma(typing_context: Any, a: Any, b: Any, c: Any) -> Any:
+def fma(typing_context, a, b, c):
     """``a * b + c``, fused if that is fast on the host."""
     return _function(lambda builder, vector, *v: _call(builder, "fmuladd", vector, *v), a, b, c)
 
 
 @intrinsic
-def minimum(typing_context: Any, a: Any, b: Any) -> Any:
+def minimum(typing_context, a, b):
     """``a if a < b else b``; so b if either is NaN."""
     return _function(lambda builder, _, x, y: builder.select(builder.fcmp_ordered("<", x, y), x, y), a, b)
 
 
 @intrinsic
-def maximum(typing_context: Any, a: Any, b: Any) -> Any:
+def maximum(typing_context, a, b):
     """``a if a > b else b``; so b if either is NaN."""
     return _function(lambda builder, _, x, y: builder.select(builder.fcmp_ordered(">", x, y), x, y), a, b)
 
 
 @intrinsic
-def absolute(typing_context: Any, a: Any) -> Any:
+def absolute(typing_context, a):
     """``|a|``."""
     return _function(lambda builder, vector, x: _call(builder, "fabs", vector, x), a)
 
 
 @intrinsic
-def square_root(typing_context: Any, a: Any) -> Any:
+def square_root(typing_context, a):
     return _function(lambda builder, vector, x: _call(builder, "sqrt", vector, x), a)
 
 
 @intrinsic
-def floor(typing_context: Any, a: Any) -> Any:
+def floor(typing_context, a):
     return _function(lambda builder, vector, x: _call(builder, "floor", vector, x), a)
 
 
 @intrinsic
-def ceil(typing_context: Any, a: Any) -> Any:
+def ceil(typing_context, a):
     return _function(lambda builder, vector, x: _call(builder, "ceil", vector, x), a)
 
 
 @intrinsic
-def select(typing_context: Any, mask: Any, a: Any, b: Any) -> Any:
+def select(typing_context, mask, a, b):
     """``a`` where ``mask`` is True, else ``b``; one of the two may be a number."""
     vector = common_vector((a, b))
     if vector is None or mask != MASK:
         return None
 
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    def codegen(context, builder, sig, args):
         x, y = (as_vector(context, builder, args[k], sig.args[k], vector) for k in (1, 2))
         return builder.select(args[0], x, y)
 
@@ -324,20 +324,20 @@ def select(typing_context: Any, mask: Any, a: Any, b: Any) -> Any:
 
 
 @intrinsic
-def mask_bits(typing_context: Any, mask: Any) -> Any:
+def mask_bits(typing_context, mask):
     """The mask as an integer with lane k in bit k."""
 
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    def codegen(context, builder, sig, args):
         return builder.zext(builder.bitcast(args[0], ir.IntType(LANES)), ir.IntType(64))
 
     return types.uint64(mask), codegen
 
 
 @intrinsic
-def mask_from_bits(typing_context: Any, bits: Any) -> Any:
+def mask_from_bits(typing_context, bits):
     """The mask whose lane k is bit k of an integer."""
 
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    def codegen(context, builder, sig, args):
         wide_bits = context.cast(builder, args[0], sig.args[0], types.uint64)
         return builder.bitcast(builder.trunc(wide_bits, ir.IntType(LANES)), MASK.ir)
 
@@ -345,12 +345,12 @@ def mask_from_bits(typing_context: Any, bits: Any) -> Any:
 
 
 @intrinsic
-def lanes_with_bit(typing_context: Any, masks: Any, index: Any, bit: Any) -> Any:
+def lanes_with_bit(typing_context, masks, index, bit):
     """A 64-bit word whose bit k is 1 if ``masks.flat[index + k] & bit`` is not 0; ``masks`` is a uint16 array."""
     lanes = 64
     kind = ir.VectorType(ir.IntType(16), lanes)
 
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    def codegen(context, builder, sig, args):
         values = builder.load(builder.bitcast(address(context, builder, sig, args), kind.as_pointer()), align=2)
         undefined = ir.Constant(kind, ir.Undefined)
         wanted = context.cast(builder, args[2], sig.args[2], types.uint16)
@@ -363,10 +363,10 @@ def lanes_with_bit(typing_context: Any, masks: Any, index: Any, bit: Any) -> Any
 
 
 @intrinsic
-def lowest_bit(typing_context: Any, bits: Any) -> Any:
+def lowest_bit(typing_context, bits):
     """The number of the lowest set bit of an integer, which must not be 0."""
 
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    def codegen(context, builder, sig, args):
         wide_bits = context.cast(builder, args[0], sig.args[0], types.uint64)
         return builder.cttz(wide_bits, ir.Constant(ir.IntType(1), 1))
 
@@ -390,13 +390,13 @@ _BITS_OF_ROOT_HALF = 0x3F3504F3
 
 
 @intrinsic
-def exp2(typing_context: Any, a: Any) -> Any:
+def exp2(typing_context, a):
     """``2^a`` with an error of at most 2.5e-7 for -126 <= a < 127.5; undefined elsewhere.
 
     2^a = 2^n 2^f. Adding 1.5 * 2^23 to a leaves the nearest integer n in the low bits of the mantissa.
     """
 
-    def emit(builder: Any, vector: Vector, x: Any) -> Any:
+    def emit(builder, vector, x):
         magic = vector.constant(1.5 * 2.0**MANTISSA_BITS)
         shifted = builder.fadd(x, magic)
         fraction = builder.fsub(x, builder.fsub(shifted, magic))
@@ -408,10 +408,10 @@ def exp2(typing_context: Any, a: Any) -> Any:
 
 
 @intrinsic
-def log2(typing_context: Any, a: Any) -> Any:
+def log2(typing_context, a):
     """``log2(a)`` of positive normal numbers, with an error of at most 2e-7 max(1, |log2(a)|); undefined elsewhere."""
 
-    def emit(builder: Any, vector: Vector, x: Any) -> Any:
+    def emit(builder, vector, x):
         # x = 2^n m with m from sqrt(1/2) to sqrt(2): n is the difference of the bits and those of sqrt(1/2), shifted.
         bits = builder.bitcast(x, vector.bits_ir)
         exponent = builder.ashr(builder.sub(bits, vector.bits(_BITS_OF_ROOT_HALF)), vector.bits(MANTISSA_BITS))
@@ -428,7 +428,7 @@ SUM_LANES = tuple(int(f"{k:04b}"[::-1], 2) for k in range(LANES))
 
 
 @intrinsic
-def lane_sums(typing_context: Any, vectors: Any) -> Any:
+def lane_sums(typing_context, vectors):
     """Sum the 16 lanes of each of up to 16 vectors; the k-th sum is in lane ``SUM_LANES[k]``, other lanes are 0.
 
     It is a tree of shuffles and additions in which each level merges pairs of vectors. So the sums of eleven vectors
@@ -437,7 +437,7 @@ def lane_sums(typing_context: Any, vectors: Any) -> Any:
     if not (isinstance(vectors, types.UniTuple) and vectors.dtype is VECTOR):
         return None
 
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    def codegen(context, builder, sig, args):
         level = [builder.extract_value(args[0], k) for k in range(sig.args[0].count)]
         half = LANES // 2
         while half:

@@ -8,35 +8,33 @@ import torch
 from torch import Tensor
 
 from gsbench.gaussians.model import Gaussians
-from gsbench.raster.base import CONSTANTS, Footprint, view_depths
+from gsbench.raster.base import CONSTANTS, CameraNumbers, Footprint, view_depths
 from gsbench.raster.executors import load_driver
 from gsbench.raster.staged import Gradients, Lifetime, RenderRequest, StagedRasterizer
 from gsbench.raster.triton.composite import composite, composite_backward, cover, sum_cover
 from gsbench.raster.triton.launch import Workspace, WorkspacePool, launch, launch_grid
 from gsbench.raster.triton.layout import (
+    BLOCK_HEIGHT,
     BLOCK_PIXELS,
+    BLOCK_WIDTH,
     BORDER,
     COLOR_SLOPES,
     RECORD,
     ROW,
     TILE,
-    Grid,
-    TritonCamera,
     count_borders,
-    make_camera,
-    make_grid,
 )
 from gsbench.raster.triton.lists import Lists, Projected, Units, find_all_units, make_lists
 from gsbench.raster.triton.projection import backproject, project, sum_units
-from gsbench.scene.types import Camera
 
 
 @dataclass
 class TritonFrame:
     """Results of the forward pass for the backward pass; the memory belongs to a workspace."""
 
-    grid: Grid
-    view: TritonCamera
+    blocks_x: int
+    blocks: int  # number of blocks
+    view: CameraNumbers
     projected: Projected
     units: Units
     lists: Lists
@@ -69,9 +67,7 @@ class TritonRasterizer(StagedRasterizer[TritonFrame]):
         if gaussians.means.device.type == "cuda":
             load_driver()
 
-    def forward(
-        self, lifetime: Lifetime, gaussians: Gaussians, request: RenderRequest
-    ) -> tuple[Tensor, Tensor, Tensor, TritonFrame]:
+    def forward(self, gaussians: Gaussians, request: RenderRequest) -> tuple[Tensor, Tensor, Tensor, TritonFrame]:
         """Project, sort, bin, composite; see `StagedRasterizer`. Raises ValueError for bad values."""
         camera, device = request.camera, gaussians.means.device
         image = torch.empty(camera.height, camera.width, 3, dtype=torch.float32, device=device)
@@ -79,17 +75,21 @@ class TritonRasterizer(StagedRasterizer[TritonFrame]):
         radii = torch.empty(len(gaussians), dtype=torch.int32, device=device)
         call_lifetime = Lifetime()  # freed when this call returns
         with torch.cuda.device_of(image):
-            memory = self._frames.lease(lifetime, device)
+            memory = self._frames.lease(request.lifetime, device)
             scratch = self._scratch.lease(call_lifetime, device)
-            grid, view = make_grid(request.camera), make_camera(request.camera)
-            count, blocks, background = len(gaussians), grid.blocks, request.background
+            # No number is an integer: Triton compiles a kernel again for the integer 1 and for multiples of 16.
+            view = CameraNumbers._make(map(float, CameraNumbers.of(camera)))
+            blocks_x = -(-camera.width // BLOCK_WIDTH.value)
+            blocks = blocks_x * -(-camera.height // BLOCK_HEIGHT.value)
+            count, background = len(gaussians), request.background
             flags = scratch.take("flags", 1, torch.int32).zero_()
             keys = scratch.take("depth_keys", count, torch.int32)
             projected = _project(memory, gaussians, view, request.degree, keys, radii, flags)
-            units, owners = find_all_units(memory, scratch, gaussians, projected, grid, keys, flags, background)
+            units, owners = find_all_units(memory, scratch, gaussians, projected, blocks_x, keys, flags, background)
             lists = make_lists(memory, scratch, units, owners, blocks)
             frame = TritonFrame(
-                grid,
+                blocks_x,
+                blocks,
                 view,
                 projected,
                 units,
@@ -107,9 +107,9 @@ class TritonRasterizer(StagedRasterizer[TritonFrame]):
                 projected.records,
                 count,
                 background,
-                grid.width,
-                grid.height,
-                grid.blocks_x,
+                camera.width,
+                camera.height,
+                blocks_x,
                 image,
                 alpha,
                 frame.transmittance,
@@ -135,23 +135,23 @@ class TritonRasterizer(StagedRasterizer[TritonFrame]):
         lifetime = Lifetime()
         with torch.cuda.device_of(g_image):
             scratch = self._scratch.lease(lifetime, g_image.device)
-            grid, units, lists, count = frame.grid, frame.units, frame.lists, len(gaussians)
+            camera, units, lists, count = request.camera, frame.units, frame.lists, len(gaussians)
             projected, absolute = frame.projected, request.absolute
             rows = scratch.take("rows", units.pairs * ROW.value, torch.float32)
             inner = count_borders(units.pairs)
-            launch_grid(composite_backward, inner + grid.blocks)(
+            launch_grid(composite_backward, inner + frame.blocks)(
                 lists.order,
                 lists.starts,
-                grid.blocks,
+                frame.blocks,
                 inner,
                 lists.entries,
                 lists.slots,
                 projected.records,
                 count,
                 request.background,
-                grid.width,
-                grid.height,
-                grid.blocks_x,
+                camera.width,
+                camera.height,
+                frame.blocks_x,
                 frame.transmittance,
                 frame.last,
                 frame.past,
@@ -193,7 +193,7 @@ class TritonRasterizer(StagedRasterizer[TritonFrame]):
             return Gradients(gradients, g_screen, g_splitting)
 
     def footprint(
-        self, frame: TritonFrame, gaussians: Gaussians, camera: Camera, values: Tensor | None = None
+        self, frame: TritonFrame, gaussians: Gaussians, request: RenderRequest, values: Tensor | None = None
     ) -> Footprint:
         """See ``raster.base.RenderOutput``."""
         lifetime = Lifetime()
@@ -204,14 +204,14 @@ class TritonRasterizer(StagedRasterizer[TritonFrame]):
             sums, distances = torch.zeros(2, count, device=device)
             given = sums if values is None else values.detach().float().contiguous()
             rows = scratch.take("rows", units.pairs * ROW.value, torch.float32)  # ``cover`` fills 3 of 16 columns
-            launch_grid(cover, frame.grid.blocks)(
+            launch_grid(cover, frame.blocks)(
                 lists.starts,
                 lists.entries,
                 lists.slots,
                 frame.projected.records,
-                frame.grid.width,
-                frame.grid.height,
-                frame.grid.blocks_x,
+                request.camera.width,
+                request.camera.height,
+                frame.blocks_x,
                 frame.last,
                 frame.past,
                 given,
@@ -231,13 +231,13 @@ class TritonRasterizer(StagedRasterizer[TritonFrame]):
                 sums,
                 distances,
             )
-            return Footprint(covered, view_depths(gaussians, camera), sums, distances)
+            return Footprint(covered, view_depths(gaussians, request.camera), sums, distances)
 
 
 def _project(
     memory: Workspace,
     gaussians: Gaussians,
-    view: TritonCamera,
+    view: CameraNumbers,
     degree: int,
     keys: Tensor,
     radii: Tensor,

@@ -1,15 +1,12 @@
-"""Memory layout of the data that kernels exchange: camera, blocks, borders, records, gradient rows."""
+"""Memory layout of the data that kernels exchange: blocks, borders, records, gradient rows."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import NamedTuple
 
 import triton.language as tl
 
-from gsbench.raster.base import CONSTANTS, projection_numbers
-from gsbench.scene.types import Camera
+from gsbench.raster.base import CONSTANTS
 
 # One program of one warp composites one block: half a tile of 3DGS, four pixels per lane. Lane l has row
 # l // LANE_COLUMNS, and in it every LANE_COLUMNS-th pixel from column l % LANE_COLUMNS on.
@@ -64,66 +61,6 @@ ALPHA_MIN = tl.constexpr(CONSTANTS.alpha_min)
 LOG2_ALPHA_MIN = tl.constexpr(math.log2(CONSTANTS.alpha_min))
 
 
-@dataclass(frozen=True)
-class Grid:
-    """The size of an image and its numbers of blocks."""
-
-    width: int  # px
-    height: int
-    blocks_x: int
-    blocks_y: int
-
-    @property
-    def blocks(self) -> int:
-        return self.blocks_x * self.blocks_y
-
-
-class TritonCamera(NamedTuple):
-    """A camera and its grid as float numbers for the kernels.
-
-    None is an integer, because Triton compiles a kernel again for the integer 1 and for multiples of 16.
-    """
-
-    width: float  # px
-    height: float
-    tiles_x: float
-    tiles_y: float
-    blocks_x: float
-    blocks_y: float
-    fx: float
-    fy: float
-    pixel_cx: float  # px, integer pixel centres
-    pixel_cy: float
-    slope_x_min: float  # limits of x/z in the Jacobian
-    slope_x_max: float
-    slope_y_min: float
-    slope_y_max: float
-    r00: float
-    r01: float
-    r02: float
-    r10: float
-    r11: float
-    r12: float
-    r20: float
-    r21: float
-    r22: float
-    center_x: float
-    center_y: float
-    center_z: float
-
-
 def count_borders(pairs: int) -> int:
     """The largest number of borders of lists with ``pairs`` entries in all."""
     return max(pairs - 1, 0) // SEGMENT.value
-
-
-def make_grid(camera: Camera) -> Grid:
-    width, height = int(camera.width), int(camera.height)
-    return Grid(width, height, -(-width // BLOCK_WIDTH.value), -(-height // BLOCK_HEIGHT.value))
-
-
-def make_camera(camera: Camera) -> TritonCamera:
-    grid = make_grid(camera)
-    tiles = -(-grid.width // TILE.value), -(-grid.height // TILE.value)
-    sizes = map(float, (grid.width, grid.height, *tiles, grid.blocks_x, grid.blocks_y))
-    return TritonCamera(*sizes, *projection_numbers(camera))

@@ -31,7 +31,6 @@ from gsbench.raster.triton.layout import (
     RECORD,
     RIGHTMOST_Y,
     SHEAR,
-    Grid,
 )
 
 # Margins for float32 rounding: it must not lose a pixel of the contour.
@@ -173,7 +172,7 @@ def find_all_units(
     scratch: Workspace,
     gaussians: Gaussians,
     projected: Projected,
-    grid: Grid,
+    blocks_x: int,
     keys: Tensor,
     flags: Tensor,
     background: Tensor,
@@ -202,7 +201,7 @@ def find_all_units(
             unit_ends,
             projected.records,
             projected.records.view(torch.int32),
-            grid.blocks_x,
+            blocks_x,
             capacity,
             first,
             owners,

@@ -150,8 +150,9 @@ def project(
     reach = tl.maximum((log2_opacity - LOG2_ALPHA_MIN) * (2 / LOG2_E), 0.0)  # squared Mahalanobis distance
     half_x = tl.sqrt(reach * xx) * (1 + CONTOUR_MARGIN) + CONTOUR_MARGIN
     half_y = tl.sqrt(reach * yy) * (1 + CONTOUR_MARGIN) + CONTOUR_MARGIN
-    inner_x, outer_x = _tile_range(tl.ceil(column - half_x), tl.floor(column + half_x) + 1, v.blocks_x, BLOCK_WIDTH)
-    inner_y, outer_y = _tile_range(tl.ceil(row - half_y), tl.floor(row + half_y) + 1, v.blocks_y, BLOCK_HEIGHT)
+    blocks_x, blocks_y = tl.ceil(v.width * (1.0 / BLOCK_WIDTH)), tl.ceil(v.height * (1.0 / BLOCK_HEIGHT))
+    inner_x, outer_x = _tile_range(tl.ceil(column - half_x), tl.floor(column + half_x) + 1, blocks_x, BLOCK_WIDTH)
+    inner_y, outer_y = _tile_range(tl.ceil(row - half_y), tl.floor(row + half_y) + 1, blocks_y, BLOCK_HEIGHT)
     first_x, past_x = tl.maximum(first_x, inner_x), tl.minimum(past_x, outer_x)
     first_y, past_y = tl.maximum(first_y * BLOCK_ROWS, inner_y), tl.minimum(past_y * BLOCK_ROWS, outer_y)
     seen = visible & (growth * ALPHA_MIN < 1.0) & (first_x < past_x) & (first_y < past_y)
