@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import importlib.metadata
+import inspect
 import re
 import subprocess
 import sys
@@ -14,7 +15,7 @@ import torch
 
 from gsbench.errors import InputError
 from gsbench.pipeline.parts import locate
-from gsbench.raster import create_rasterizer, executors, resolve_name
+from gsbench.raster import create_rasterizer, executors
 from gsbench.raster.contract import CASES, departures
 from gsbench.raster.executors import EXECUTORS, Executor, find_executor, resolve
 from gsbench.raster.reference import ReferenceRasterizer
@@ -34,7 +35,7 @@ def test_facts_agree_with_the_class(executor: Executor) -> None:
         pytest.skip("Triton has no wheels for this system")
     kind = locate(executor.target, "raster", [])
     assert kind.name == executor.name
-    assert ("threads" in kind.__init__.__code__.co_varnames) == executor.takes_threads
+    assert ("threads" in inspect.signature(kind).parameters) == executor.takes_threads
     assert (executor.package is None) == (executor.install == "")
 
 
@@ -55,7 +56,7 @@ def test_the_table_loads_no_torch() -> None:
 
 
 def test_auto(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
-    assert resolve_name("auto", CPU) == "cpu"
+    assert resolve("auto", "cpu").name == "cpu"
     installed(monkeypatch, "gsplat")
     assert resolve("auto", "cuda").name == "gsplat"
     assert caplog.text == ""
@@ -67,12 +68,12 @@ def test_auto(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture)
 
 
 def test_what_cannot_run_is_said_with_what_can(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert resolve_name("reference", CPU) == "reference"
+    assert resolve("reference", "cpu").name == "reference"
     assert isinstance(create_rasterizer("reference", CPU, threads=1), ReferenceRasterizer)
     with pytest.raises(InputError, match=r"opengl is not known; choose auto, reference, cpu, .*_target_"):
-        resolve_name("opengl", CPU)
+        resolve("opengl", "cpu")
     with pytest.raises(InputError, match="raster=gsplat runs on device=cuda, not on cpu; choose from reference, cpu"):
-        resolve_name("gsplat", CPU)
+        resolve("gsplat", "cpu")
     with pytest.raises(InputError, match=r"raster=cpu runs on device=cpu, not on cuda; choose from reference, "):
         resolve("cpu", "cuda")
     installed(monkeypatch)

@@ -149,7 +149,7 @@ def test_on_a_gpu_it_departs_only_as_its_module_says() -> None:
 def test_square_radii_are_those_of_the_reference() -> None:
     projected = project(random_gaussians(300, seed=4, log_scale=(-4, 0.5)), front_camera(64, 48))
     seen = torch.ones(1, len(projected.index), dtype=torch.bool)
-    radii = _square_radii(projected.conics.unsqueeze(0), seen, CONSTANTS)[0]
+    radii = _square_radii(projected.conics.unsqueeze(0), seen)[0]
     assert (radii - projected.radii).abs().max() <= 1  # ceil may fall either way on an exact integer
     assert (radii == projected.radii).double().mean() > 0.99
 

@@ -184,48 +184,31 @@ def _compare(
     model = f"{setting.count:,} Gaussians" if setting.ply is None else setting.ply.name
     what, turns = f"{setting.width}x{setting.height}, {model}", WARM_UP_STEPS + repeats
     steppers = {raster: Stepper(raster, setting) for raster in rasters}
-    parts: dict[str, list[dict[str, float]]] = {raster: [] for raster in rasters}
-    speeds: dict[str, list[float]] = {raster: [] for raster in rasters}
-    frames: dict[str, list[float]] = {raster: [] for raster in rasters}
+    samples: dict[str, list[dict[str, float]]] = {raster: [] for raster in rasters}
     for repeat in range(turns):
         for raster, stepper in steppers.items():
             report(what, repeat, turns, raster)
-            sample, speed, fps = stepper.step(), stepper.steps_per_second(), stepper.frames_per_second()
+            sample = stepper.step()
+            sample |= {"steps_per_second": stepper.steps_per_second(), "fps": stepper.frames_per_second()}
             if repeat >= WARM_UP_STEPS:
-                parts[raster].append(sample)
-                frames[raster].append(fps)
-                speeds[raster].append(speed)
+                samples[raster].append(sample)
     rows = []
     for raster, stepper in steppers.items():
-        pairs = zip(parts[raster], parts[rasters[0]], strict=True)
+        for own, first in zip(samples[raster], samples[rasters[0]], strict=True):
+            own["step_ratio"] = own["step_ms"] / first["step_ms"]
         row: dict[str, Any] = {
             "raster": raster,
             "scene": setting.scene if setting.ply is None else str(setting.ply),
             "size": f"{setting.width}x{setting.height}",
             "count": stepper.count,
         }
-        row |= {key: _median([sample[key] for sample in parts[raster]]) for key in parts[raster][0]}
-        row |= {
-            "step_ratio": _median([sample["step_ms"] / first["step_ms"] for sample, first in pairs]),
-            "steps_per_second": _median(speeds[raster]),
-            "fps": _median(frames[raster]),
-            "threads": stepper.threads,
-            "device": stepper.device.type,
-        }
-        rows.append(row)
+        row |= {key: round(statistics.median(s[key] for s in samples[raster]), 3) for key in samples[raster][0]}
+        rows.append(row | {"threads": stepper.threads, "device": stepper.device.type, "peak_memory_mb": None})
     del steppers, stepper  # frees memory for the processes below
-    for row in rows:
-        row["peak_memory_mb"] = None
-        if memory:
+    if memory:
+        setting = replace(setting, ply=setting.ply and setting.ply.absolute())
+        for row in rows:
             report(f"{what}, memory", len(rows), len(rows), row["raster"])
-            row["peak_memory_mb"] = _measure_memory(row["raster"], setting)
+            task = f"measuring the memory of raster={row['raster']}"
+            row["peak_memory_mb"] = run_isolated(peak_memory, row["raster"], setting, what=task)
     return rows
-
-
-def _measure_memory(raster: str, setting: Setting) -> float:
-    ply = None if setting.ply is None else setting.ply.absolute()
-    return run_isolated(peak_memory, raster, replace(setting, ply=ply), what=f"measuring the memory of raster={raster}")
-
-
-def _median(values: list[float]) -> float:
-    return round(statistics.median(values), 3)

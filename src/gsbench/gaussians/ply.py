@@ -3,11 +3,9 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from plyfile import PlyData, PlyElement, PlyParseError
 
 from gsbench.errors import InputError
@@ -52,12 +50,6 @@ def write_ply(gaussians: Gaussians, path: Path) -> None:
         PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(str(temporary))
 
 
-def _read_vertices(path: Path) -> NDArray[Any]:
-    with _reading(path):
-        _check_length(path)
-        return PlyData.read(str(path))["vertex"].data
-
-
 def check_ply(path: Path) -> None:
     """Raise InputError if a file cannot be a PLY of Gaussians, judged only by its header and length."""
     with _reading(path):
@@ -100,7 +92,9 @@ def read_ply(path: Path, device: torch.device | str = "cpu") -> Gaussians:
 
     Raises InputError if the file is not a PLY, lacks a property, or has invalid values.
     """
-    vertices = _read_vertices(path)
+    with _reading(path):
+        _check_length(path)
+        vertices = PlyData.read(str(path))["vertex"].data
     present = set(vertices.dtype.names or ())
     present_rest = {name for name in present if name.startswith(REST)}
     rest = [f"{REST}{i}" for i in range(len(present_rest))]

@@ -15,12 +15,6 @@ if TYPE_CHECKING:
     import torch
 
 
-def resolve_name(name: str, device: torch.device) -> str:
-    """The name of the executor that ``name``, perhaps ``auto``, selects on ``device``. Raises InputError if it cannot
-    run there."""
-    return resolve(name, device.type).name
-
-
 def create_rasterizer(name: str, device: torch.device, threads: int | None = None) -> Rasterizer:
     """Make the rasterizer that ``name``, perhaps ``auto``, selects on ``device``; ``threads`` limits the CPU threads of
     ``cpu``."""
@@ -38,5 +32,4 @@ __all__ = [
     "Rasterizer",
     "RenderOutput",
     "create_rasterizer",
-    "resolve_name",
 ]

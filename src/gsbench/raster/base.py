@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from torch import Tensor
 
     from gsbench.gaussians.model import Gaussians
@@ -30,10 +32,10 @@ class RasterConstants:
 CONSTANTS = RasterConstants()
 
 
-def slope_limits(camera: Camera, constants: RasterConstants = CONSTANTS) -> tuple[float, float, float, float]:
+def slope_limits(camera: Camera) -> tuple[float, float, float, float]:
     """The limits in the Jacobian of a projection (`RasterConstants.fov_margin`): x/z least, most; y/z least, most."""
-    margin_x = constants.fov_margin * camera.width / (2 * camera.fx)
-    margin_y = constants.fov_margin * camera.height / (2 * camera.fy)
+    margin_x = CONSTANTS.fov_margin * camera.width / (2 * camera.fx)
+    margin_y = CONSTANTS.fov_margin * camera.height / (2 * camera.fy)
     return (
         -camera.cx / camera.fx - margin_x,
         (camera.width - camera.cx) / camera.fx + margin_x,
@@ -107,12 +109,6 @@ def view_depths(gaussians: Gaussians, camera: Camera) -> Tensor:
     return gaussians.means.detach() @ gaussians.means.new_tensor(camera.rotation[2]) + camera.translation[2]
 
 
-class FootprintFunction(Protocol):
-    """Computes the footprint of one rendered view."""
-
-    def __call__(self, values: Tensor | None = None) -> Footprint: ...
-
-
 @dataclass
 class RenderOutput:
     """One rendered view.
@@ -136,7 +132,7 @@ class RenderOutput:
     radii: Tensor
     screen_points: Tensor
     screen_gradient_abs: Tensor | None = None
-    footprint: FootprintFunction | None = None
+    footprint: Callable[..., Footprint] | None = None
     splitting_probe: Tensor | None = None
 
     @property

@@ -17,7 +17,9 @@ from __future__ import annotations
 
 import importlib
 import inspect
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 from weakref import WeakKeyDictionary
 
@@ -28,7 +30,7 @@ from torch.autograd.function import once_differentiable
 
 from gsbench.errors import InputError
 from gsbench.gaussians.model import Gaussians
-from gsbench.raster.base import CONSTANTS, RasterConstants, RenderOutput
+from gsbench.raster.base import CONSTANTS, RenderOutput
 from gsbench.raster.executors import find_executor
 from gsbench.raster.staged import Readback, bad_values, check_settings, raise_for_values
 from gsbench.scene.types import Camera
@@ -42,14 +44,13 @@ class GsplatRasterizer:
 
     name = "gsplat"
 
-    def __init__(self, constants: RasterConstants = CONSTANTS, library: Any = None) -> None:
+    def __init__(self, library: Any = None) -> None:
         if library is None:
             try:
                 library = importlib.import_module("gsplat")
             except ImportError as error:
                 raise InputError(f"raster=gsplat needs gsplat: {find_executor('gsplat').install}") from error
         self.library = library
-        self.constants = constants
         # gsplat 1.5 takes directions, 1.6 means and poses.
         self._takes_directions = "dirs" in inspect.signature(library.spherical_harmonics).parameters
         self._cameras: WeakKeyDictionary[Camera, _DeviceCamera] = WeakKeyDictionary()
@@ -69,7 +70,7 @@ class GsplatRasterizer:
         if len(gaussians) == 0:  # gsplat's projection divides by the number of Gaussians, on the host
             return _empty(camera, background, points, absolute)
         bad = Readback(bad_values(gaussians, background))
-        constants, width, height = self.constants, camera.width, camera.height
+        width, height, tile = camera.width, camera.height, CONSTANTS.tile
         on_device = self._on_device(camera, gaussians.means)
         radii, means, depths, conics, _ = self.library.fully_fused_projection(
             gaussians.means,
@@ -80,22 +81,32 @@ class GsplatRasterizer:
             on_device.intrinsics,
             width,
             height,
-            eps2d=constants.blur,
-            near_plane=constants.near,
+            eps2d=CONSTANTS.blur,
+            near_plane=CONSTANTS.near,
         )  # radii [1, N, 2], means [1, N, 2] px, depths [1, N], conics [1, N, 3]
         seen = (radii > 0).all(-1)  # [1, N]
-        square = _square_radii(conics.detach(), seen, constants)  # [1, N] int32
-        tiles_x, tiles_y = -(-width // constants.tile), -(-height // constants.tile)
+        square = _square_radii(conics.detach(), seen)  # [1, N] int32
+        tiles_x, tiles_y = -(-width // tile), -(-height // tile)
         axis_radii = square.unsqueeze(-1).expand(-1, -1, 2).contiguous()
-        _, pairs, members = self.library.isect_tiles(means, axis_radii, depths, constants.tile, tiles_x, tiles_y)
+        _, pairs, members = self.library.isect_tiles(means, axis_radii, depths, tile, tiles_x, tiles_y)
         if bad.values():  # no wait: gsplat has just waited for the number of pairs
             raise_for_values(gaussians, background)
         offsets = self.library.isect_offset_encode(pairs, 1, tiles_x, tiles_y)
-        frame = _Frame(width, height, constants.tile, offsets, members, on_device.half_size, absolute)
+        rasterize = partial(
+            self.library.rasterize_to_pixels,
+            image_width=width,
+            image_height=height,
+            tile_size=tile,
+            isect_offsets=offsets,
+            flatten_ids=members,
+            backgrounds=background.detach().unsqueeze(0),
+            absgrad=absolute_gradient,
+        )
         colors = self._colors(gaussians, on_device, sh_degree, seen)  # [N, 3]
         image, alpha = _Composite.apply(
-            self.library,
-            frame,
+            rasterize,
+            on_device.half_size,
+            absolute,
             means,
             conics,
             colors.unsqueeze(0),
@@ -145,19 +156,6 @@ class _DeviceCamera:
         return cls(parts[0].view(1, 4, 4), parts[1].view(1, 3, 3), parts[2], parts[3])
 
 
-@dataclass(frozen=True)
-class _Frame:
-    """Inputs of compositing that have no gradient."""
-
-    width: int
-    height: int
-    tile: int
-    offsets: Tensor  # [1, tiles_y, tiles_x]
-    members: Tensor  # [pairs] of Gaussian and tile
-    half_size: Tensor  # [2] px
-    absolute: Tensor | None  # [N, 2] NDC, filled by the backward pass
-
-
 class _Composite(torch.autograd.Function):
     """gsplat's compositing on leaves of its own graph, so that ``backward`` here sees the gradient of the means.
 
@@ -169,8 +167,9 @@ class _Composite(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any,
-        library: Any,
-        frame: _Frame,
+        rasterize: Callable[..., tuple[Tensor, Tensor]],
+        half_size: Tensor,
+        absolute: Tensor | None,
         means: Tensor,
         conics: Tensor,
         colors: Tensor,
@@ -179,21 +178,12 @@ class _Composite(torch.autograd.Function):
         screen_points: Tensor,
     ) -> tuple[Tensor, Tensor]:
         needed = ctx.needs_input_grad
-        requires = (needed[2] or needed[7], *needed[3:6])  # the screen points need the gradient of the means
+        requires = (needed[3] or needed[8], *needed[4:7])  # the screen points need the gradient of the means
         leaves = (tensor.detach() for tensor in (means, conics, colors, opacities))
         ctx.leaves = [leaf.requires_grad_(flag) for leaf, flag in zip(leaves, requires, strict=True)]
         with torch.enable_grad():
-            ctx.outputs = library.rasterize_to_pixels(
-                *ctx.leaves,
-                frame.width,
-                frame.height,
-                frame.tile,
-                frame.offsets,
-                frame.members,
-                backgrounds=background.detach().unsqueeze(0),
-                absgrad=frame.absolute is not None,
-            )  # [1, H, W, 3], [1, H, W, 1]
-        ctx.frame = frame
+            ctx.outputs = rasterize(*ctx.leaves)  # [1, H, W, 3], [1, H, W, 1]
+        ctx.half_size, ctx.absolute = half_size, absolute
         ctx.set_materialize_grads(False)
         image, alpha = (output.detach() for output in ctx.outputs)
         return image[0], alpha[0, ..., 0]
@@ -207,13 +197,12 @@ class _Composite(torch.autograd.Function):
         wanted = [leaf for leaf in ctx.leaves if leaf.requires_grad]
         computed = iter(torch.autograd.grad((image, alpha), wanted, (g_image, g_alpha), retain_graph=True))
         gradients = [next(computed) if leaf.requires_grad else None for leaf in ctx.leaves]
-        frame: _Frame = ctx.frame
         g_means = gradients[0]
-        g_screen = None if g_means is None else g_means[0] * frame.half_size
-        if frame.absolute is not None and g_means is not None:
-            frame.absolute.add_(ctx.leaves[0].absgrad[0] * frame.half_size)
-        g_background = (g_image * (1 - alpha.detach())).sum((0, 1, 2)) if ctx.needs_input_grad[6] else None
-        return None, None, *gradients, g_background, g_screen
+        g_screen = None if g_means is None else g_means[0] * ctx.half_size
+        if ctx.absolute is not None and g_means is not None:
+            ctx.absolute.add_(ctx.leaves[0].absgrad[0] * ctx.half_size)
+        g_background = (g_image * (1 - alpha.detach())).sum((0, 1, 2)) if ctx.needs_input_grad[7] else None
+        return None, None, None, *gradients, g_background, g_screen
 
 
 def _empty(camera: Camera, background: Tensor, points: Tensor, absolute: Tensor | None) -> RenderOutput:
@@ -224,13 +213,13 @@ def _empty(camera: Camera, background: Tensor, points: Tensor, absolute: Tensor 
     return RenderOutput(image, alpha, torch.zeros_like(points[:, 0], dtype=torch.int32), points, absolute)
 
 
-def _square_radii(conics: Tensor, seen: Tensor, constants: RasterConstants) -> Tensor:
+def _square_radii(conics: Tensor, seen: Tensor) -> Tensor:
     """ceil(3 sqrt(lambda_max)) px, for covariances with the inverses ``conics`` [1, N, 3]; 0 if not ``seen``."""
     a, b, c = conics.double().unbind(-1)  # the inverse of the covariance: yy, -xy, xx over its determinant
     determinant = 1 / (a * c - b * b)
     half_trace = 0.5 * (a + c) * determinant
-    root = (half_trace * half_trace - determinant).clamp_min(constants.eigenvalue_floor).sqrt()
-    radii = (constants.sigma_extent * (half_trace + root).sqrt()).ceil().nan_to_num(0, 0, 0).clamp(0, MAX_RADIUS)
+    root = (half_trace * half_trace - determinant).clamp_min(CONSTANTS.eigenvalue_floor).sqrt()
+    radii = (CONSTANTS.sigma_extent * (half_trace + root).sqrt()).ceil().nan_to_num(0, 0, 0).clamp(0, MAX_RADIUS)
     return torch.where(seen, radii, 0.0).to(torch.int32)
 
 

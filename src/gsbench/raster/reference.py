@@ -4,6 +4,7 @@ Tests compare the faster executors with this one in float64. The formulas are th
 2001) as in 3DGS (Kerbl et al. 2023); the constants are in ``raster.base.RasterConstants``.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 
@@ -12,7 +13,7 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from gsbench.gaussians.model import Gaussians, colors
-from gsbench.raster.base import CONSTANTS, Footprint, RasterConstants, RenderOutput, slope_limits, view_depths
+from gsbench.raster.base import CONSTANTS, Footprint, RenderOutput, slope_limits, view_depths
 from gsbench.raster.staged import check_inputs
 from gsbench.scene.types import Camera
 
@@ -35,9 +36,6 @@ class ReferenceRasterizer:
 
     name = "reference"
 
-    def __init__(self, constants: RasterConstants = CONSTANTS) -> None:
-        self.constants = constants
-
     def render(
         self,
         gaussians: Gaussians,
@@ -52,8 +50,8 @@ class ReferenceRasterizer:
         screen_points = torch.zeros_like(gaussians.means[:, :2], requires_grad=True)  # [N, 2] NDC
         gradient_abs = torch.zeros_like(screen_points) if absolute_gradient else None
 
-        projected = project(gaussians, camera, self.constants)
-        tile_min, tile_max = tile_rectangles(projected, camera, self.constants.tile)
+        projected = project(gaussians, camera)
+        tile_min, tile_max = tile_rectangles(projected, camera, CONSTANTS.tile)
         reached = ((tile_max - tile_min) > 0).all(-1)  # [M]
         radii = torch.zeros(len(gaussians), dtype=torch.int32, device=gaussians.means.device)
         radii[projected.index[reached]] = projected.radii[reached].to(torch.int32)
@@ -70,9 +68,7 @@ class ReferenceRasterizer:
         # Adding zero connects the image with the graph even if no tile is reached, so that ``backward`` always works.
         image = background.expand(camera.height, camera.width, 3) + 0 * screen_points.sum()
         alpha = torch.zeros(camera.height, camera.width, dtype=image.dtype, device=image.device)
-        tiles_x = -(-camera.width // self.constants.tile)
-        for tile, members in bin_gaussians(projected.depths, tile_min, tile_max, tiles_x):
-            x0, y0, x1, y1 = self._bounds(tile, tiles_x, camera)
+        for members, (x0, y0, x1, y1) in members_of_tiles(projected.depths, tile_min, tile_max, camera):
             pixels = pixel_centres(x0, y0, x1, y1, image)
             # One mean per pixel, so that the hook sees the gradient of each pixel before the sum.
             pixel_means = means[members].expand(len(pixels), -1, -1)  # [P, K, 2]
@@ -87,7 +83,6 @@ class ReferenceRasterizer:
                 opacities[members],
                 rgb[members],
                 background,
-                self.constants,
                 None if image_probe is None else image_probe[members],
                 use_reentrant=False,
                 preserve_rng_state=False,
@@ -101,25 +96,18 @@ class ReferenceRasterizer:
     def _footprint(self, gaussians: Gaussians, camera: Camera, values: Tensor | None = None) -> Footprint:
         covered = torch.zeros(len(gaussians), dtype=torch.int32, device=gaussians.means.device)
         sums, distances = torch.zeros(2, len(gaussians), dtype=gaussians.means.dtype, device=gaussians.means.device)
-        projected = project(gaussians, camera, self.constants)
-        tile_min, tile_max = tile_rectangles(projected, camera, self.constants.tile)
-        tiles_x = -(-camera.width // self.constants.tile)
-        for tile, members in bin_gaussians(projected.depths, tile_min, tile_max, tiles_x):
-            x0, y0, x1, y1 = self._bounds(tile, tiles_x, camera)
+        projected = project(gaussians, camera)
+        tile_min, tile_max = tile_rectangles(projected, camera, CONSTANTS.tile)
+        for members, (x0, y0, x1, y1) in members_of_tiles(projected.depths, tile_min, tile_max, camera):
             pixels, index = pixel_centres(x0, y0, x1, y1, sums), projected.index[members]
             means = projected.means[members].expand(len(pixels), -1, -1)  # [P, K, 2]
             conics, opacities = projected.conics[members], gaussians.opacities[index]
-            blended = blending_weights(pixels, means, conics, opacities, self.constants) > 0  # [P, K]
+            blended = blending_weights(pixels, means, conics, opacities) > 0  # [P, K]
             covered.index_add_(0, index, blended.sum(0, dtype=torch.int32))
             distances.index_add_(0, index, ((means - pixels.unsqueeze(1)).norm(dim=-1) * blended).sum(0))
             if values is not None:
                 sums.index_add_(0, index, (values[y0:y1, x0:x1].reshape(-1, 1).to(sums) * blended).sum(0))
         return Footprint(covered, view_depths(gaussians, camera), sums, distances)
-
-    def _bounds(self, tile: int, tiles_x: int, camera: Camera) -> tuple[int, int, int, int]:
-        """The pixels of a tile: first x, first y, past-the-last x, past-the-last y."""
-        x, y = tile % tiles_x * self.constants.tile, tile // tiles_x * self.constants.tile
-        return x, y, min(x + self.constants.tile, camera.width), min(y + self.constants.tile, camera.height)
 
     @staticmethod
     def _colors(gaussians: Gaussians, index: Tensor, camera: Camera, sh_degree: int) -> Tensor:
@@ -136,7 +124,7 @@ def pixel_centres(x0: int, y0: int, x1: int, y1: int, like: Tensor) -> Tensor:
     ).flip(-1)
 
 
-def project(gaussians: Gaussians, camera: Camera, constants: RasterConstants = CONSTANTS) -> Projection:
+def project(gaussians: Gaussians, camera: Camera) -> Projection:
     """Project the Gaussians to the image plane; leave out those behind ``near`` or with an unusable covariance.
 
     A first pass without a graph selects the usable ones, so that an overflow in another Gaussian cannot reach their
@@ -144,27 +132,25 @@ def project(gaussians: Gaussians, camera: Camera, constants: RasterConstants = C
     """
     with torch.no_grad():
         depths = view_depths(gaussians, camera)  # [N]
-        index = (depths > constants.near).nonzero().squeeze(-1)  # [M]
-        means, (xx, xy, yy), _ = _to_image(gaussians.select(index), camera, constants)
+        index = (depths > CONSTANTS.near).nonzero().squeeze(-1)  # [M]
+        means, (xx, xy, yy), _ = _to_image(gaussians.select(index), camera)
         determinant = xx * yy - xy * xy  # [M]
         half_trace = 0.5 * (xx + yy)
-        root = (half_trace * half_trace - determinant).clamp_min(constants.eigenvalue_floor).sqrt()
-        radii = (constants.sigma_extent * (half_trace + root).sqrt()).ceil()
+        root = (half_trace * half_trace - determinant).clamp_min(CONSTANTS.eigenvalue_floor).sqrt()
+        radii = (CONSTANTS.sigma_extent * (half_trace + root).sqrt()).ceil()
         usable = (determinant > 0) & determinant.isfinite() & radii.isfinite() & means.isfinite().all(-1)
         index, radii = index[usable], radii[usable].clamp_max(MAX_RADIUS)
-    means, (xx, xy, yy), z = _to_image(gaussians.select(index), camera, constants)
+    means, (xx, xy, yy), z = _to_image(gaussians.select(index), camera)
     conics = torch.stack([yy, -xy, xx], -1) / (xx * yy - xy * xy).unsqueeze(-1)  # [M, 3]
     return Projection(index, means, conics, z.detach(), radii)
 
 
-def _to_image(
-    gaussians: Gaussians, camera: Camera, constants: RasterConstants
-) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor], Tensor]:
+def _to_image(gaussians: Gaussians, camera: Camera) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor], Tensor]:
     """Means [M, 2] px; entries xx, xy, yy of the blurred 2D covariances, each [M], px^2; view depths [M]."""
     rotation = gaussians.means.new_tensor(camera.rotation)  # [3, 3]
     translation = gaussians.means.new_tensor(camera.translation)  # [3]
     x, y, z = (gaussians.means @ rotation.T + translation).unbind(-1)  # each [M]
-    left, right, top, bottom = slope_limits(camera, constants)
+    left, right, top, bottom = slope_limits(camera)
     slope_x, slope_y = (x / z).clamp(left, right), (y / z).clamp(top, bottom)
     zero = torch.zeros_like(z)
     jacobian = torch.stack(
@@ -178,7 +164,7 @@ def _to_image(
     image_axes = jacobian @ rotation @ axes  # [M, 2, 3]
     covariance = image_axes @ image_axes.mT  # [M, 2, 2]
     means = torch.stack([camera.fx * x / z + camera.cx - 0.5, camera.fy * y / z + camera.cy - 0.5], -1)
-    blurred = (covariance[:, 0, 0] + constants.blur, covariance[:, 0, 1], covariance[:, 1, 1] + constants.blur)
+    blurred = (covariance[:, 0, 0] + CONSTANTS.blur, covariance[:, 0, 1], covariance[:, 1, 1] + CONSTANTS.blur)
     return means, blurred, z
 
 
@@ -217,6 +203,16 @@ def bin_gaussians(depths: Tensor, tile_min: Tensor, tile_max: Tensor, tiles_x: i
     return list(zip(numbers.tolist(), members, strict=True))
 
 
+def members_of_tiles(
+    depths: Tensor, tile_min: Tensor, tile_max: Tensor, camera: Camera
+) -> Iterator[tuple[Tensor, tuple[int, int, int, int]]]:
+    """Yield, for each tile with Gaussians, those [K], front to back, and its pixels: first x, y; past-the-last x, y."""
+    tile, tiles_x = CONSTANTS.tile, -(-camera.width // CONSTANTS.tile)
+    for number, members in bin_gaussians(depths, tile_min, tile_max, tiles_x):
+        x, y = number % tiles_x * tile, number // tiles_x * tile
+        yield members, (x, y, min(x + tile, camera.width), min(y + tile, camera.height))
+
+
 def composite(
     pixels: Tensor,
     means: Tensor,
@@ -224,7 +220,6 @@ def composite(
     opacities: Tensor,
     rgb: Tensor,
     background: Tensor,
-    constants: RasterConstants = CONSTANTS,
     image_probe: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Blend K Gaussians, front to back, at P pixels.
@@ -233,7 +228,7 @@ def composite(
     and opacities [P]. A pixel stops before the Gaussian that would lower its transmittance below
     ``transmittance_min``. ``image_probe`` as in ``blending_weights``.
     """
-    weight = blending_weights(pixels, means, conics, opacities, constants, image_probe)  # [P, K]
+    weight = blending_weights(pixels, means, conics, opacities, image_probe)  # [P, K]
     opacity = weight.sum(1)  # [P]
     return weight @ rgb + (1 - opacity).unsqueeze(-1) * background, opacity
 
@@ -243,7 +238,6 @@ def blending_weights(
     means: Tensor,
     conics: Tensor,
     opacities: Tensor,
-    constants: RasterConstants = CONSTANTS,
     image_probe: Tensor | None = None,
 ) -> Tensor:
     """Alpha times transmittance, [P, K], for the arguments of ``composite``; 0 where a Gaussian is not blended.
@@ -260,11 +254,11 @@ def blending_weights(
         slope = (inverse @ offset.unsqueeze(-1)).squeeze(-1)  # [P, K, 2]
         second = slope.unsqueeze(-1) * slope.unsqueeze(-2) - inverse  # [P, K, 2, 2]
         raw = raw + raw.detach() * (second * image_probe).sum((-2, -1))
-    saturated = raw + (raw.clamp_max(constants.alpha_max) - raw).detach()  # the gradient passes the clamp, as in 3DGS
-    alpha = torch.where((power <= 0) & (raw >= constants.alpha_min), saturated, 0.0)
+    saturated = raw + (raw.clamp_max(CONSTANTS.alpha_max) - raw).detach()  # the gradient passes the clamp, as in 3DGS
+    alpha = torch.where((power <= 0) & (raw >= CONSTANTS.alpha_min), saturated, 0.0)
     after = torch.cumprod(1 - alpha, dim=1)  # [P, K] transmittance behind each Gaussian
     before = torch.cat([torch.ones_like(after[:, :1]), after[:, :-1]], dim=1)
-    return torch.where(after >= constants.transmittance_min, alpha * before, 0.0)
+    return torch.where(after >= CONSTANTS.transmittance_min, alpha * before, 0.0)
 
 
 def _absolute_sum_into(buffer: Tensor, index: Tensor, half_size: Tensor):  # type: ignore[no-untyped-def]

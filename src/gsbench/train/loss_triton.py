@@ -98,16 +98,7 @@ def _add(sums, x, y, weight):
 
 @triton.jit(do_not_specialize=["height", "numbers", "rows"])
 def measure_similarity(
-    image,
-    target,
-    scale,
-    height,
-    numbers,
-    derivatives,
-    sums,
-    rows,
-    DIFFERENTIATE: tl.constexpr,
-    STRIP: tl.constexpr,
+    image, target, scale, height, numbers, derivatives, sums, rows, DIFFERENTIATE: tl.constexpr, STRIP: tl.constexpr
 ):
     """Write the sums of SSIM and of |image - target scale| over the ``rows`` of this program to ``sums`` [programs, 2].
 
@@ -173,17 +164,7 @@ def add_up(sums, programs, size, ssim_weight, values, GROUP: tl.constexpr):
 
 @triton.jit(do_not_specialize=["height", "numbers", "rows"])
 def differentiate(
-    image,
-    target,
-    scale,
-    height,
-    numbers,
-    derivatives,
-    g_loss,
-    ssim_weight,
-    gradient,
-    rows,
-    STRIP: tl.constexpr,
+    image, target, scale, height, numbers, derivatives, g_loss, ssim_weight, gradient, rows, STRIP: tl.constexpr
 ):
     """Compute the ``gradient`` [H, 3 W] by the image. The symmetric blur is its own adjoint."""
     number = tl.program_id(0) * STRIP + tl.arange(0, STRIP)  # [STRIP] of a row

@@ -317,16 +317,9 @@ def composite_backward_tiles(memory, first, past, frame, g_image, g_alpha, all_r
                 if want_absolute is not None:
                     sum_abs_t += absolute(ht)
                     # d power / d mean_y = shear a t + e dy, with a and e from the curves: curve = -log2(e)/2 a
-                    sum_abs_y += (
-                        absolute(
-                            fma(
-                                ht,
-                                records[base + at.SHEAR] * records[base + at.CURVE_T],
-                                hy * records[base + at.CURVE_Y],
-                            )
-                        )
-                        * TO_PRECISION
-                    )
+                    shear_a = records[base + at.SHEAR] * records[base + at.CURVE_T]
+                    slope = fma(ht, shear_a, hy * records[base + at.CURVE_Y])
+                    sum_abs_y += absolute(slope) * TO_PRECISION
             if want_absolute is not None:
                 sums = lane_sums(
                     (sum_h, sum_ht, sum_hy, sum_htt, sum_hty, sum_hyy, sum_r, sum_g, sum_b, sum_abs_t, sum_abs_y)

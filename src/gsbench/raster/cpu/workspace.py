@@ -83,10 +83,8 @@ class TensorPool:
             fitting = [k for k, block in enumerate(self._free) if size <= block.size <= 2 * size + 4096]
             if fitting:
                 return self._free.pop(min(fitting, key=lambda k: self._free[k].size))
-            if self._free:
-                self._free.pop(
-                    0
-                )  # the block unused for longest, so the pool never has more blocks than were in use at once
+            if self._free:  # drop what was unused for longest: the pool never has more blocks than were in use at once
+                self._free.pop(0)
         return aligned_bytes(int(size * HEADROOM))
 
 

@@ -378,18 +378,7 @@ def composite_backward(
 
 @triton.jit(do_not_specialize=["width", "height", "blocks_x"])
 def cover(
-    starts,
-    entries,
-    slots,
-    records,
-    width,
-    height,
-    blocks_x,
-    last,
-    past,
-    values,
-    rows_out,
-    HAS_VALUES: tl.constexpr,
+    starts, entries, slots, records, width, height, blocks_x, last, past, values, rows_out, HAS_VALUES: tl.constexpr
 ):
     """Write the footprints of one block, for its entries up to ``past`` [blocks], to their rows in ``rows_out``
     [pairs, 16].
@@ -416,16 +405,7 @@ def cover(
 
 @triton.jit(do_not_specialize=["count"])
 def sum_cover(
-    count,
-    row_counts,
-    first_units,
-    pair_ends,
-    unit_widths,
-    rows,
-    covered,
-    sums,
-    distances,
-    GROUP: tl.constexpr,
+    count, row_counts, first_units, pair_ends, unit_widths, rows, covered, sums, distances, GROUP: tl.constexpr
 ):
     """Write ``covered`` [N] int32, ``sums`` and ``distances`` [N] from the rows that ``sum_units`` has summed."""
     index = tl.program_id(0).to(tl.int64) * GROUP + tl.arange(0, GROUP)  # [GROUP]

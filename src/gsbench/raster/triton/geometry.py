@@ -166,14 +166,7 @@ def _add(sums, coefficients, factor):
 
 
 @triton.jit
-def colors(
-    direction,
-    dc,
-    sh_rest,
-    index,
-    mask,
-    DEGREE: tl.constexpr,
-):
+def colors(direction, dc, sh_rest, index, mask, DEGREE: tl.constexpr):
     """The colours SH + 0.5, not clamped, of the Gaussians ``index`` at unit directions, and their derivatives by x, y
     and z of the direction, not yet projected to the tangent of the unit sphere; each for red, green and blue.
 

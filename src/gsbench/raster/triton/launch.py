@@ -42,13 +42,11 @@ class Workspace:
 
     def take(self, name: str, count: int, dtype: torch.dtype) -> Tensor:
         """Return ``count`` numbers of ``dtype``. A name must always have the same dtype."""
-        if count > self.capacity(name):
+        if name not in self._buffers or count > self.capacity(name):
             grown = max(count, 2 * self.capacity(name))
             self._buffers.pop(name, None)  # free the old one first, so that both never exist at once
             with torch.inference_mode(False):  # an inference tensor could not be written to outside that mode
                 self._buffers[name] = torch.empty(grown, dtype=dtype, device=self.device)
-        elif name not in self._buffers:
-            return torch.empty(0, dtype=dtype, device=self.device)
         return self._buffers[name][:count]
 
     def capacity(self, name: str) -> int:
