@@ -6,9 +6,12 @@ values.
 """
 
 import logging
+import math
 import os
+import re
 import reprlib
 import stat
+from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import MISSING, dataclass, fields, is_dataclass
@@ -34,8 +37,8 @@ MAX_WORD = 4000  # characters of an unquoted YAML word, which could be a number
 MAX_VALUES = 100_000  # in a YAML file, whose aliases let a few lines stand for billions of values
 MAX_MESSAGE = 300  # characters of a message about a file
 LARGEST_INT = 2**64  # larger than the seeds of torch and times in ns
-KEYS = {str, int}
-LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+SURROGATE = re.compile("[\ud800-\udfff]")  # half a character, which no file can hold
+LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 class DamagedError(InputError):
@@ -113,30 +116,35 @@ def read_json(path: Path) -> Any:
     return value
 
 
-def read_yaml(path: Path, unique: bool = False) -> Any:
-    """The value in a YAML file; raises as `read_json` does.
+def read_yaml(path: Path) -> Any:
+    """The value in a YAML file; raises as `read_bytes` does, and DamagedError if it is no YAML or has a fault.
 
-    With ``unique``, a key that occurs twice in a mapping is an error; YAML would silently drop the first.
+    Numbers may be infinite, because users write settings in YAML and a class may have an infinite default.
     """
-    return parse_yaml(read_bytes(path, MAX_YAML_BYTES), path, unique)
-
-
-def parse_yaml(content: bytes, path: Path, unique: bool = False) -> Any:
-    """Parse YAML; raises DamagedError if it is no YAML or if `fault_of` finds a fault.
-
-    Numbers may be infinite, because users write settings in YAML and a class may have an infinite default. ``unique``
-    is as in `read_yaml`.
-    """
+    content = read_bytes(path, MAX_YAML_BYTES)
     try:
         text = content.decode("utf-8")
-        fault = _danger_in_yaml(text) or (_key_that_stands_twice(text) if unique else "")
-        value = None if fault else yaml.load(text, Loader=LOADER)
+        fault = _danger_in_yaml(text)
+        value = None if fault else yaml.load(text, Loader=_Loader)
     except (yaml.YAMLError, ValueError, TypeError, OverflowError, RecursionError) as error:
         reason = getattr(error, "problem", None) or error  # PyYAML's own text has several lines
         raise DamagedError(path, f"is not YAML ({reason})") from None
     if fault := fault or fault_of(value, MAX_VALUES, infinite=True):
         raise DamagedError(path, f"is damaged: {fault}")
     return value
+
+
+class _Loader(LOADER):
+    """A safe loader for which a key that occurs twice in a mapping is an error; YAML would silently drop the first."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        seen = set()
+        for key, _ in node.value:
+            name = key.value if isinstance(key, yaml.ScalarNode) else key
+            if name in seen:
+                raise ValueError(f"{name!r} is in it twice (line {key.start_mark.line + 1})")
+            seen.add(name)
+        return super().construct_mapping(node, deep)
 
 
 def _danger_in_yaml(text: str) -> str:
@@ -163,73 +171,44 @@ def _danger_in_yaml(text: str) -> str:
     return ""
 
 
-def _key_that_stands_twice(text: str) -> str:
-    """Name the first key that occurs twice in a mapping, with its line, or "" if there is none."""
-    waiting, seen = [yaml.compose(text, Loader=LOADER)], set()
-    while waiting:
-        node = waiting.pop()
-        if id(node) in seen:  # an alias of a node that was already checked
-            continue
-        seen.add(id(node))
-        if isinstance(node, yaml.MappingNode):
-            keys = set()
-            for key, value in node.value:
-                if isinstance(key, yaml.ScalarNode):
-                    if key.value in keys:
-                        return f"{key.value!r} is in it twice (line {key.start_mark.line + 1})"
-                    keys.add(key.value)
-                waiting.append(value)
-        elif isinstance(node, yaml.SequenceNode):
-            waiting += node.value
-    return ""
-
-
 def fault_of(value: Any, most: int | None = None, infinite: bool = False) -> str:
     """The reason why ``value`` is not plain, or "" if it is.
 
     A plain value has keys that are texts or integers, at most `MAX_DEPTH` levels, finite numbers (unless ``infinite``)
     and at most ``most`` values, where a YAML alias counts each time it is used.
     """
-    level, count = [value], 0
-    for _ in range(MAX_DEPTH):
-        below: list[Any] = []
-        for item in level:
-            kind = type(item)
-            if kind is dict:
-                if _fault_of_keys(item):
-                    return _named_fault(value)
-                below += item.values()
-            elif kind is list:
-                below += item
-            elif _fault_of_leaf(item) and not (infinite and type(item) is float):
-                return _named_fault(value)
-            if most is not None and count + len(below) > most:
-                return f"it has more than {most:,} values"
-        count += len(below)
-        if not below:
-            return ""
-        level = below
-    return f"it has more than {MAX_DEPTH} levels"
+    containers: deque[tuple[tuple[Any, ...], Any]] = deque(
+        [((), [value])]
+    )  # with their places: the keys that lead there
+    count = 0
+    while containers:
+        place, container = containers.popleft()
+        if len(place) > MAX_DEPTH:
+            return f"it has more than {MAX_DEPTH} levels"
+        count += len(container)
+        if most is not None and count > most:
+            return f"it has more than {most:,} values"
+        is_mapping = isinstance(container, dict)
+        if is_mapping and (fault := _fault_of_keys(container)):
+            return f"{_named(place)} has {fault}"
+        for key, item in container.items() if is_mapping else enumerate(container):
+            if type(item) in (dict, list):
+                containers.append(((*place, key), item))
+            elif (fault := _fault_of_leaf(item)) and not (infinite and type(item) is float):
+                return f"{_named((*place, key))} is {fault}"
+    return ""
 
 
-def _named_fault(value: Any, place: str = "", depth: int = 0) -> str:
-    """The first invalid key or value with its place, or "" if there is none within `MAX_DEPTH` levels."""
-    if not isinstance(value, dict | list) or depth > MAX_DEPTH:
-        fault = _fault_of_leaf(value)
-        return f"{place or 'it'} is {fault}" if fault else ""
-    if isinstance(value, dict) and (fault := _fault_of_keys(value)):
-        return f"{place or 'it'} has {fault}"
-    entries = value.items() if isinstance(value, dict) else enumerate(value)
-    faults = (_named_fault(item, f"{place}.{key}" if place else str(key), depth + 1) for key, item in entries)
-    return next((fault for fault in faults if fault), "")
+def _named(place: tuple[Any, ...]) -> str:
+    return ".".join(map(str, place[1:])) or "it"
 
 
 def _fault_of_leaf(item: Any) -> str:
     kind = type(item)
     if kind is str:
-        return "" if item.isascii() or _is_unicode(item) else "a text with half a character"
+        return "a text with half a character" if SURROGATE.search(item) else ""
     if kind is float:
-        return "" if item - item == 0 else f"{item}, which is not a finite number"
+        return "" if math.isfinite(item) else f"{item}, which is not a finite number"
     if kind is int:
         return "" if -LARGEST_INT < item < LARGEST_INT else "an integer beyond all bounds"
     return "" if kind is bool or item is None else f"of type {kind.__name__}"
@@ -237,19 +216,9 @@ def _fault_of_leaf(item: Any) -> str:
 
 def _fault_of_keys(mapping: dict[Any, Any]) -> str:
     kinds = set(map(type, mapping))
-    if len(kinds) > 1 or not kinds <= KEYS:  # JSON with sorted keys needs keys of one type
+    if len(kinds) > 1 or not kinds <= {str, int}:  # JSON with sorted keys needs keys of one type
         return "keys that are not all texts, or all integers"
-    if kinds == {str} and all(map(str.isascii, mapping)):
-        return ""
     return next((f"a key that is {fault}" for key in mapping if (fault := _fault_of_leaf(key))), "")
-
-
-def _is_unicode(text: str) -> bool:
-    try:
-        text.encode()
-    except UnicodeEncodeError:
-        return False
-    return True
 
 
 # ---- JSON files through dataclasses, for writing and reading; the annotations say what is allowed

@@ -145,7 +145,7 @@ class ClaimsFile:
 def read_claims(path: Path) -> ClaimsFile:
     """Read and check a file of claims; raises InputError, one line that says where the fault is and how to fix it."""
     try:
-        content = read_yaml(resolved(path), unique=True)
+        content = read_yaml(resolved(path))
     except FileNotFoundError:
         raise InputError(
             f"{path} cannot be read (there is no such file): give a file of claims (docs/claims.md)"
