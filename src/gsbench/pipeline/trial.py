@@ -6,7 +6,6 @@ import time
 import traceback
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +20,7 @@ from gsbench.files import link_or_copy, remove_temporaries, require_no_links, st
 from gsbench.init import Sfm
 from gsbench.init.base import GAUSSIANS_FILE, MODEL_FOLDER, PICTURE_FILE, REPORT_FILE
 from gsbench.logs import log_to
-from gsbench.parsing import read_json
+from gsbench.parsing import read_json, read_typed
 from gsbench.pipeline.parts import Parts
 from gsbench.pipeline.steps.evaluate import evaluate_step
 from gsbench.pipeline.steps.scene import (
@@ -48,7 +47,6 @@ from gsbench.runs.keys import (
     sha256_of,
     user_modules,
 )
-from gsbench.runs.layout import BUILDING, CONFIG, EVENTS, FAILED, LOG
 from gsbench.runs.store import Store, StoredResult, read_manifest
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import (
@@ -58,14 +56,11 @@ from gsbench.runs.trial_record import (
     RENDERS_ALONE,
     Budget,
     Code,
-    Declared,
-    ExternalTrainer,
+    Evaluation,
     Failure,
     Training,
     TrialRecord,
-    read_evaluation,
     read_rows,
-    read_training,
     split_text,
 )
 from gsbench.scene.colmap_files import model_files
@@ -137,7 +132,7 @@ def run_trial(trial: Trial, wait: bool = True) -> TrialRecord:
         folder.require_no_links()
         require_no_links(folder.runs, folder.runs / layout.STORE / layout.VIEWS)
         folder.path.mkdir(parents=True, exist_ok=True)
-        with hold(folder.lock, folder.label, wait), log_to(folder.path / LOG):
+        with hold(folder.lock, folder.label, wait), log_to(folder.path / layout.LOG):
             if not folder.why_not_done(trial.values):
                 log.info("%s: was done", folder.label)
                 return folder.record()
@@ -168,7 +163,7 @@ def _recorded_failures(values: dict[str, Any], folder: TrialFolder) -> Iterator[
             bad_input=isinstance(error, InputError),
         )
         with suppress(OSError):  # a full disk: the raised error is all that the user gets
-            write_json(folder.path / FAILED, {"status": "failed"} | failure.to_json())
+            write_json(folder.path / layout.FAILED, {"status": "failed"} | failure.to_json())
         raise
 
 
@@ -183,11 +178,11 @@ def _run(trial: Trial, folder: TrialFolder) -> TrialRecord:
         torch.set_num_threads(parts.threads)
 
         def announce(stage: Stage, place: Path) -> None:
-            write_json(folder.path / BUILDING, {"stage": stage.name, "folder": str(place)})
+            write_json(folder.path / layout.BUILDING, {"stage": stage.name, "folder": str(place)})
 
         store = Store(folder.runs / layout.STORE, announce)
-        write_text(folder.path / CONFIG, trial.yaml)
-        (folder.path / FAILED).unlink(missing_ok=True)
+        write_text(folder.path / layout.CONFIG, trial.yaml)
+        (folder.path / layout.FAILED).unlink(missing_ok=True)
         trial_steps = TrialSteps(parts, store)
         entries: dict[str, StoredResult] = {}
         code: dict[str, str] = {}
@@ -204,7 +199,7 @@ def _run(trial: Trial, folder: TrialFolder) -> TrialRecord:
         made_of = {stage.name: entries[stage.name].path for stage in (INIT, TRAIN, GROUND_TRUTH, EVALUATE)}
         sources = source_files(trial_steps.photographs, store)
         was_done = folder.write_finished(values, results, sources, made_of, published)
-        (folder.path / BUILDING).unlink(missing_ok=True)
+        (folder.path / layout.BUILDING).unlink(missing_ok=True)
     metrics = "  ".join(f"{key} {value:.4g}" for key, value in results.metrics.items())
     size = "" if results.num_gaussians is None else f"  {results.num_gaussians} Gaussians"
     log.info("%s: %s%s%s", folder.label, metrics, size, "  (was done)" if was_done else "")
@@ -256,11 +251,23 @@ def results_of(
     entries by stage. ``code`` maps the parts of gsbench's source that the steps used to their states.
     """
     init, trained, evaluated = entries[INIT.name], entries[TRAIN.name], entries[EVALUATE.name]
-    training, evaluation = read_training(trained.path), read_evaluation(evaluated.path)
+    training = read_typed(trained.path / layout.TRAINING, Training)
+    evaluation = read_typed(evaluated.path / layout.METRICS, Evaluation)
     manifest = read_manifest(evaluated.path)
-    events = read_rows(trained.path / EVENTS)
+    primary, declarations = values["eval"].get("primary"), read_declarations(TrialFolder.of(values).home)
+    declared = [one for one in declarations if not one.of_claims and one.primary == primary]
     sizes = sorted({(view.camera.width, view.camera.height) for view in [*scene.train, *scene.test]}, reverse=True)
-    results = TrialRecord(
+    seconds = {"init": init.seconds, "train": training.seconds, "evaluate": evaluated.seconds}
+    evaluated_from, unknown = training.evaluated_from, dict[str, str]()
+    if evaluated_from == FROM_RENDERS:
+        raster, unknown["gaussians"] = "unknown", RENDERS_ALONE
+    if training.peak_memory_mb is None:
+        unknown["peak_memory_mb"] = "another program's memory of a GPU is not measured"
+    if training.trained_by is None and not training.iterations:  # a ready-made model
+        del seconds[TRAIN.name]
+        evaluated_from = FROM_MODEL
+        unknown |= dict.fromkeys(("train_time", "total_time"), f"{MADE_ELSEWHERE}: not trained here")
+    return TrialRecord(
         status="complete",
         experiment=values["name"],
         scene=values["scene"]["name"],
@@ -271,9 +278,9 @@ def results_of(
         protocol=manifest.inputs["protocol"],
         iterations=training.iterations,
         metrics=evaluation.metrics,
-        unavailable=evaluation.unavailable,
+        unavailable=evaluation.unavailable | unknown,
         measured=manifest.created,  # of an evaluation found in the store: when it was put there
-        declared=_declared(values),
+        declared=declared[-1].summary() if declared else None,
         awaited=evaluation.awaited,
         metric_facts=evaluation.facts,
         metrics_at=evaluation.at,
@@ -281,7 +288,7 @@ def results_of(
         num_gaussians=training.num_gaussians,
         causes=training.causes,
         scene_extent=training.scene_extent,
-        seconds={"init": init.seconds, "train": training.seconds, "evaluate": evaluated.seconds},
+        seconds=seconds,
         peak_memory_mb=training.peak_memory_mb,
         budget=Budget(
             max_gaussians=values["densify"].get("max_gaussians"),
@@ -293,7 +300,7 @@ def results_of(
         split=split_text(flatten(values)),
         held_out=capture.held_out,
         resolution=sizes[0],
-        events=sum_events(events),
+        events=sum_events(read_rows(trained.path / layout.EVENTS)),
         init_report=read_json(init.path / REPORT_FILE),
         hashes={
             "config": config_hash(values),
@@ -311,48 +318,8 @@ def results_of(
         ),
         machine=training.machine,
         versions=versions(),
-        evaluated_from=training.evaluated_from,
-    )
-    if training.trained_by is not None:
-        return _trained_by_program(results, training, training.trained_by)
-    return results if training.iterations else _without_training(results)
-
-
-def _trained_by_program(results: TrialRecord, training: Training, trainer: ExternalTrainer) -> TrialRecord:
-    """The results of a training by another program, which may have left only renders and no model."""
-    unknown = {}
-    if training.evaluated_from == FROM_RENDERS:
-        unknown["gaussians"] = RENDERS_ALONE
-    if training.peak_memory_mb is None:
-        unknown["peak_memory_mb"] = "another program's memory of a GPU is not measured"
-    return replace(
-        results,
-        trained_by=trainer,
-        raster="unknown" if training.evaluated_from == FROM_RENDERS else results.raster,
-        unavailable=results.unavailable | unknown,
-    )
-
-
-def _declared(values: dict[str, Any]) -> Declared | None:
-    """The newest declaration of the trial's primary metric, which its verdict is about; None if there is none."""
-    home = TrialFolder.of(values).home
-    metric = values["eval"].get("primary")
-    declarations = [
-        declaration
-        for declaration in read_declarations(home)
-        if not declaration.of_claims and declaration.primary == metric
-    ]
-    return declarations[-1].summary() if declarations else None
-
-
-def _without_training(results: TrialRecord) -> TrialRecord:
-    """The results of a model that came ready-made: its training time is unknown, not 0."""
-    unknown = dict.fromkeys(("train_time", "total_time"), f"{MADE_ELSEWHERE}: not trained here")
-    return replace(
-        results,
-        evaluated_from=FROM_MODEL,
-        seconds={stage: seconds for stage, seconds in results.seconds.items() if stage != TRAIN.name},
-        unavailable=results.unavailable | unknown,
+        evaluated_from=evaluated_from,
+        trained_by=training.trained_by,
     )
 
 

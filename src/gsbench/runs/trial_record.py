@@ -26,9 +26,7 @@ from gsbench.parsing import (
     iterate_rows,
     one_line,
     read_bytes,
-    read_typed,
 )
-from gsbench.runs.layout import METRICS, TRAINING
 from gsbench.settings import FolderName
 
 log = logging.getLogger(__name__)
@@ -200,16 +198,6 @@ class Evaluation(Record):
     awaited: list[str]
     facts: dict[str, MetricRecord] = field(default_factory=dict)  # of a user's own metrics
     at: dict[Iteration, Earlier] = field(default_factory=dict)  # by iteration
-
-
-def read_training(folder: Path) -> Training:
-    """The record of the training in ``folder``; raises FileNotFoundError and DamagedError."""
-    return read_typed(folder / TRAINING, Training)
-
-
-def read_evaluation(folder: Path) -> Evaluation:
-    """The record of the evaluation in ``folder``; raises as `read_training` does."""
-    return read_typed(folder / METRICS, Evaluation)
 
 
 def split_text(config: Mapping[str, Any]) -> str:
