@@ -95,7 +95,7 @@ def archive(
 
 def test_an_archive_is_a_study_of_its_pairs(tmp_path: Path) -> None:
     file = archive(tmp_path, "lab")
-    (study,) = read_studies(file, WANTED, "lab").studies
+    ((study,), _, _) = read_studies(file, WANTED, "lab")
     trials = load_experiment(tmp_path / "runs_lab_0", "exp").trials
     by_arm = {(one.densify, one.scene, one.seed): one.metrics["psnr"] for one in trials}
     pairs = np.array(
@@ -115,17 +115,16 @@ def test_an_archive_is_a_study_of_its_pairs(tmp_path: Path) -> None:
 
 def test_where_each_scene_has_one_initialiser_they_are_one_study(tmp_path: Path) -> None:
     both = archive(tmp_path, "both", inits=("sfm", "dataset"))
-    assert [study.name for study in read_studies(both, WANTED, "both").studies] == ["both (dataset)", "both (sfm)"]
+    assert [study.name for study in read_studies(both, WANTED, "both")[0]] == ["both (dataset)", "both (sfm)"]
     trials = load_experiment(tmp_path / "runs_both_0", "exp")
     kept = [trial for trial in trials.trials if (trial.init == "sfm") == (trial.scene == "garden")]
     write_archive(replace(trials, trials=tuple(kept)), tmp_path / "one.zip")
-    found = read_studies(tmp_path / "one.zip", WANTED, "one")
-    (study,) = found.studies
+    (study,), notes, _ = read_studies(tmp_path / "one.zip", WANTED, "one")
     by_arm = {(trial.densify, trial.scene, trial.seed): trial.metrics["psnr"] for trial in kept}
     pairs = np.array([by_arm["volumetric", *key[1:]] - value for key, value in by_arm.items() if key[0] == "adc"])
     assert study.effect == pytest.approx(pairs.mean())
     assert study.interval is not None
-    assert [("sfm" in note, "dataset" in note) for note in found.notes] == [(False, True), (True, False)]
+    assert [("sfm" in note, "dataset" in note) for note in notes] == [(False, True), (True, False)]
 
 
 def test_trials_of_archives_can_be_chosen(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -191,20 +191,18 @@ def _search(sweep: Sweep, searches: Sequence[ArmSearch]) -> bool:
         jobs_by_point = [search.jobs_of(proposal.params) for search, proposal in proposals]
         # Composed together, because `compose_jobs` composes only once what trials share.
         trials = iter(sweep.trials([job for jobs in jobs_by_point for job in jobs]))
-        trials_by_point = [[next(trials) for _ in jobs] for jobs in jobs_by_point]
-        missing = [
-            trial
-            for (search, _), point_trials in zip(proposals, trials_by_point, strict=True)
-            for trial in point_trials
-            if search.value_of(trial) is None
+        points = [
+            (search, proposal, [next(trials) for _ in jobs])
+            for (search, proposal), jobs in zip(proposals, jobs_by_point, strict=True)
         ]
+        missing = [trial for search, _, own in points for trial in own if search.value_of(trial) is None]
         if missing and sweep.task.look_only:
             return False
         if missing:
             _write(searches)  # before training, so that the ranges were on record before any result
             sweep.task.launch(missing)
-        for (search, proposal), point_trials in zip(proposals, trials_by_point, strict=True):
-            point = search.judge(proposal, point_trials)
+        for search, proposal, own in points:
+            point = search.judge(proposal, own)
             if missing:
                 value = "failed" if point.value is None else f"{point.value:.5g}"
                 settings, number = ", ".join(words_of_values(point.settings)), len(search.points)

@@ -125,15 +125,6 @@ class PooledQuestion:
     where: Mapping[str, str] = field(default_factory=dict)
 
 
-@dataclass(frozen=True)
-class ArchiveStudies:
-    """The studies of one archive, notes on them, and a mark of each trial (`_mark`), so that none is counted twice."""
-
-    studies: tuple[Study, ...]
-    notes: tuple[str, ...] = ()
-    trials: frozenset[str] = frozenset()
-
-
 def pool_sources(
     sources: Sequence[Path], wanted: PooledQuestion, protocol: str | None = None
 ) -> tuple[Pooled, list[str], list[str]]:
@@ -146,16 +137,17 @@ def pool_sources(
     stems = Counter(source.stem for source in sources)
     for source in sources:
         try:
-            archive = read_studies(source, wanted, source.stem if stems[source.stem] == 1 else str(source))
+            name = source.stem if stems[source.stem] == 1 else str(source)
+            read, archive_notes, marks = read_studies(source, wanted, name)
         except InputError as error:
             faults.append(f"left out: {error}")
             continue
-        if twice := archive.trials & seen.keys():
+        if twice := marks & seen.keys():
             faults.append(f"left out: {source} has trials that {seen[min(twice)]} has, and they would count twice")
             continue
-        seen |= dict.fromkeys(archive.trials, source)
-        notes += archive.notes
-        for study in archive.studies:
+        seen |= dict.fromkeys(marks, source)
+        notes += archive_notes
+        for study in read:
             if protocol is not None and study.protocol != protocol:
                 notes.append(f"{study.name}: not asked for, it is by {study.protocol}")
             elif study.interval is None:
@@ -167,10 +159,11 @@ def pool_sources(
     return pool(studies), notes, faults
 
 
-def read_studies(path: Path, question: PooledQuestion, name: str) -> ArchiveStudies:
+def read_studies(path: Path, question: PooledQuestion, name: str) -> tuple[list[Study], list[str], set[str]]:
     """The studies in the archive ``path``, one or more for each protocol; their labels begin with ``name``.
 
-    Raises InputError, one line, if there is none.
+    Also returns notes on them, and a mark of each trial (`_mark`), so that none is counted twice. Raises InputError,
+    one line, if there is no study.
     """
     studies, notes = [], list[str]()
     with tempfile.TemporaryDirectory() as folder:
@@ -199,7 +192,7 @@ def read_studies(path: Path, question: PooledQuestion, name: str) -> ArchiveStud
                         f"{', '.join(pairs.scenes)}; {_size(own)}"
                     )
                     notes += [f"{label}: left out, {line}" for line in pairs.left_out]
-        return ArchiveStudies(tuple(studies), tuple(notes), frozenset(map(_mark, trials)))
+        return studies, notes, set(map(_mark, trials))
 
 
 def _group_into_studies(trials: Sequence[TrialResult], pairs: Sequence[tuple[Arm, Arm]]) -> list[list[tuple[Arm, Arm]]]:

@@ -26,6 +26,10 @@ from gsbench.runs.layout import SEED
 from gsbench.runs.trial_record import TrialRecord
 from gsbench.words import counted
 
+NO_RESULTS: dict[str, Any] = {"raster": "", "protocol": "", "iterations": 0, "num_init_points": None}
+NO_RESULTS |= {"num_gaussians": 0, "peak_memory_mb": None, "metrics": {}, "unavailable": {}, "seconds": {}}
+NO_RESULTS |= {"hashes": {}, "versions": {}}
+
 log = logging.getLogger(__name__)
 
 KeyAndSeed = tuple[str, int]  # a trial's key (its folder within the experiment without the seed) and its seed
@@ -148,17 +152,7 @@ def _expected(trial: Trial) -> TrialResult:
         init=values["init"]["name"],
         densify=values["densify"]["name"],
         seed=values["seed"],
-        raster="",
-        protocol="",
-        iterations=0,
-        metrics={},
-        unavailable={},
-        seconds={},
-        num_init_points=None,
-        num_gaussians=0,
-        peak_memory_mb=None,
-        hashes={},
-        versions={},
+        **NO_RESULTS,
     )
     result = TrialResult(folder, folder.name.partition(SEED)[0], record)
     return replace(result, settings=Configurations({result.key: flatten(yaml.safe_load(trial.yaml))}))

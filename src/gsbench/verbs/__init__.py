@@ -18,7 +18,7 @@ VERBS = {  # their modules, with their purposes as `gsbench --help` lists them
     "site": ("exchange", "a static site from archives: tables that sort, verdicts, reports"),
     "explain": ("results", "the trials, settings and code behind a number of a table"),
     "status": ("trials", "the state of every trial: done, running, failed, missing"),
-    "retry": ("trials", "run failed, stopped and missing trials again"),
+    "retry": ("trials", "run failed, stopped, damaged and missing trials again"),
     "bench": ("machine", "time rasterizers and the training step"),
     "sync": ("trials", "send to MLflow the trials that it lacks"),
     "ui": ("servers", "open the MLflow dashboard on this machine"),

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from gsbench.errors import InputError
+from gsbench.verbs import VERBS
 from gsbench.words import did_you_mean, is_path
 
 MAX_PORT = 65535
@@ -13,7 +14,16 @@ SETTING = re.compile(r"[+~]*[a-z_]\w*([./]\w+)*=")
 
 
 class ArgumentParser(argparse.ArgumentParser):
-    """An argparse parser that raises InputError for what it does not understand; ``--help`` prints and exits."""
+    """An argparse parser that raises InputError for what it does not understand; ``--help`` prints and exits.
+
+    ``gsbench VERB --help`` prints the verb's purpose, and ``more``.
+    """
+
+    def __init__(self, verb: str = "", more: str = "", **options: Any) -> None:
+        purpose = VERBS[verb][1] if verb else ""
+        stop = "" if purpose.endswith("?") else "."
+        description = f"{purpose[:1].upper()}{purpose[1:]}{stop} {more}"
+        super().__init__(prog=f"gsbench {verb}".strip(), description=description, **options)
 
     def parse_args(self, args: Any = None, namespace: Any = None) -> Any:
         words = list(args or [])

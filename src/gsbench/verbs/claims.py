@@ -47,11 +47,7 @@ DEFAULT_METRIC = "psnr"
 
 def check(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: 0 for any verdicts; raises InputError for bad input."""
-    parser = ArgumentParser(
-        prog="gsbench check",
-        description="Test the claims of a file (docs/claims.md): write the plan down, run trials until each claim is "
-        "decided, and write a page with the verdicts.",
-    )
+    parser = ArgumentParser("check", "It runs trials until each claim is decided, and writes a page (docs/claims.md).")
     parser.add_argument("claims", type=path, help="a YAML file, such as conf/claims/volumetric.yaml")
     parser.add_argument(
         "permissions",
@@ -158,10 +154,7 @@ def _run(check: Check) -> None:
 
 def plan(argv: Sequence[str], runs: Path) -> int:
     """Run the verb; raises InputError for bad input."""
-    parser = ArgumentParser(
-        prog="gsbench plan",
-        description="From an experiment's trials: the scenes and seeds that resolve a difference with 80 % power.",
-    )
+    parser = ArgumentParser("plan", "An estimate from an experiment's trials, for 80 % power.")
     parser.add_argument("experiment")
     parser.add_argument("--metric", default="psnr", help="such as psnr (the default), ssim, lpips_squeeze")
     parser.add_argument(
@@ -253,11 +246,7 @@ def ablate(argv: Sequence[str], runs: Path) -> int:
 
 
 def _ablate_parser() -> ArgumentParser:
-    parser = ArgumentParser(
-        prog="gsbench ablate",
-        description="Train a densifier with its parts switched off in all combinations (docs/claims.md), and judge "
-        "each against the densifier with all of them.",
-    )
+    parser = ArgumentParser("ablate", "Each is judged against the densifier with all of them on (docs/claims.md).")
     parser.add_argument(
         "settings", nargs="*", metavar="KEY=VALUE", help="as of a sweep: densify=volumetric_once seed=0,1,2 …"
     )

@@ -35,11 +35,7 @@ def evaluate(argv: Sequence[str], runs: Path) -> int:
 
 
 def _evaluate_parser() -> ArgumentParser:
-    parser = ArgumentParser(
-        prog="gsbench evaluate",
-        description="Measure renders of any program against photographs, by the protocol that trials are measured by. "
-        "Names are matched, never guessed; sizes must be equal.",
-    )
+    parser = ArgumentParser("evaluate", "Names are matched, never guessed. Sizes must be equal.")
     parser.add_argument("renders", metavar="RENDERS", help="folder of pictures")
     parser.add_argument("settings", nargs="*", metavar="KEY=VALUE", help="settings of the scene, and eval.…")
     parser.add_argument(
@@ -63,10 +59,10 @@ def _evaluate_parser() -> ArgumentParser:
 def export(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: 0 if the file, or folder, was written."""
     parser = ArgumentParser(
-        prog="gsbench export",
-        description="Write a trained model for other programs; `gsbench export init TRIAL --out DIR` copies the COLMAP "
-        "model that the trial started from; `gsbench export --results EXPERIMENT` writes results, configurations and "
-        "hashes as one small archive, without pixels unless --pictures is given.",
+        "export",
+        "`gsbench export init TRIAL --out DIR` copies the COLMAP model that the trial started from. `gsbench export "
+        "--results EXPERIMENT` writes results, configurations and hashes as one small archive, without pixels unless "
+        "--pictures is given.",
     )
     parser.add_argument("--results", metavar="EXPERIMENT", help="the archive of its results (default: EXPERIMENT.zip)")
     parser.add_argument("trial", nargs="*", metavar="TRIAL", help=f"{ADDRESS}; after the word init: its initial model")
@@ -149,10 +145,7 @@ def pool(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: 0, or 1 if a source was left out; raises InputError if none can be read."""
     from gsbench.claims.pooling import PooledQuestion, describe, markdown_table, pool_sources  # slow
 
-    parser = ArgumentParser(
-        prog="gsbench pool",
-        description="A mean over many archives of `gsbench export --results`, each with the same weight.",
-    )
+    parser = ArgumentParser("pool", "It is their mean, each with the same weight.")
     parser.add_argument("sources", nargs="+", type=path, metavar="ARCHIVE")
     parser.add_argument("--arm", type=names, required=True, help="a densifier; names it goes by, comma between")
     parser.add_argument(
@@ -178,11 +171,7 @@ def site(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: 0, or 1 if an archive was left out; raises InputError if none can be read."""
     from gsbench.claims.site import INDEX, write_site  # here, for a quick answer to --help
 
-    parser = ArgumentParser(
-        prog="gsbench site",
-        description="Write a static site from archives (gsbench export --results); it needs no server. It has sortable "
-        "tables of arms and scenes, all verdicts, and the report of each, with pictures if the archive has them.",
-    )
+    parser = ArgumentParser("site", "It needs no server, and has pictures if the archives have them.")
     parser.add_argument("archives", nargs="+", type=path, metavar="ARCHIVE")
     parser.add_argument("--out", type=path, required=True, metavar="DIR", help="the folder to write into")
     parser.add_argument("--title", default="Results of gsbench", help="of its first page")

@@ -114,9 +114,9 @@ def _mirror(mirror: str | None) -> str | None:
 
 def _parser(names: Sequence[str]) -> ArgumentParser:
     parser = ArgumentParser(
-        prog="gsbench fetch",
-        description=f"Bring public scenes into the data folder (${DATA_VARIABLE}, else ./data), where scene=NAME finds "
-        "them: only the wanted scenes and image folders out of the archives. Stopped, the same command goes on.",
+        "fetch",
+        f"They come into the data folder (${DATA_VARIABLE}, else ./data), where scene=NAME finds them: only the wanted "
+        "scenes and image folders out of the archives. Stopped, the same command goes on.",
     )
     parser.add_argument("dataset", nargs="?", metavar="DATASET", help=", ".join(names))
     parser.add_argument("scenes", nargs="*", metavar="SCENE", help="the scenes wanted; none: all of the data set")

@@ -44,7 +44,7 @@ class Finding(NamedTuple):
 
 def doctor(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: 1 if something is bad."""
-    parser = ArgumentParser(prog="gsbench doctor", description="Check this machine and say what is missing.")
+    parser = ArgumentParser("doctor")
     parser.parse_args(argv)
     bad = 0
     for findings in (check_packages(), check_devices(), check_weights(), check_runs(runs)):
@@ -151,10 +151,7 @@ def check_runs(runs: Path) -> Iterator[Finding]:
 
 def _bench_parser() -> ArgumentParser:
     names = ", ".join(executor.name for executor in EXECUTORS)
-    parser = ArgumentParser(
-        prog="gsbench bench",
-        description="Time rasterizers and the training step side by side: medians of steps that take turns.",
-    )
+    parser = ArgumentParser("bench", "Times are medians of steps that take turns.")
     parser.add_argument(
         "--raster", default="cpu", help=f"names, comma between: {names}, or your own, mine.MyRasterizer"
     )

@@ -99,11 +99,7 @@ def _as_file(arm: Arm) -> str:
 
 
 def _tables_parser() -> ArgumentParser:
-    parser = ArgumentParser(
-        prog="gsbench tables",
-        description="Tables of an experiment, from its result files; `gsbench tables paper` lists where the paper's "
-        "own numbers contradict each other.",
-    )
+    parser = ArgumentParser("tables", "`gsbench tables paper` lists where the paper contradicts itself.")
     parser.add_argument(
         "experiment", help="its name; table1, table2 and their _own come in the paper's layout, with its values beside"
     )
@@ -164,7 +160,7 @@ def report(argv: Sequence[str], runs: Path) -> int:
     """Run the verb; raises InputError for bad input."""
     from gsbench.analysis.report.build import build_report  # here, for a quick answer to --help
 
-    parser = ArgumentParser(prog="gsbench report", description="One HTML file with the evidence of an experiment.")
+    parser = ArgumentParser("report")
     parser.add_argument("experiment")
     parser.add_argument(
         "--out", type=path, metavar="PATH", help=f"a folder or a .html file; default: {REPORT_NAME} with the experiment"
@@ -193,9 +189,7 @@ def file_at(out: Path, experiment: str) -> Path:
 
 def explain(argv: Sequence[str], runs: Path) -> int:
     """Run the verb; raises InputError for bad input."""
-    parser = ArgumentParser(
-        prog="gsbench explain", description="The runs, settings, data and code versions behind a cell of a table."
-    )
+    parser = ArgumentParser("explain")
     parser.add_argument("cell", metavar="CELL", help=f"a number of a table: {ADDRESS}")
     print(explain_cell(parser.parse_args(argv).cell, runs))
     return 0

@@ -26,9 +26,7 @@ LEAN = {  # environment; MLflow's defaults take eight processes and 2 GB
 
 
 def view(argv: Sequence[str], runs: Path) -> int:
-    parser = ArgumentParser(
-        prog="gsbench view", description="Look at trained models in the browser: one, or two side by side."
-    )
+    parser = ArgumentParser("view")
     parser.add_argument("trial", nargs="+", metavar="TRIAL", help=ADDRESS)
     parser.add_argument("--port", type=port, default=VIEWER_PORT, help=f"on this machine; 0: any ({VIEWER_PORT})")
     parser.add_argument("--device", default="auto", help="auto, cpu, cuda or cuda:1")
@@ -61,7 +59,7 @@ def view(argv: Sequence[str], runs: Path) -> int:
 
 def ui(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: serves the dashboard until Ctrl-C."""
-    parser = ArgumentParser(prog="gsbench ui", description="The MLflow dashboard, on this machine only.")
+    parser = ArgumentParser("ui")
     parser.add_argument(
         "--uri", help="the tracker's database; default: $MLFLOW_TRACKING_URI, or that of the runs folder"
     )

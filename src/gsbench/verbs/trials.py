@@ -35,7 +35,7 @@ log = logging.getLogger(__name__)
 
 def status(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: 0 if all trials are done, running or queued, 1 if some failed or are missing."""
-    parser = ArgumentParser(prog="gsbench status", description="The state of every trial of an experiment.")
+    parser = ArgumentParser("status")
     parser.add_argument("experiment", nargs="?", help="its name; without one, a line for each experiment")
     parser.add_argument("--all", action="store_true", help="list the finished trials too")
     parser.add_argument("--json", action="store_true", help="print a JSON list instead of lines")
@@ -132,9 +132,7 @@ def retry(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: the exit code says, as a sweep's does, whether a trial failed."""
     from gsbench.app.command import run_trials
 
-    parser = ArgumentParser(
-        prog="gsbench retry", description="Run the failed, stopped, damaged and missing trials of an experiment again."
-    )
+    parser = ArgumentParser("retry")
     parser.add_argument("experiment")
     parser.add_argument(
         "changes",
@@ -213,7 +211,7 @@ def recompose(folder: Path, planned: PlannedTrial | None, runs: Path, changes: l
 
 def sync(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: 1 if the tracker cannot be reached."""
-    parser = ArgumentParser(prog="gsbench sync", description="Mirror ended trials to their tracker, once.")
+    parser = ArgumentParser("sync")
     parser.add_argument("experiment", nargs="?", help="its name; without one, all")
     parser.add_argument(
         "--uri",

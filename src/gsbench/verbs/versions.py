@@ -48,10 +48,10 @@ LOG = "bisect.log"
 def gate(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: 0 passed, 1 worse, 3 not decided; raises GsbenchError (1) if trials fail, InputError (2)."""
     parser = ArgumentParser(
-        prog="gsbench gate",
-        description="Train this version on scenes and seeds of an archive (gsbench export --results), seed by seed "
-        "until it is decided. The exit code says whether it is worse: 0 no (better, or worse by less than what "
-        "matters), 1 yes, or its trials fail, 3 the seeds do not tell, 2 bad input (docs/gate.md).",
+        "gate",
+        "It trains this version on scenes and seeds of an archive (gsbench export --results), seed by seed until it "
+        "is decided. Exit code 0: no (better, or worse by less than what matters), 1: yes, or its trials fail, 3: the "
+        "seeds do not tell, 2: bad input (docs/gate.md).",
     )
     parser.add_argument("archive", type=path, help="the results of the version that you trust")
     add_question(parser)
@@ -132,11 +132,11 @@ def _arm(trial: TrialResult) -> str:
 def bisect(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: 0 if the commit is found, 3 if not; raises TrainingError if GOOD or BAD does not train."""
     parser = ArgumentParser(
-        prog="gsbench bisect",
-        description="Find the commit that made results worse in the git repository of this folder: one with a "
-        "densifier of your own, or gsbench's checkout. Each step trains one commit in a work tree of its own and "
-        "compares it with GOOD, as gsbench gate does; all steps share an error rate of 5 %. The same command goes on "
-        "after a kill. Exit code 0: found, 3: not found (docs/gate.md).",
+        "bisect",
+        "It searches the git repository of this folder: one with a densifier of your own, or gsbench's checkout. Each "
+        "step trains one commit in a work tree of its own and compares it with GOOD, as gsbench gate does; all steps "
+        "share an error rate of 5 %. The same command goes on after a kill. Exit code 0: found, 3: not found "
+        "(docs/gate.md).",
     )
     parser.add_argument("good", help="a commit, tag or branch whose results are good")
     parser.add_argument("bad", help="a later one whose results are worse")
