@@ -223,7 +223,11 @@ def explain_storage(error: BaseException, folder: Path) -> GsbenchError | None:
     """An error of gsbench that explains ``error`` if its cause is storage, else None."""
     number = error.errno if isinstance(error, OSError) else None
     place = getattr(error, "filename", None) or folder
-    if number in FULL or FULL_TEXT.search(str(error)) or (_is_write_error(error) and _free(folder) < NEARLY_NOTHING):
+    if (
+        number in FULL
+        or FULL_TEXT.search(str(error))
+        or (isinstance(error, (OSError, RuntimeError)) and _free(folder) < NEARLY_NOTHING)
+    ):
         return DiskFullError(
             f"the disk of {folder} is full: free some space, then give the same command again: it continues"
         )
@@ -245,14 +249,8 @@ def explain_storage(error: BaseException, folder: Path) -> GsbenchError | None:
     return None
 
 
-def _is_write_error(error: BaseException) -> bool:
-    return isinstance(error, (OSError, RuntimeError))
-
-
 def _free(folder: Path) -> int:
-    existing = folder
-    while not existing.exists() and existing != existing.parent:
-        existing = existing.parent
+    existing = next(place for place in (folder, *folder.parents) if place.exists())
     try:
         usage = shutil.disk_usage(existing)
     except OSError:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from gsbench.system.install import Checkout, checkout_of
+from gsbench.system.install import checkout_of
 
 
 def test_a_folder_that_the_repository_does_not_follow_is_no_checkout(
@@ -27,8 +27,8 @@ def test_a_folder_that_the_repository_does_not_follow_is_no_checkout(
     inner = tmp_path / ".venv" / "site-packages"
     inner.mkdir(parents=True)
     (inner / "b.py").touch()
-    assert checkout_of(inner, "b.py") is None
+    assert checkout_of(inner, "b.py") == {}
     commit = git("rev-parse", "HEAD")
-    assert checkout_of(tmp_path, "a.py") == Checkout(commit, False)
+    assert checkout_of(tmp_path, "a.py") == {"commit": commit, "edited": False}
     (tmp_path / "a.py").write_text("two")
-    assert checkout_of(tmp_path, "a.py") == Checkout(commit, True)
+    assert checkout_of(tmp_path, "a.py") == {"commit": commit, "edited": True}

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from gsbench.system.install import Checkout, checkout_of
+from gsbench.system.install import checkout_of
 
 MARK = "#!/bin/sh\ntouch '{mark}'\ncat\n"
 
@@ -35,9 +35,9 @@ def git(*words: str) -> str:
 
 
 def test_commit_and_changes_are_told(repository: Path) -> None:
-    assert checkout_of(repository) == Checkout(git("rev-parse", "HEAD"), False)
+    assert checkout_of(repository, "a.txt") == {"commit": git("rev-parse", "HEAD"), "edited": False}
     (repository / "a.txt").write_text("two")
-    assert checkout_of(repository) == Checkout(git("rev-parse", "HEAD"), True)
+    assert checkout_of(repository, "a.txt") == {"commit": git("rev-parse", "HEAD"), "edited": True}
 
 
 @pytest.mark.parametrize("setting", ["core.fsmonitor", "filter.x.clean", "filter.x.process", "Filter.y.CLEAN"])
@@ -51,9 +51,8 @@ def test_git_starts_nothing_that_a_capture_names(repository: Path, tmp_path: Pat
     assert (tmp_path / "exploded").exists()  # git alone would start it
     (tmp_path / "exploded").unlink()
     os.utime(repository / "a.txt", (2, 2))
-    found = checkout_of(repository)
-    assert found is not None
-    assert found.commit == git("rev-parse", "HEAD")
+    found = checkout_of(repository, "a.txt")
+    assert found["commit"] == git("rev-parse", "HEAD")
     assert not (tmp_path / "exploded").exists()
 
 
@@ -62,5 +61,5 @@ def test_nor_hooks(repository: Path, tmp_path: Path) -> None:
     hook.write_text(MARK.format(mark=tmp_path / "exploded"))
     hook.chmod(0o755)
     os.utime(repository / "a.txt", (3, 3))
-    checkout_of(repository)
+    checkout_of(repository, "a.txt")
     assert not (tmp_path / "exploded").exists()

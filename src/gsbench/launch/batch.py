@@ -7,7 +7,6 @@ import re
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 from gsbench.config.command_words import options
 from gsbench.config.compose import Trial
@@ -79,26 +78,17 @@ def _skip_finished(trials: Sequence[Trial]) -> tuple[list[Outcome], list[Trial]]
     """The outcomes of finished trials, and the unfinished ones; each folder once, since a sweep may repeat a value."""
     outcomes: list[Outcome] = []
     unfinished: list[Trial] = []
-    seen: set[Path] = set()
-    for trial in trials:
-        folder = trial.folder
-        if folder in seen:
-            continue
-        seen.add(folder)
-        if not _why_not_done(trial):
+    for folder, trial in {trial.folder: trial for trial in trials}.items():
+        if _why_not_done(trial):
+            unfinished.append(trial)
+        else:
             outcomes.append(outcome_of_results(folder, trial.files.record()))
             log.info("%s: was done  %s", outcomes[-1].label, outcomes[-1].message)
-        else:
-            unfinished.append(trial)
     return outcomes, unfinished
 
 
 def _why_not_done(trial: Trial) -> str:
-    return trial.files.why_not_done(trial.values, _unavailable_metrics)
-
-
-def _unavailable_metrics(options: dict[str, Any]) -> frozenset[str]:
-    return _unavailable(json.dumps(options, sort_keys=True))
+    return trial.files.why_not_done(trial.values, lambda options: _unavailable(json.dumps(options, sort_keys=True)))
 
 
 @cache

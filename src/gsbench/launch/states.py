@@ -5,9 +5,7 @@ A file in a trial's folder names its Slurm job.
 
 from __future__ import annotations
 
-import getpass
 import json
-import os
 import subprocess
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
@@ -16,6 +14,7 @@ from itertools import compress
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import psutil
 from pydantic import Field
 
 from gsbench.config.compose import Trial
@@ -228,10 +227,7 @@ def read_queue(users: Iterable[str]) -> Queue | None:
 
 def current_user() -> str:
     """The user's name, or the user id if there is no name, as in some containers."""
-    try:
-        return getpass.getuser()
-    except (KeyError, OSError):
-        return str(os.getuid())
+    return psutil.Process().username()
 
 
 # ---- a dry run: all finished trials are read once, so that ten thousand planned ones can be compared with them

@@ -5,7 +5,6 @@ import os
 import re
 import subprocess
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import PackageNotFoundError, distribution, version
 from pathlib import Path
@@ -76,32 +75,24 @@ REPOSITORY_VARIABLES = (
 SAFE_SETTINGS = ("core.fsmonitor=false", f"core.hooksPath={os.devnull}", "protocol.allow=never")
 
 
-@dataclass(frozen=True)
-class Checkout:
-    """The commit of a checkout. ``edited``: whether tracked files have changed since; None if unknown."""
+def checkout_of(folder: Path, tracked: str) -> dict[str, Any]:
+    """The ``commit`` of the checkout that contains ``folder``, and whether it is ``edited``: None if that is unknown.
 
-    commit: str
-    edited: bool | None
-
-
-def checkout_of(folder: Path, tracked: str | None = None) -> Checkout | None:
-    """The checkout that contains ``folder``; None if there is none, or if git does not track the file ``tracked``."""
-    if tracked is not None and not _git(folder, "ls-files", "--", tracked):
-        return None
-    commit = _git(folder, "rev-parse", "HEAD")
+    Empty if there is no checkout, or if git does not track the file ``tracked``.
+    """
+    commit = _git(folder, "rev-parse", "HEAD") if _git(folder, "ls-files", "--", tracked) else None
     if not commit:
-        return None
+        return {}
     changes = None
     if not _has_filters(folder):
         changes = _git(folder, "status", "--porcelain", "--untracked-files=no", "--ignore-submodules=all")
-    return Checkout(commit, None if changes is None else bool(changes))
+    return {"commit": commit, "edited": None if changes is None else bool(changes)}
 
 
 @cache
 def own_checkout() -> dict[str, Any]:
     """The commit of gsbench's own checkout, and whether tracked files had changed; empty if it is no checkout."""
-    state = checkout_of(Path(__file__).parent, Path(__file__).name)
-    return {} if state is None else {"commit": state.commit, "edited": state.edited}
+    return checkout_of(Path(__file__).parent, Path(__file__).name)
 
 
 def _has_filters(folder: Path) -> bool:

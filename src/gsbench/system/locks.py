@@ -9,7 +9,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from filelock import FileLock, Timeout
 
@@ -50,7 +49,9 @@ def hold(path: Path, what: str, wait: bool = True) -> Iterator[None]:
     with suppress(OSError):  # this file is only information
         holder.unlink(missing_ok=True)  # first: another process may have made it a link to any file
         with os.fdopen(open_plain(holder, os.O_WRONLY | os.O_CREAT | os.O_EXCL), "w") as stream:
-            stream.write(json.dumps(this_process() | {"what": what}))
+            job = os.environ.get("SLURM_JOB_ID")
+            this = LockHolder(host=socket.gethostname(), pid=os.getpid(), since=time.time(), slurm=job, what=what)
+            stream.write(json.dumps(this.to_json()))
     try:
         yield
     finally:
@@ -109,15 +110,6 @@ def describe_holder(path: Path) -> str:
     """The holder of a lock, for people."""
     holder = read_holder(path)
     return "another process" if holder is None else holder.description
-
-
-def this_process() -> dict[str, Any]:
-    return {
-        "pid": os.getpid(),
-        "host": socket.gethostname(),
-        "slurm": os.environ.get("SLURM_JOB_ID"),
-        "since": time.time(),
-    }
 
 
 def _holder_file(path: Path) -> Path:

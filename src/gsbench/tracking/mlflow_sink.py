@@ -6,7 +6,6 @@ is sent twice is stored once. The trial's folder keeps the run's id, so that no 
 
 from __future__ import annotations
 
-import getpass
 import logging
 import os
 import re
@@ -17,6 +16,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import psutil
 from filelock import FileLock
 
 from gsbench.errors import InputError
@@ -121,14 +121,6 @@ def require_own_artifacts(client: MlflowClient, address: str, runs: Path) -> Non
             f"and {ARTIFACTS} there: `gsbench sync` makes them again"
         )
     require_no_links(runs, place, below=True)
-
-
-def user_tags() -> dict[str, str]:
-    """The tag with the user's name, if the system has one."""
-    try:
-        return {"mlflow.user": getpass.getuser()}
-    except (KeyError, OSError, ImportError):  # a user without a name in a container; Windows
-        return {}
 
 
 def _create_sqlite(uri: str) -> None:
@@ -241,7 +233,7 @@ class MlflowSink:
 
     def _create_run(self, experiment_id: str, token: str) -> Any:
         trial, client = self._trial, self.client
-        tags = trial.tags() | {TOKEN_TAG: token} | user_tags()
+        tags = trial.tags() | {TOKEN_TAG: token, "mlflow.user": psutil.Process().username()}
         return client.create_run(experiment_id, tags=tags, run_name=trial.label)
 
     def _log_params(self) -> None:

@@ -53,14 +53,10 @@ from gsbench.system.resources import available_threads
 
 
 class CaptureSource:
-    """The source of the photographs of a scene: the user's folder, or a step that makes them.
-
-    The files are read once, however many trials ask.
-    """
+    """The source of the photographs of a scene: the user's folder, or a step that makes them."""
 
     def __init__(self, options: SceneConfig) -> None:
         self.options, self.name = options, str(options.name)
-        self._captures: dict[Path | None, Capture] = {}
 
     @cached_property
     def step(self) -> Step | None:
@@ -74,11 +70,6 @@ class CaptureSource:
 
     def read(self, made: Path | None) -> Capture:
         """The photographs, selected and split; ``made`` is the folder that ``step`` filled."""
-        if made not in self._captures:
-            self._captures[made] = self._read(made)
-        return self._captures[made]
-
-    def _read(self, made: Path | None) -> Capture:
         options = self.options
         selection: dict[str, Any] = {"max_images": options.max_images, "split": options.split_rule}
         if options.kind == "courtyard":

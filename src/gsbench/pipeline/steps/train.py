@@ -8,8 +8,7 @@ import os
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -159,8 +158,10 @@ def external_step(views: Views, trainer: External, parts: Parts) -> Step:
                 shutil.rmtree(places[place], ignore_errors=True)
         log.info("train: %s ended after %s", trainer.program, readable_time(ended.seconds))
         pattern = fill_placeholders(trainer.result, values, "densify.result")
-        with naming_the_program(trainer, log_file):
+        try:
             summary = take_result(trainer, pattern, views, places[OUTPUT], folder)
+        except TrainingError as error:
+            raise TrainingError(f"{Path(trainer.program).name} ended well, but {error}; log: {log_file}") from error
         shutil.rmtree(work)
         (folder / EVENTS).write_text("")
         summary |= {
@@ -198,15 +199,6 @@ def take_result(trainer: External, pattern: str, views: Views, output: Path, fol
     state: dict[str, Any] = {name: tensor.numpy() for name, tensor in lineage.state_dict().items()}
     np.savez_compressed(folder / LINEAGE, **state)
     return {"evaluated_from": FROM_MODEL, "num_gaussians": len(gaussians), "causes": lineage.causes_of_living()}
-
-
-@contextmanager
-def naming_the_program(trainer: External, log_file: Path) -> Iterator[None]:
-    """Add the program's name and the path of its log to a TrainingError about its result."""
-    try:
-        yield
-    except TrainingError as error:
-        raise TrainingError(f"{Path(trainer.program).name} ended well, but {error}; log: {log_file}") from error
 
 
 def environment_of(trainer: External, values: Mapping[str, object]) -> dict[str, str]:
