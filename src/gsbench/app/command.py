@@ -27,6 +27,7 @@ from omegaconf.errors import OmegaConfBaseException
 from gsbench.analysis.quantities import COSTS
 from gsbench.app.tuning import tuned_jobs
 from gsbench.claims.stopping import KeyAndSeed, headline, plan_sweep, run_looks
+from gsbench.config import compose
 from gsbench.config.command_words import (
     bare_key,
     check_words,
@@ -38,18 +39,7 @@ from gsbench.config.command_words import (
     parse_word,
     value_text,
 )
-from gsbench.config.compose import (
-    Trial,
-    compose_jobs,
-    compose_whole,
-    enforce_permissions,
-    explained,
-    hydra_ready,
-    resolve_times,
-    resolve_trial,
-    run_main,
-    typed_words,
-)
+from gsbench.config.compose import Trial
 from gsbench.config.trust import PERMISSIONS, check_composed, load_callbacks
 from gsbench.errors import GsbenchError, InputError
 from gsbench.eval.options import EvalConfig
@@ -140,8 +130,8 @@ class TrialTask:
         hydra: Any = HydraConfig.instance().cfg
         # Checked again: the files that this job chooses may set other things of Hydra than the checked ones.
         check_composed(hydra, self.allowed)
-        hydra_words, words = typed_words(hydra.hydra.overrides)
-        trial = resolve_trial(enforce_permissions(config, self.allowed), [*hydra_words, *words])
+        hydra_words, words = compose.typed_words(hydra.hydra.overrides)
+        trial = compose.resolve_trial(compose.enforce_permissions(config, self.allowed), [*hydra_words, *words])
         if hydra.hydra.mode == RunMode.RUN:
             self.launch([trial])
             return
@@ -163,12 +153,12 @@ def run_app(words: Sequence[str], multirun: bool, task: TrialTask) -> None:
     """
     check_words(words)
     swept = [word for word in words if is_sweep(word)]
-    with hydra_ready():
-        config = compose_whole([*words, "hydra.mode=MULTIRUN"] if multirun else words)
+    with compose.hydra_ready():
+        config = compose.compose_whole([*words, "hydra.mode=MULTIRUN"] if multirun else words)
     multirun = config.hydra.mode == RunMode.MULTIRUN
     if swept and not multirun:
         raise InputError(f"{swept[0]} lists several values: add -m to run one trial for each")
-    with explained(words):
+    with compose.explained(words):
         check_sweep_settings(config, multirun)
         check_launcher(config, multirun)
     task.allowed = tuple(config[PERMISSIONS])
@@ -179,8 +169,8 @@ def run_app(words: Sequence[str], multirun: bool, task: TrialTask) -> None:
         argv += [f"~hydra.callbacks.{name}" for name in config.hydra.callbacks]
     else:
         load_callbacks(config.hydra.callbacks, task.allowed)
-    with explained(words, (HydraException, OmegaConfBaseException, OSError)):
-        run_main(task, [*argv, f"hydra.mode={(RunMode.MULTIRUN if multirun else RunMode.RUN).name}"], task.allowed)
+    with compose.explained(words, (HydraException, OmegaConfBaseException, OSError)):
+        compose.run_main(task, [*argv, f"hydra.mode={'MULTIRUN' if multirun else 'RUN'}"], task.allowed)
 
 
 def list_trials(trials: Sequence[Trial]) -> list[Outcome]:
@@ -199,9 +189,7 @@ def check_sweep_settings(config: DictConfig, multirun: bool) -> None:
     if not multirun and config.hydra.mode is None and (params or sweeper.get("grids")):
         raise InputError("hydra.sweeper lists values: add -m to run a trial for each, or hydra.mode=RUN for one")
     if params is not None and not OmegaConf.is_dict(params):
-        raise InputError(
-            f"hydra.sweeper.params={params} must map settings to their values; seed=0,1 can be typed itself"
-        )
+        raise InputError(f"hydra.sweeper.params={params} must map settings to values; seed=0,1 can be typed itself")
     if config.launch.stop_when_decided and not multirun:
         raise InputError("launch.stop_when_decided adds seeds to a sweep: add -m, two densifiers and seed=0,1,2,3")
 
@@ -258,7 +246,7 @@ class Sweep:
         """Make a sweep from what Hydra gives a sweeper."""
         assert isinstance(task, TrialTask)
         config.allow_targets = list(task.allowed)
-        resolve_times(config)
+        compose.resolve_times(config)
         launcher = Plugins.instance().instantiate_launcher(hydra_context=context, task_function=task, config=config)
         return cls(config, task, context, launcher)
 
@@ -286,12 +274,12 @@ class Sweep:
         """The words as Hydra reads them, with the choices of ``glob(*)``."""
         for word in words:
             parse_word(word)  # for its errors: words from a file were not checked before
-        with explained(words):
+        with compose.explained(words):
             return OverridesParser.create(self.context.config_loader).parse_overrides(list(words))
 
     def trials(self, jobs: Sequence[Sequence[str]]) -> list[Trial]:
         """The trials of ``jobs``, each the list of its words."""
-        return compose_jobs(self.context.config_loader, self.config, jobs)
+        return compose.compose_jobs(self.context.config_loader, self.config, jobs)
 
     def launch(self, trials: Sequence[Trial]) -> None:
         """Run trials by the launcher. For another launcher than gsbench's, all trials are checked before the first."""

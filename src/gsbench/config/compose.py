@@ -24,16 +24,8 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 from omegaconf.errors import OmegaConfBaseException
 
-from gsbench.config.command_words import (
-    GROUPS,
-    check_search_path,
-    check_single,
-    is_sweep,
-    options,
-    parse_word,
-    searched_folders,
-    typed_permissions,
-)
+from gsbench.config import command_words
+from gsbench.config.command_words import GROUPS, options, parse_word
 from gsbench.config.schema import Config, checked_values, register_schemas
 from gsbench.config.trust import HYDRAS_CALLBACKS, PERMISSIONS, check_composed, check_permissions
 from gsbench.errors import GsbenchError, InputError
@@ -91,14 +83,14 @@ def compose_whole(words: Sequence[str], modules: str | None = None) -> DictConfi
     folder ``modules`` (default: the current one). Raises InputError, one line. Call it within `hydra_ready`.
     """
     # The order matters: Hydra imports packages of the search path while it composes, so they are checked first.
-    allowed = typed_permissions(words)
-    check_search_path(words, allowed)
-    check_files(searched_folders(words))
+    allowed = command_words.typed_permissions(words)
+    command_words.check_search_path(words, allowed)
+    check_files(command_words.searched_folders(words))
     allow_modules(allowed, os.getcwd() if modules is None else modules)
     with explained(words), warnings.catch_warnings():
         # Hydra only warns of a folder in its search path that does not exist.
         warnings.filterwarnings("error", message=r".* is not available\.", module="hydra")
-        single = [word for word in words if not is_sweep(word)]
+        single = [word for word in words if not command_words.is_sweep(word)]
         return enforce_permissions(hydra.compose(CONFIG_NAME, single, return_hydra_config=True), allowed)
 
 
@@ -159,7 +151,7 @@ def compose_one(overrides: Sequence[str], modules: str | None = None) -> Trial:
 
     The folder ``modules`` (default: the current one) is where the user's modules are looked for.
     """
-    check_single(overrides, "choose one")
+    command_words.check_single(overrides, "choose one")
     with hydra_ready():
         return resolve_trial(compose_whole(overrides, modules), overrides)
 
@@ -219,7 +211,7 @@ def compose_jobs(loader: ConfigLoader, sweep: DictConfig, jobs: Sequence[Sequenc
                 for key, value in values.items():
                     OmegaConf.update(composed, key, value)
             else:
-                check_search_path(words, allowed)
+                command_words.check_search_path(words, allowed)
                 composed = by_files[files] = enforce_permissions(loader.load_sweep_config(sweep, list(words)), allowed)
                 with read_write(composed), open_dict(composed):
                     composed.pop("hydra")  # large, and no trial reads it

@@ -72,14 +72,8 @@ def add_question(parser: argparse.ArgumentParser) -> None:
 
 def add_where(parser: argparse.ArgumentParser) -> None:
     """Add ``--where KEY=VALUE``, whose values `gsbench.analysis.cells.select_trials` takes as a dict."""
-    parser.add_argument(
-        "--where",
-        type=_condition,
-        action="append",
-        default=[],
-        metavar="KEY=VALUE",
-        help="only such trials (repeatable)",
-    )
+    text = "only such trials (repeatable)"
+    parser.add_argument("--where", type=_condition, action="append", default=[], metavar="KEY=VALUE", help=text)
 
 
 def _condition(text: str) -> tuple[str, str]:

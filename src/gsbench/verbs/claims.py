@@ -14,15 +14,7 @@ from gsbench.analysis.quantities import Quantity, quantity
 from gsbench.analysis.results import load_experiment, read_experiment
 from gsbench.analysis.statistics import MIN_SCENES, Components, designs_needed, estimate_components
 from gsbench.app.command import compose_trials, run_trials
-from gsbench.claims.ablation import (
-    choose_switches,
-    declared_switches,
-    judge_runs,
-    markdown_table,
-    off_settings,
-    run_name,
-    runs_to_train,
-)
+from gsbench.claims import ablation
 from gsbench.claims.check import Check, make_page, prepare, recheck, to_html, to_text
 from gsbench.claims.file import ClaimsFile, read_claims
 from gsbench.claims.stopping import KeyAndSeed, run_looks
@@ -158,7 +150,7 @@ def plan(argv: Sequence[str], runs: Path) -> int:
     parser.add_argument("experiment")
     parser.add_argument("--metric", default="psnr", help="such as psnr (the default), ssim, lpips_squeeze")
     parser.add_argument(
-        "--difference", type=_above_zero, help="the difference to see; default: what papers count as an improvement"
+        "--difference", type=_above_zero, help="to be seen; default: what papers count as an improvement"
     )
     parser.add_argument("--baseline", default=BASELINE, help=f"the densifier to compare with ({BASELINE})")
     options = parser.parse_args(argv)
@@ -198,7 +190,7 @@ def _lines(components: Components, metric: Quantity, difference: float) -> list[
         designs.sort(key=lambda design: (design.trials, design.scenes))
         texts = [f"{design.scenes} × {design.seeds} ({design.trials} trials)" for design in designs[:MAX_DESIGNS]]
         lines.append(
-            f"  to see {difference:g} on {group}, scenes × seeds: {', '.join(texts) or 'no number that can be run'}"
+            f"  to see {difference:g} on {group}, scenes × seeds: {', '.join(texts) or 'none that can be run'}"
         )
     return lines
 
@@ -220,9 +212,12 @@ def ablate(argv: Sequence[str], runs: Path) -> int:
     words = [*settings, *([] if _names_experiment(settings) else [f"name={_default_name(settings)}"])]
     first = _trials(words)
     densify = _only_densifier(first)
-    declared = declared_switches(_class_switches(first[0]), first[0].values["densify"])
-    switches = choose_switches(declared, options.switches, densify)
-    by_run = {run: _trials([*words, *_words(off_settings(run, switches), first[0])]) for run in runs_to_train(switches)}
+    declared = ablation.declared_switches(_class_switches(first[0]), first[0].values["densify"])
+    switches = ablation.choose_switches(declared, options.switches, densify)
+    by_run = {
+        run: _trials([*words, *_words(ablation.off_settings(run, switches), first[0])])
+        for run in ablation.runs_to_train(switches)
+    }
     _check_different(by_run)
     trials = [trial for group in by_run.values() for trial in group]
     print(
@@ -231,7 +226,7 @@ def ablate(argv: Sequence[str], runs: Path) -> int:
     )
     for run, group in by_run.items():
         hashes = ", ".join(dict.fromkeys(trial.folder.name.partition(SEED)[0] for trial in group))
-        print(f"  {hashes}: {run_name(run, list(switches))}")
+        print(f"  {hashes}: {ablation.run_name(run, list(switches))}")
     if options.dry_run:
         print("\n".join(describe_plan(trials, trials[0].values["launch"]["parallel"])))
         return 0
@@ -240,7 +235,7 @@ def ablate(argv: Sequence[str], runs: Path) -> int:
     if code == 0:
         keys = {run: {t.values["scene"]["name"]: t.files.key for t in group} for run, group in by_run.items()}
         metric = options.metric or trials[0].values["eval"].get("primary") or DEFAULT_METRIC
-        print("\n".join(markdown_table(judge_runs(read_experiment(home).trials, keys, metric))))
+        print("\n".join(ablation.markdown_table(ablation.judge_runs(read_experiment(home).trials, keys, metric))))
         print(f"all metrics and pictures: gsbench report {home.name}")
     return code
 
@@ -248,11 +243,9 @@ def ablate(argv: Sequence[str], runs: Path) -> int:
 def _ablate_parser() -> ArgumentParser:
     parser = ArgumentParser("ablate", "Each is judged against the densifier with all of them on (docs/claims.md).")
     parser.add_argument(
-        "settings", nargs="*", metavar="KEY=VALUE", help="as of a sweep: densify=volumetric_once seed=0,1,2 …"
+        "settings", nargs="*", metavar="KEY=VALUE", help="as of a sweep: densify=volumetric seed=0,1,2 …"
     )
-    parser.add_argument(
-        "--switches", type=names, default=(), metavar="A,B", help="only these; default: all it declares"
-    )
+    parser.add_argument("--switches", type=names, default=(), metavar="A,B", help="only these; default: all declared")
     parser.add_argument("--metric", help="printed; default: eval.primary, else psnr")
     parser.add_argument("--dry-run", action="store_true", help="list the trials and their state; run nothing")
     return parser

@@ -48,7 +48,7 @@ def _evaluate_parser() -> ArgumentParser:
     parser.add_argument("--protocol", choices=list(PROTOCOLS), help="default: that of the trial, or paper")
     parser.add_argument("--by-order", action="store_true", help="match sorted pictures with sorted photographs")
     parser.add_argument(
-        "--as", dest="place", metavar="EXPERIMENT:ARM", help="enter them as a trial; ARM is a name, or INIT-NAME"
+        "--as", dest="place", metavar="EXPERIMENT:ARM", help="enter them as a trial; ARM: a name or INIT-NAME"
     )
     parser.add_argument("--seed", type=int, default=0, help="which repetition of the arm they are (0)")
     parser.add_argument("--scene", metavar="NAME", help="with --as, where PLACE is a folder: what to call the scene")
@@ -67,7 +67,7 @@ def export(argv: Sequence[str], runs: Path) -> int:
     parser.add_argument("--results", metavar="EXPERIMENT", help="the archive of its results (default: EXPERIMENT.zip)")
     parser.add_argument("trial", nargs="*", metavar="TRIAL", help=f"{ADDRESS}; after the word init: its initial model")
     parser.add_argument(
-        "--out", type=path, metavar="PATH", help="the file, or for init the folder, to write; needed for a TRIAL"
+        "--out", type=path, metavar="PATH", help="the file to write, for init the folder; a TRIAL needs it"
     )
     parser.add_argument("--pictures", action="store_true", help="with --results: the pictures of the test views, too")
     options = parser.parse_args(argv)
@@ -148,9 +148,7 @@ def pool(argv: Sequence[str], runs: Path) -> int:
     parser = ArgumentParser("pool", "It is their mean, each with the same weight.")
     parser.add_argument("sources", nargs="+", type=path, metavar="ARCHIVE")
     parser.add_argument("--arm", type=names, required=True, help="a densifier; names it goes by, comma between")
-    parser.add_argument(
-        "--baseline", type=names, default=(BASELINE,), help=f"the densifier to compare with ({BASELINE})"
-    )
+    parser.add_argument("--baseline", type=names, default=(BASELINE,), help=f"to compare with ({BASELINE})")
     parser.add_argument("--metric", default="psnr", help="such as psnr (the default), ssim, lpips_vgg")
     add_where(parser)
     parser.add_argument("--protocol", help="only studies by this one, such as paper-1")

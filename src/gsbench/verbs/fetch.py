@@ -76,9 +76,7 @@ def _make_folder(data: Path) -> None:
     try:
         data.mkdir(parents=True, exist_ok=True)
     except (FileExistsError, NotADirectoryError, FileNotFoundError) as error:  # `data` is a file, or lies in /proc
-        raise InputError(
-            f"{data} cannot be the data folder ({error.strerror}): set {DATA_VARIABLE} to another"
-        ) from error
+        raise InputError(f"{data} cannot be the data folder ({error.strerror}): set {DATA_VARIABLE}") from error
 
 
 def _dataset(catalog: Mapping[str, PublicDataset], name: str) -> PublicDataset:

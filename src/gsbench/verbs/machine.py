@@ -152,9 +152,7 @@ def check_runs(runs: Path) -> Iterator[Finding]:
 def _bench_parser() -> ArgumentParser:
     names = ", ".join(executor.name for executor in EXECUTORS)
     parser = ArgumentParser("bench", "Times are medians of steps that take turns.")
-    parser.add_argument(
-        "--raster", default="cpu", help=f"names, comma between: {names}, or your own, mine.MyRasterizer"
-    )
+    parser.add_argument("--raster", default="cpu", help=f"names, comma between: {names} or your own, mine.MyRaster")
     parser.add_argument("--size", default="500x375", help="image sizes, comma between")
     parser.add_argument("--count", default="100000", help="numbers of Gaussians, comma between")
     parser.add_argument(
@@ -168,7 +166,7 @@ def _bench_parser() -> ArgumentParser:
     parser.add_argument("--threads", type=_count, help="CPU threads (default: as many as torch takes)")
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.add_argument(
-        "--no-memory", action="store_true", help="do not measure peak memory, which needs one process each"
+        "--no-memory", action="store_true", help="do not measure peak memory, in processes of their own"
     )
     return parser
 

@@ -101,31 +101,17 @@ def _as_file(arm: Arm) -> str:
 def _tables_parser() -> ArgumentParser:
     parser = ArgumentParser("tables", "`gsbench tables paper` lists where the paper contradicts itself.")
     parser.add_argument(
-        "experiment", help="its name; table1, table2 and their _own come in the paper's layout, with its values beside"
+        "experiment", help="its name; table1, table2 and their _own look as in the paper, with its values"
     )
+    parser.add_argument("--format", choices=[*FORMATS, TRIALS], help=f"default: md; {TRIALS}: CSV with one row a trial")
+    parser.add_argument("--out", type=path, metavar="PATH", help="a folder, or a file whose ending says the format")
     parser.add_argument(
-        "--format",
-        choices=[*FORMATS, TRIALS],
-        help=f"by default Markdown (md); {TRIALS}: CSV with one row a trial instead",
+        "--rows", type=names, metavar="A,B", help=f"fields or settings (default {','.join(DEFAULT_ROWS)})"
     )
-    parser.add_argument(
-        "--out", type=path, metavar="PATH", help="write to this file, whose ending says the format, or into this folder"
-    )
-    parser.add_argument(
-        "--rows", type=names, metavar="A,B", help=f"fields or config keys (default {','.join(DEFAULT_ROWS)})"
-    )
-    parser.add_argument(
-        "--columns", type=names, metavar="A,B", help="fields or config keys, each crossed with every metric"
-    )
-    parser.add_argument(
-        "--metrics", type=names, metavar="A,B", help="such as psnr,ssim,lpips_squeeze,gaussians,train_time"
-    )
+    parser.add_argument("--columns", type=names, metavar="A,B", help="fields or settings, crossed with all metrics")
+    parser.add_argument("--metrics", type=names, metavar="A,B", help="such as psnr,lpips_squeeze,gaussians,train_time")
     add_where(parser)
-    parser.add_argument(
-        "--paper",
-        metavar="NAME",
-        help=f"also compare the trials with published numbers: {', '.join(published_names())}",
-    )
+    parser.add_argument("--paper", metavar="NAME", help=f"published numbers, too: {', '.join(published_names())}")
     parser.add_argument(
         "--layout",
         choices=[*PAPER_TABLES, "plain", FAIRNESS],
@@ -163,7 +149,7 @@ def report(argv: Sequence[str], runs: Path) -> int:
     parser = ArgumentParser("report")
     parser.add_argument("experiment")
     parser.add_argument(
-        "--out", type=path, metavar="PATH", help=f"a folder or a .html file; default: {REPORT_NAME} with the experiment"
+        "--out", type=path, metavar="PATH", help=f"folder or .html file; default: the experiment's {REPORT_NAME}"
     )
     parser.add_argument("--baseline", help=f"the densifier to compare with ({BASELINE})")
     options = parser.parse_args(argv)

@@ -60,9 +60,7 @@ def view(argv: Sequence[str], runs: Path) -> int:
 def ui(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: serves the dashboard until Ctrl-C."""
     parser = ArgumentParser("ui")
-    parser.add_argument(
-        "--uri", help="the tracker's database; default: $MLFLOW_TRACKING_URI, or that of the runs folder"
-    )
+    parser.add_argument("--uri", help="the tracker's database; default: $MLFLOW_TRACKING_URI, or the runs folder's")
     parser.add_argument("--port", type=port, default=DASHBOARD_PORT)
     options = parser.parse_args(argv)
     if options.uri is not None and "://" not in options.uri:

@@ -28,6 +28,7 @@ from gsbench.verbs.arguments import ArgumentParser
 from gsbench.words import counted, readable_time
 
 ORDER = ("failed", "damaged", "running", "queued", "partial", "missing", "superseded", "done")
+RETRIED = ("failed", "partial", "damaged", "missing")
 TRACKER = "tracking.uri"
 
 log = logging.getLogger(__name__)
@@ -146,11 +147,7 @@ def retry(argv: Sequence[str], runs: Path) -> int:
     home = experiment_home(runs, options.experiment)
     if refused := [change for change in options.changes if makes_other_trials(key_of(change))]:
         raise InputError(f"{refused[0]} would make other trials than those of the plan: give the sweep's own command")
-    unfinished = [
-        trial.folder
-        for trial in states_of_experiment(home)
-        if trial.state in ("failed", "partial", "damaged", "missing")
-    ]
+    unfinished = [trial.folder for trial in states_of_experiment(home) if trial.state in RETRIED]
     if not unfinished:
         print(f"nothing to retry: all trials of {options.experiment} are done, running or queued")
         return 0
@@ -215,14 +212,11 @@ def sync(argv: Sequence[str], runs: Path) -> int:
     parser.add_argument("experiment", nargs="?", help="its name; without one, all")
     parser.add_argument(
         "--uri",
-        help="the tracker, such as http://127.0.0.1:5000 (else $MLFLOW_TRACKING_URI, else the runs folder's own)",
+        help="such as http://127.0.0.1:5000; default: $MLFLOW_TRACKING_URI, or the runs folder's",
     )
     options = parser.parse_args(argv)
-    homes = (
-        [experiment_home(runs, options.experiment)]
-        if options.experiment
-        else [runs / n for n in list_experiments(runs)]
-    )
+    names = [options.experiment] if options.experiment else list_experiments(runs)
+    homes = [experiment_home(runs, name) for name in names]
     try:
         folders = [TrialFolder(Path(place)) for home in homes for place in sorted(trial_folders(home))]
         for line in send_missing(folders, options.uri):
