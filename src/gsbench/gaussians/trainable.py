@@ -118,10 +118,7 @@ class TrainableGaussians:
         self._replace(name, values.detach().clone())
         state = self.adam[name]
         for moment in (state.first, state.second):
-            if where is None:
-                moment.zero_()
-            else:
-                moment[where] = 0
+            moment[... if where is None else where] = 0
 
     def _replace(self, name: str, values: Tensor, keep: Tensor | None = None, added: Tensor | None = None) -> None:
         """Replace the parameter ``name`` by ``values``, and edit its moments alike; the step count stays."""

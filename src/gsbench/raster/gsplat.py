@@ -149,11 +149,8 @@ class _DeviceCamera:
         view = np.eye(4)
         view[:3, :3], view[:3, 3] = camera.rotation, camera.translation
         intrinsics = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
-        half_size = np.array([camera.width / 2, camera.height / 2])
-        numbers = [view.ravel(), intrinsics.ravel(), camera.center, half_size]
-        packed = torch.from_numpy(np.concatenate(numbers)).to(like)  # one upload
-        parts = packed.split([16, 9, 3, 2])
-        return cls(parts[0].view(1, 4, 4), parts[1].view(1, 3, 3), parts[2], parts[3])
+        numbers = (view[None], intrinsics[None], camera.center, np.array([camera.width / 2, camera.height / 2]))
+        return cls(*map(like.new_tensor, numbers))
 
 
 class _Composite(torch.autograd.Function):

@@ -241,7 +241,7 @@ class _TritonLossFunction(torch.autograd.Function):
                 STRIP=STRIP,
             )
             launch_grid(add_up, 1)(sums, grid[0] * grid[1], float(image.numel()), loss.ssim_weight, values, GROUP=1024)
-        ctx.weight, ctx.scale, ctx.derivatives = loss.ssim_weight, scale, derivatives
+        ctx.weight, ctx.scale, ctx.derivatives, ctx.rows, ctx.grid = loss.ssim_weight, scale, derivatives, rows, grid
         ctx.save_for_backward(image, target)
         ctx.set_materialize_grads(False)
         total, l1, similarity = values.unbind()
@@ -256,10 +256,8 @@ class _TritonLossFunction(torch.autograd.Function):
         image, target = ctx.saved_tensors
         height, numbers = image.shape[0], 3 * image.shape[1]
         gradient = torch.empty_like(image)
-        rows = rows_of_program(height, numbers)
-        grid = triton.cdiv(numbers, STRIP), triton.cdiv(height, rows)
         with torch.cuda.device_of(image):
-            launch_grid(differentiate, *grid)(
+            launch_grid(differentiate, *ctx.grid)(
                 image,
                 target,
                 ctx.scale,
@@ -269,7 +267,7 @@ class _TritonLossFunction(torch.autograd.Function):
                 g_loss.contiguous(),
                 ctx.weight,
                 gradient,
-                rows,
+                ctx.rows,
                 STRIP=STRIP,
             )
         return None, gradient, None

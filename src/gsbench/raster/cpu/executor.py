@@ -38,7 +38,6 @@ class ForwardPass:
     """Results of the forward pass for the backward pass; the memory belongs to an arena."""
 
     frame: at.CpuFrame
-    degree: int
     visible: NDArray[np.int64]  # [GAUSSIAN_SHARDS] number of records of each shard
 
 
@@ -114,7 +113,7 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
             composite_tiles(*_tiles(frame, first, past), *pixels)
 
         self._runner.run(TILE_SHARDS, composite)
-        return image, alpha, radii, ForwardPass(frame, request.degree, flags[:, VISIBLE])
+        return image, alpha, radii, ForwardPass(frame, flags[:, VISIBLE])
 
     def _list_tiles(
         self, arena: Arena, view: CameraNumbers, order: NDArray[np.uint64], records: NDArray[np.float32]
@@ -158,39 +157,29 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
         lifetime = Lifetime()
         arena = self._scratch.lease(lifetime)
         rows = arena.take("rows", (TILE_SHARDS, len(gaussians) * at.ROW), np.float32, zero=True)
-        try:
-            self._composite_backward(passed.frame, request, g_image, g_alpha, rows)
-            return self._backproject(passed, gaussians, request.absolute, rows, want_splitting)
-        except BaseException:
-            arena.drop("rows")  # kernels expect zeros and clear what they add; an interrupt may have left sums
-            raise
-
-    def _composite_backward(
-        self,
-        frame: at.CpuFrame,
-        request: RenderRequest,
-        g_image: Tensor,
-        g_alpha: Tensor | None,
-        rows: NDArray[np.float32],
-    ) -> None:
         g_pixels = g_image.numpy().reshape(-1)
         g_alphas = np.empty(0, np.float32) if g_alpha is None else g_alpha.numpy().reshape(-1)
         want_absolute = None if request.absolute is None else True
 
         def composite_backward(first: int, past: int) -> None:
-            composite_backward_tiles(*_tiles(frame, first, past), g_pixels, g_alphas, rows, want_absolute)
+            composite_backward_tiles(*_tiles(passed.frame, first, past), g_pixels, g_alphas, rows, want_absolute)
 
-        self._runner.run(TILE_SHARDS, composite_backward)
+        try:
+            self._runner.run(TILE_SHARDS, composite_backward)
+            return self._backproject(passed, gaussians, request, rows, want_splitting)
+        except BaseException:
+            arena.drop("rows")  # kernels expect zeros and clear what they add; an interrupt may have left sums
+            raise
 
     def _backproject(
         self,
         passed: ForwardPass,
         gaussians: Gaussians,
-        absolute: Tensor | None,
+        request: RenderRequest,
         rows: NDArray[np.float32],
         want_splitting: bool,
     ) -> Gradients:
-        """Compute all gradients from the gradient sums in ``rows``; fill ``absolute``, if given."""
+        """Compute all gradients from the gradient sums in ``rows``; fill ``request.absolute``, if given."""
         count, take = len(gaussians), self._tensors.empty
         gradients = gaussians.map(lambda tensor: take(tuple(tensor.shape)))
         g_screen = take((count, 2))
@@ -199,12 +188,12 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
             _edges(count),
             passed.visible,
             _arrays(gaussians),
-            passed.degree,
+            request.degree,
             passed.frame,
             rows.reshape(-1),
             _arrays(gradients),
             g_screen.numpy(),
-            np.empty((0, 2), np.float32) if absolute is None else absolute.numpy(),
+            np.empty((0, 2), np.float32) if request.absolute is None else request.absolute.numpy(),
             np.empty((0, 9), np.float32) if g_splitting is None else g_splitting.numpy().reshape(-1, 9),
         )
 

@@ -10,7 +10,7 @@ from llvmlite import ir
 from numba.core import types
 
 from gsbench.gaussians.model import NUM_SH_REST
-from gsbench.raster.cpu.simd import LANES, VECTOR, address, intrinsic, lane_indices
+from gsbench.raster.cpu.simd import LANES, VECTOR, address, broadcast, intrinsic, lane_indices
 
 CHANNELS = 3
 BLOCK = 4  # px, the sides of the 16 pixels of a vector
@@ -135,10 +135,9 @@ def index_bits(typing_context, start):
 
     def codegen(context, builder, sig, args):
         first = context.cast(builder, args[0], sig.args[0], types.int32)
-        undefined = ir.Constant(VECTOR.bits_ir, ir.Undefined)
-        placed = builder.insert_element(undefined, first, ir.Constant(ir.IntType(32), 0))
-        everywhere = builder.shuffle_vector(placed, undefined, lane_indices([0] * LANES))
-        return builder.bitcast(builder.add(everywhere, lane_indices(range(LANES))), VECTOR.ir)
+        return builder.bitcast(
+            builder.add(broadcast(builder, first, VECTOR.bits_ir), lane_indices(range(LANES))), VECTOR.ir
+        )
 
     return VECTOR(start), codegen
 

@@ -29,18 +29,15 @@ class Vector(types.Type):
     """The numba type of 16 float32."""
 
     def __init__(self) -> None:
-        self.element, self.lanes = types.float32, LANES
-        self.scalar_ir = ir.FloatType()
-        self.ir = ir.VectorType(self.scalar_ir, LANES)
+        self.ir = ir.VectorType(ir.FloatType(), LANES)
         self.bits_ir = ir.VectorType(ir.IntType(32), LANES)
-        self.suffix = f"v{LANES}f32"  # in the names of LLVM's intrinsic functions
         super().__init__(name=f"float32x{LANES}")
 
     def constant(self, value: float) -> ir.Constant:
-        return ir.Constant(self.ir, [ir.Constant(self.scalar_ir, value)] * self.lanes)
+        return ir.Constant(self.ir, [ir.Constant(self.ir.element, value)] * LANES)
 
     def bits(self, value: int) -> ir.Constant:
-        return ir.Constant(self.bits_ir, [ir.Constant(self.bits_ir.element, value)] * self.lanes)
+        return ir.Constant(self.bits_ir, [ir.Constant(self.bits_ir.element, value)] * LANES)
 
 
 class Mask(types.Type):
@@ -53,6 +50,7 @@ class Mask(types.Type):
 
 VECTOR = Vector()
 MASK = Mask()
+BINARY = [(Vector, Vector), (Vector, types.Number), (types.Number, Vector)]
 
 
 @register_model(Vector)
@@ -67,65 +65,59 @@ def lane_indices(lanes: Sequence[int]) -> ir.Constant:
     return ir.Constant(ir.VectorType(ir.IntType(32), len(lanes)), [ir.Constant(ir.IntType(32), lane) for lane in lanes])
 
 
-def as_vector(context: Any, builder: Any, value: Any, kind: Any, vector: Vector) -> Any:
-    """The operand ``value`` of the numba type ``kind`` as a vector; a number is broadcast to all lanes."""
-    if isinstance(kind, Vector):
-        return value
-    scalar = context.cast(builder, value, kind, vector.element)
-    undefined = ir.Constant(vector.ir, ir.Undefined)
+def broadcast(builder: Any, scalar: Any, kind: ir.VectorType) -> Any:
+    """The LLVM value ``scalar`` in all lanes of a vector of the LLVM type ``kind``."""
+    undefined = ir.Constant(kind, ir.Undefined)
     first = builder.insert_element(undefined, scalar, ir.Constant(ir.IntType(32), 0))
-    return builder.shuffle_vector(first, undefined, lane_indices([0] * vector.lanes))
+    return builder.shuffle_vector(first, undefined, lane_indices([0] * kind.count))
 
 
-def common_vector(kinds: Sequence[Any]) -> Vector | None:
-    """The vector type if the arguments are vectors of one type and numbers, with at least one vector; else None."""
-    vectors = {kind for kind in kinds if isinstance(kind, Vector)}
-    fits = len(vectors) == 1 and all(isinstance(kind, Vector | types.Number) for kind in kinds)
-    return vectors.pop() if fits else None
+def as_vectors(context: Any, builder: Any, values: Sequence[Any], kinds: Sequence[Any]) -> list[Any]:
+    """The operands ``values`` of the numba types ``kinds``; numbers are broadcast to all lanes."""
+    return [
+        broadcast(builder, context.cast(builder, value, kind, types.float32), VECTOR.ir)
+        if isinstance(kind, types.Number)
+        else value
+        for value, kind in zip(values, kinds, strict=True)
+    ]
 
 
-def _register_operator(functions: Sequence[Any], arity: int, emit: Callable[..., Any], compares: bool = False) -> None:
-    """Make numba compile ``functions`` of vectors (or vectors and numbers) to ``emit(builder, *operands)``."""
+def _fits(kinds: Sequence[Any]) -> bool:
+    """Whether the numba types are vectors and numbers, at least one a vector."""
+    return VECTOR in kinds and all(isinstance(kind, Vector | types.Number) for kind in kinds)
+
+
+def _register_operator(
+    functions: Sequence[Any], operands: Sequence[tuple[Any, ...]], emit: Callable[..., Any], gives: types.Type = VECTOR
+) -> None:
+    """Make numba compile ``functions`` of one of the combinations ``operands`` to ``emit(builder, *operands)``."""
 
     class _Template(AbstractTemplate):
         def generic(self, args: Sequence[Any], kws: Any) -> Any:
-            vector = common_vector(args) if len(args) == arity else None
-            return signature(MASK if compares else vector, *args) if vector else None
+            fits = any(len(args) == len(kinds) and all(map(isinstance, args, kinds)) for kinds in operands)
+            return signature(gives, *args) if fits else None
 
     def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        vector: Any = common_vector(sig.args)
-        return emit(builder, *(as_vector(context, builder, v, k, vector) for v, k in zip(args, sig.args, strict=True)))
+        return emit(builder, *as_vectors(context, builder, args, sig.args))
 
     for function in functions:
         infer_global(function)(type("_Template", (_Template,), {}))
-        combinations = [(Vector,)] if arity == 1 else [(Vector, Vector), (Vector, types.Number), (types.Number, Vector)]
-        for combination in combinations:
-            lower_builtin(function, *combination)(lower)
+        for kinds in operands:
+            lower_builtin(function, *kinds)(lower)
 
 
-def _register_mask_operator(functions: Sequence[Any], arity: int, emit: Callable[..., Any]) -> None:
-    class _Template(AbstractTemplate):
-        def generic(self, args: Sequence[Any], kws: Any) -> Any:
-            fits = len(args) == arity and isinstance(args[0], Mask) and set(args) == {args[0]}
-            return signature(args[0], *args) if fits else None
-
-    for function in functions:
-        infer_global(function)(type("_Template", (_Template,), {}))
-        lower_builtin(function, *[Mask] * arity)(lambda context, builder, sig, args: emit(builder, *args))
-
-
-_register_operator([operator.add, operator.iadd], 2, lambda builder, a, b: builder.fadd(a, b))
-_register_operator([operator.sub, operator.isub], 2, lambda builder, a, b: builder.fsub(a, b))
-_register_operator([operator.mul, operator.imul], 2, lambda builder, a, b: builder.fmul(a, b))
-_register_operator([operator.truediv, operator.itruediv], 2, lambda builder, a, b: builder.fdiv(a, b))
-_register_operator([operator.neg], 1, lambda builder, a: builder.fneg(a))
-_register_operator([operator.lt], 2, lambda builder, a, b: builder.fcmp_ordered("<", a, b), compares=True)
-_register_operator([operator.le], 2, lambda builder, a, b: builder.fcmp_ordered("<=", a, b), compares=True)
-_register_operator([operator.gt], 2, lambda builder, a, b: builder.fcmp_ordered(">", a, b), compares=True)
-_register_operator([operator.ge], 2, lambda builder, a, b: builder.fcmp_ordered(">=", a, b), compares=True)
-_register_mask_operator([operator.and_, operator.iand], 2, lambda builder, a, b: builder.and_(a, b))
-_register_mask_operator([operator.or_, operator.ior], 2, lambda builder, a, b: builder.or_(a, b))
-_register_mask_operator([operator.invert], 1, lambda builder, a: builder.not_(a))
+_register_operator([operator.add, operator.iadd], BINARY, lambda builder, a, b: builder.fadd(a, b))
+_register_operator([operator.sub, operator.isub], BINARY, lambda builder, a, b: builder.fsub(a, b))
+_register_operator([operator.mul, operator.imul], BINARY, lambda builder, a, b: builder.fmul(a, b))
+_register_operator([operator.truediv, operator.itruediv], BINARY, lambda builder, a, b: builder.fdiv(a, b))
+_register_operator([operator.neg], [(Vector,)], lambda builder, a: builder.fneg(a))
+_register_operator([operator.lt], BINARY, lambda builder, a, b: builder.fcmp_ordered("<", a, b), MASK)
+_register_operator([operator.le], BINARY, lambda builder, a, b: builder.fcmp_ordered("<=", a, b), MASK)
+_register_operator([operator.gt], BINARY, lambda builder, a, b: builder.fcmp_ordered(">", a, b), MASK)
+_register_operator([operator.ge], BINARY, lambda builder, a, b: builder.fcmp_ordered(">=", a, b), MASK)
+_register_operator([operator.and_, operator.iand], [(Mask, Mask)], lambda builder, a, b: builder.and_(a, b), MASK)
+_register_operator([operator.or_, operator.ior], [(Mask, Mask)], lambda builder, a, b: builder.or_(a, b), MASK)
+_register_operator([operator.invert], [(Mask,)], lambda builder, a: builder.not_(a), MASK)
 
 
 # Memory
@@ -137,51 +129,50 @@ def address(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     return builder.gep(data, [context.cast(builder, args[1], sig.args[1], types.intp)])
 
 
-def _vector_of(array: Any) -> Vector:
+def _check_array(array: Any) -> None:
     if not (isinstance(array, types.Array) and array.layout == "C" and array.dtype == types.float32):
         raise TypeError(f"a contiguous float32 array is needed, got {array}")
-    return VECTOR
 
 
 @intrinsic
 def load(typing_context, array, index):
     """The vector ``array.flat[index : index + 16]``."""
-    vector = _vector_of(array)
+    _check_array(array)
 
     def codegen(context, builder, sig, args):
         # LLVM aligns the stack to 16 bytes only. Vectors that it spills to the stack could then cross cache lines, in
         # some processes and threads but not in others, which would cost a quarter of a kernel's time.
         builder.function.attributes.alignstack = 4 * LANES
         builder.function.attributes.add("nounwind")
-        pointer = builder.bitcast(address(context, builder, sig, args), vector.ir.as_pointer())
-        return builder.load(pointer, align=vector.element.bitwidth // 8)
+        return builder.load(builder.bitcast(address(context, builder, sig, args), VECTOR.ir.as_pointer()), align=4)
 
-    return vector(array, index), codegen
+    return VECTOR(array, index), codegen
 
 
 @intrinsic
 def load_numbers(typing_context, array, index):
     """``load``, also from a uint8 array."""
     is_bytes = isinstance(array, types.Array) and array.layout == "C" and array.dtype == types.uint8
-    vector = VECTOR if is_bytes else _vector_of(array)
-    kind = ir.VectorType(ir.IntType(8), LANES) if is_bytes else vector.ir
+    if not is_bytes:
+        _check_array(array)
+    kind = ir.VectorType(ir.IntType(8), LANES) if is_bytes else VECTOR.ir
 
     def codegen(context, builder, sig, args):
         value = builder.load(builder.bitcast(address(context, builder, sig, args), kind.as_pointer()), align=1)
-        return builder.uitofp(value, vector.ir) if is_bytes else value
+        return builder.uitofp(value, VECTOR.ir) if is_bytes else value
 
-    return vector(array, index), codegen
+    return VECTOR(array, index), codegen
 
 
 @intrinsic
 def store(typing_context, array, index, value):
     """Write the vector ``value`` to ``array.flat[index : index + 16]``."""
-    vector = _vector_of(array)
+    _check_array(array)
 
     def codegen(context, builder, sig, args):
-        pointer = builder.bitcast(address(context, builder, sig, args), vector.ir.as_pointer())
-        operand = as_vector(context, builder, args[2], sig.args[2], vector)
-        builder.store(operand, pointer, align=vector.element.bitwidth // 8)
+        pointer = builder.bitcast(address(context, builder, sig, args), VECTOR.ir.as_pointer())
+        (operand,) = as_vectors(context, builder, args[2:], sig.args[2:])
+        builder.store(operand, pointer, align=4)
         return context.get_dummy_value()
 
     return types.void(array, index, value), codegen
@@ -200,6 +191,7 @@ def _places(context: Any, builder: Any, sig: Any, args: Any) -> Iterator[Any]:
 @intrinsic
 def gather(typing_context, array, indices, stride, offset):
     """``array.flat[indices[k] * stride + offset]`` in lane k; ``indices`` is an int64 array [16]."""
+    _check_array(array)
 
     def codegen(context, builder, sig, args):
         vector = ir.Constant(VECTOR.ir, ir.Undefined)
@@ -207,13 +199,13 @@ def gather(typing_context, array, indices, stride, offset):
             vector = builder.insert_element(vector, builder.load(place), ir.Constant(ir.IntType(32), lane))
         return vector
 
-    return _vector_of(array)(array, indices, stride, offset), codegen
+    return VECTOR(array, indices, stride, offset), codegen
 
 
 @intrinsic
 def scatter(typing_context, array, indices, stride, offset, value):
     """Write lane k of ``value`` to ``array.flat[indices[k] * stride + offset]``; of equal indices the last wins."""
-    _vector_of(array)
+    _check_array(array)
 
     def codegen(context, builder, sig, args):
         for lane, place in enumerate(_places(context, builder, sig, args)):
@@ -242,22 +234,20 @@ def prefetch(typing_context, array, index):
 # Functions of vectors and masks
 
 
-def _call(builder: Any, name: str, vector: Vector, *operands: Any) -> Any:
-    kind = ir.FunctionType(vector.ir, [vector.ir] * len(operands))
-    return builder.call(cgutils.get_or_insert_function(builder.module, kind, f"llvm.{name}.{vector.suffix}"), operands)
+def _call(builder: Any, name: str, *operands: Any) -> Any:
+    kind = ir.FunctionType(VECTOR.ir, [VECTOR.ir] * len(operands))
+    return builder.call(cgutils.get_or_insert_function(builder.module, kind, f"llvm.{name}.v{LANES}f32"), operands)
 
 
 def _function(emit: Callable[..., Any], *kinds: Any) -> Any:
-    """An intrinsic of vectors, or vectors and numbers, that compiles to ``emit(builder, vector type, *operands)``."""
-    vector = common_vector(kinds)
-    if vector is None:
+    """An intrinsic of vectors, or vectors and numbers, that compiles to ``emit(builder, *operands)``."""
+    if not _fits(kinds):
         return None
 
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        operands = (as_vector(context, builder, v, k, vector) for v, k in zip(args, sig.args, strict=True))
-        return emit(builder, vector, *operands)
+    def codegen(context, builder, sig, args):
+        return emit(builder, *as_vectors(context, builder, args, sig.args))
 
-    return vector(*kinds), codegen
+    return VECTOR(*kinds), codegen
 
 
 @intrinsic
@@ -265,7 +255,7 @@ def splat(typing_context, scalar):
     """A vector with ``scalar`` in all lanes."""
 
     def codegen(context, builder, sig, args):
-        return as_vector(context, builder, args[0], sig.args[0], VECTOR)
+        return as_vectors(context, builder, args, sig.args)[0]
 
     return VECTOR(scalar), codegen
 
@@ -273,54 +263,52 @@ def splat(typing_context, scalar):
 @intrinsic
 def fma(typing_context, a, b, c):
     """``a * b + c``, fused if that is fast on the host."""
-    return _function(lambda builder, vector, *v: _call(builder, "fmuladd", vector, *v), a, b, c)
+    return _function(lambda builder, *v: _call(builder, "fmuladd", *v), a, b, c)
 
 
 @intrinsic
 def minimum(typing_context, a, b):
     """``a if a < b else b``; so b if either is NaN."""
-    return _function(lambda builder, _, x, y: builder.select(builder.fcmp_ordered("<", x, y), x, y), a, b)
+    return _function(lambda builder, x, y: builder.select(builder.fcmp_ordered("<", x, y), x, y), a, b)
 
 
 @intrinsic
 def maximum(typing_context, a, b):
     """``a if a > b else b``; so b if either is NaN."""
-    return _function(lambda builder, _, x, y: builder.select(builder.fcmp_ordered(">", x, y), x, y), a, b)
+    return _function(lambda builder, x, y: builder.select(builder.fcmp_ordered(">", x, y), x, y), a, b)
 
 
 @intrinsic
 def absolute(typing_context, a):
     """``|a|``."""
-    return _function(lambda builder, vector, x: _call(builder, "fabs", vector, x), a)
+    return _function(lambda builder, x: _call(builder, "fabs", x), a)
 
 
 @intrinsic
 def square_root(typing_context, a):
-    return _function(lambda builder, vector, x: _call(builder, "sqrt", vector, x), a)
+    return _function(lambda builder, x: _call(builder, "sqrt", x), a)
 
 
 @intrinsic
 def floor(typing_context, a):
-    return _function(lambda builder, vector, x: _call(builder, "floor", vector, x), a)
+    return _function(lambda builder, x: _call(builder, "floor", x), a)
 
 
 @intrinsic
 def ceil(typing_context, a):
-    return _function(lambda builder, vector, x: _call(builder, "ceil", vector, x), a)
+    return _function(lambda builder, x: _call(builder, "ceil", x), a)
 
 
 @intrinsic
 def select(typing_context, mask, a, b):
     """``a`` where ``mask`` is True, else ``b``; one of the two may be a number."""
-    vector = common_vector((a, b))
-    if vector is None or mask != MASK:
+    if not _fits((a, b)) or mask != MASK:
         return None
 
     def codegen(context, builder, sig, args):
-        x, y = (as_vector(context, builder, args[k], sig.args[k], vector) for k in (1, 2))
-        return builder.select(args[0], x, y)
+        return builder.select(args[0], *as_vectors(context, builder, args[1:], sig.args[1:]))
 
-    return vector(mask, a, b), codegen
+    return VECTOR(mask, a, b), codegen
 
 
 @intrinsic
@@ -352,11 +340,8 @@ def lanes_with_bit(typing_context, masks, index, bit):
 
     def codegen(context, builder, sig, args):
         values = builder.load(builder.bitcast(address(context, builder, sig, args), kind.as_pointer()), align=2)
-        undefined = ir.Constant(kind, ir.Undefined)
-        wanted = context.cast(builder, args[2], sig.args[2], types.uint16)
-        first = builder.insert_element(undefined, wanted, ir.Constant(ir.IntType(32), 0))
-        everywhere = builder.shuffle_vector(first, undefined, lane_indices([0] * lanes))
-        found = builder.icmp_unsigned("!=", builder.and_(values, everywhere), ir.Constant(kind, [0] * lanes))
+        wanted = broadcast(builder, context.cast(builder, args[2], sig.args[2], types.uint16), kind)
+        found = builder.icmp_unsigned("!=", builder.and_(values, wanted), ir.Constant(kind, [0] * lanes))
         return builder.bitcast(found, ir.IntType(lanes))
 
     return types.uint64(masks, index, bit), codegen
@@ -373,11 +358,11 @@ def lowest_bit(typing_context, bits):
     return types.uint64(bits), codegen
 
 
-def _polynomial(builder: Any, vector: Vector, x: Any, coefficients: Sequence[float]) -> Any:
+def _polynomial(builder: Any, x: Any, coefficients: Sequence[float]) -> Any:
     """``sum_k coefficients[k] x^k``."""
-    value = vector.constant(coefficients[-1])
+    value = VECTOR.constant(coefficients[-1])
     for coefficient in coefficients[-2::-1]:
-        value = _call(builder, "fmuladd", vector, value, x, vector.constant(coefficient))
+        value = _call(builder, "fmuladd", value, x, VECTOR.constant(coefficient))
     return value
 
 
@@ -396,13 +381,13 @@ def exp2(typing_context, a):
     2^a = 2^n 2^f. Adding 1.5 * 2^23 to a leaves the nearest integer n in the low bits of the mantissa.
     """
 
-    def emit(builder, vector, x):
-        magic = vector.constant(1.5 * 2.0**MANTISSA_BITS)
+    def emit(builder, x):
+        magic = VECTOR.constant(1.5 * 2.0**MANTISSA_BITS)
         shifted = builder.fadd(x, magic)
         fraction = builder.fsub(x, builder.fsub(shifted, magic))
-        value = builder.bitcast(_polynomial(builder, vector, fraction, _EXP2), vector.bits_ir)
-        exponent = builder.shl(builder.bitcast(shifted, vector.bits_ir), vector.bits(MANTISSA_BITS))
-        return builder.bitcast(builder.add(value, exponent), vector.ir)
+        value = builder.bitcast(_polynomial(builder, fraction, _EXP2), VECTOR.bits_ir)
+        exponent = builder.shl(builder.bitcast(shifted, VECTOR.bits_ir), VECTOR.bits(MANTISSA_BITS))
+        return builder.bitcast(builder.add(value, exponent), VECTOR.ir)
 
     return _function(emit, a)
 
@@ -411,14 +396,14 @@ def exp2(typing_context, a):
 def log2(typing_context, a):
     """``log2(a)`` of positive normal numbers, with an error of at most 2e-7 max(1, |log2(a)|); undefined elsewhere."""
 
-    def emit(builder, vector, x):
+    def emit(builder, x):
         # x = 2^n m with m from sqrt(1/2) to sqrt(2): n is the difference of the bits and those of sqrt(1/2), shifted.
-        bits = builder.bitcast(x, vector.bits_ir)
-        exponent = builder.ashr(builder.sub(bits, vector.bits(_BITS_OF_ROOT_HALF)), vector.bits(MANTISSA_BITS))
-        mantissa = builder.bitcast(builder.sub(bits, builder.shl(exponent, vector.bits(MANTISSA_BITS))), vector.ir)
-        s = builder.fdiv(builder.fsub(mantissa, vector.constant(1.0)), builder.fadd(mantissa, vector.constant(1.0)))
-        series = _polynomial(builder, vector, builder.fmul(s, s), _LOG2_SERIES)
-        return _call(builder, "fmuladd", vector, s, series, builder.sitofp(exponent, vector.ir))
+        bits = builder.bitcast(x, VECTOR.bits_ir)
+        exponent = builder.ashr(builder.sub(bits, VECTOR.bits(_BITS_OF_ROOT_HALF)), VECTOR.bits(MANTISSA_BITS))
+        mantissa = builder.bitcast(builder.sub(bits, builder.shl(exponent, VECTOR.bits(MANTISSA_BITS))), VECTOR.ir)
+        s = builder.fdiv(builder.fsub(mantissa, VECTOR.constant(1.0)), builder.fadd(mantissa, VECTOR.constant(1.0)))
+        series = _polynomial(builder, builder.fmul(s, s), _LOG2_SERIES)
+        return _call(builder, "fmuladd", s, series, builder.sitofp(exponent, VECTOR.ir))
 
     return _function(emit, a)
 
