@@ -8,7 +8,7 @@ import torch
 
 from gsbench.densify import ADC, MCMC, MRNF, DensifyContext, NoDensifier, Volumetric
 from gsbench.densify.base import revised_logits
-from gsbench.densify.budget import limit_at
+from gsbench.densify.budget import Budgeted
 from gsbench.densify.mcmc import shared_opacity
 from gsbench.errors import InputError
 from gsbench.gaussians.paper_values import LearningRates
@@ -92,9 +92,10 @@ def test_absolute_gradient_is_what_absgrad_reads() -> None:
 
 
 def test_curve_rises_from_the_cloud_to_the_cap() -> None:
-    counts = [limit_at(step, 500, 1500, 100, 1100, "curve") for step in (0, 500, 1000, 1500, 9000)]
-    assert counts == [100, 100, 850, 1100, 1100]
-    assert limit_at(600, 500, 1500, 100, 1100, "hard") == 1100
+    curve, hard = (Budgeted(start=500, stop=1500, max_gaussians=1100, cap=cap) for cap in ("curve", "hard"))
+    curve.begin(random_gaussians(100), DensifyContext(1.0))
+    assert [curve.limit(step) for step in (0, 500, 1000, 1500, 9000)] == [100, 100, 850, 1100, 1100]
+    assert hard.limit(600) == 1100
 
 
 def test_none_never_changes_anything() -> None:

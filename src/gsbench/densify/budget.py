@@ -17,19 +17,6 @@ CapKind = Literal["soft", "freeze", "hard", "curve", "governor"]
 BISECTION_STEPS = 40  # of log(factor): the last interval is far below the spacing of float32 scores
 
 
-def limit_at(step: int, start: int, stop: int, initial: int, max_gaussians: int | None, cap: CapKind) -> int | None:
-    """The limit on the count at iteration ``step``; None: no limit.
-
-    It is ``max_gaussians``, except under ``curve``. That limit rises from n0 = ``initial`` at ``start`` to n =
-    ``max_gaussians`` at ``stop`` along n0 + (n - n0) (2x - x^2), with x the progress of the window. So all arms grow
-    alike and the last refinements are small (the idea of Taming 3DGS, arXiv 2406.15643).
-    """
-    if max_gaussians is None or cap != "curve":
-        return max_gaussians
-    x = min(max((step - start) / (stop - start), 0.0), 1.0)
-    return round(initial + (max_gaussians - initial) * (2 * x - x * x))
-
-
 def allowance(num_gaussians: int, max_gaussians: int | None, cap: CapKind) -> int | None:
     """The number of Gaussians that a growth step may add; None: no limit.
 
@@ -153,12 +140,23 @@ class Budgeted(Densifier):
         """Return whether a round of growth and pruning is due."""
         return self.start < step < self.stop and step % self.interval == 0
 
+    def limit(self, step: int) -> int | None:
+        """The limit on the count at iteration ``step``; None: no limit.
+
+        It is ``max_gaussians``, except under ``curve``. That limit rises from n0, the size of the initial cloud, at
+        ``start`` to n = ``max_gaussians`` at ``stop`` along n0 + (n - n0) (2x - x^2), with x the progress of the
+        window. So all arms grow alike and the last refinements are small (the idea of Taming 3DGS, arXiv 2406.15643).
+        """
+        if self.max_gaussians is None or self.cap != "curve":
+            return self.max_gaussians
+        x = min(max((step - self.start) / (self.stop - self.start), 0.0), 1.0)
+        initial = self.lineage.initial_count
+        return round(initial + (self.max_gaussians - initial) * (2 * x - x * x))
+
     def allowance(self, refinement: Refinement) -> int | None:
         """The number of Gaussians that may be added now; None: no limit."""
-        initial = self.lineage.initial_count
-        limit = limit_at(refinement.step, self.start, self.stop, initial, self.max_gaussians, self.cap)
         count = len(refinement.gaussians)
-        allowed = allowance(count, limit, self.cap)
+        allowed = allowance(count, self.limit(refinement.step), self.cap)
         if self.context.limit is None or self.cap not in ("soft", "hard"):
             return allowed
         most = self.context.limit(refinement, self.max_gaussians if self.cap == "hard" else None)

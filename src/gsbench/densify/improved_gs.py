@@ -14,7 +14,6 @@ from torch import Tensor
 
 from gsbench.densify.adc import ADC, OPACITY_RESET, Grown
 from gsbench.densify.base import DensifyContext, Refinement, Rule, faded, quantile
-from gsbench.densify.budget import allowance
 from gsbench.densify.scores import by_mean, draw, draw_views, edge_scores
 from gsbench.events import Cause
 from gsbench.gaussians.model import Gaussians
@@ -162,12 +161,11 @@ class EdgeAware(LongAxis):
         """Return whether ``step`` is in the closing rounds."""
         return step > self.stop - CLOSING_ROUNDS * self.interval
 
-    def allowance(self, refinement: Refinement) -> int | None:
+    def limit(self, step: int) -> int | None:
         if self.cap != "root":
-            return super().allowance(refinement)
+            return super().limit(step)
         ramp = max(self.stop - CLOSING_ROUNDS * self.interval - self.start, self.interval)
-        progress = min((refinement.step - self.start) / ramp, 1.0)
-        return allowance(len(refinement.gaussians), int(self.most_gaussians * math.sqrt(progress)), "hard")
+        return int(self.most_gaussians * math.sqrt(min((step - self.start) / ramp, 1.0)))
 
     @property
     def most_gaussians(self) -> int:

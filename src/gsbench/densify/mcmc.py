@@ -239,8 +239,11 @@ class MRNF(Budgeted):
         growing = draw(eligible, weights * edge_factor, min(remaining, room - int(replacing.sum())), rng)
         event.blocked_by_cap += max(0, min(remaining, int(eligible.sum())) - int(growing.sum()))
         event.pruned_opacity += num_pruned
-        event.split_gradient += int((replacing | growing).sum())
-        self.split_along(refinement, replacing | growing, ~pruned)
+        parents = (replacing | growing).nonzero().squeeze(-1)  # [S]
+        event.split_gradient += len(parents)
+        children = halves(values.detach().select(parents), SPLIT_OFFSET, SPLIT_LONGEST, SPLIT_ACROSS, SPLIT_OPACITY)
+        kept = ~(pruned | replacing | growing)
+        self.edit(refinement, kept, children, parents.repeat(2), Cause.SPLIT_GRADIENT)
 
     def refine_weights(self, views: Sequence[int], gaussians: Gaussians, step: int) -> Tensor:
         """The refine weights [N] over the training views at the indices ``views``."""
@@ -260,14 +263,6 @@ class MRNF(Budgeted):
         far = (gaussians.means - center).abs().amax(-1) > limit
         sizes = (scales.amin(-1) < math.log(MIN_SCALE)) | (scales.amax(-1).exp() > limit)
         return (gaussians.opacities < self.prune_opacity) | sizes | far
-
-    def split_along(self, refinement: Refinement, selected: Tensor, kept: Tensor) -> None:
-        """Split the Gaussians at the mask ``selected`` [N] along their longest axis; of the others, keep those at
-        ``kept`` [N]."""
-        parents = selected.nonzero().squeeze(-1)  # [S]
-        parent_values = refinement.gaussians.values.detach().select(parents)
-        children = halves(parent_values, SPLIT_OFFSET, SPLIT_LONGEST, SPLIT_ACROSS, SPLIT_OPACITY)
-        self.edit(refinement, kept & ~selected, children, parents.repeat(2), Cause.SPLIT_GRADIENT)
 
     def decay(self, refinement: Refinement) -> None:
         """Lower all opacities and scales a little. Adam's moments stay."""

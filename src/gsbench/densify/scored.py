@@ -60,18 +60,13 @@ class FastGS(AbsGS):
         indices = draw_views(views, self.score_views, refinement.rng)
         total, weighted = torch.zeros_like(values.opacity_logits), torch.zeros_like(values.opacity_logits)
         for index in indices:
-            counts, loss = self.bad_pixels(index, values, refinement.step)
+            render = views.render(index, values, refinement.step)
+            bad = error_map(render.image, views.image(index)) > self.error_threshold
+            counts = render.require_footprint(bad.to(render.image)).values  # [N] bad pixels that each is blended into
             total += counts
-            weighted += loss * counts
+            weighted += views.loss(index, render.image) * counts
         self.statistics["count"] = (total / len(indices)).floor().float()
         self.statistics["score"] = to_unit_range(weighted).float()
-
-    def bad_pixels(self, index: int, gaussians: Gaussians, step: int) -> tuple[Tensor, Tensor]:
-        """The number [N] of bad pixels of a view that each Gaussian is blended into, and the loss of the view."""
-        views = self.context.training_views
-        render = views.render(index, gaussians, step)
-        bad = error_map(render.image, views.image(index)) > self.error_threshold
-        return render.require_footprint(bad.to(render.image)).values, views.loss(index, render.image)
 
     def candidates(self, refinement: Refinement) -> tuple[Tensor, Tensor]:
         over, large = super().candidates(refinement)

@@ -85,18 +85,14 @@ class LpipsMetric:
     def __init__(self, context: MetricContext, net: str, raw: bool = False) -> None:
         self._network, self._raw = context.network(net), raw
 
-    def measure(self, image: Tensor, truth: Tensor) -> float:
-        return self._distance(image, truth)
-
-    def measure_masked(self, image: Tensor, truth: Tensor, mask: Tensor) -> float:
-        return self._distance(image, truth, mask)
-
-    def _distance(self, image: Tensor, truth: Tensor, mask: Tensor | None = None) -> float:
+    def measure(self, image: Tensor, truth: Tensor, mask: Tensor | None = None) -> float:
         _require_size(image, self._network.backbone.min_size)
         first, second = (x.permute(2, 0, 1).unsqueeze(0) for x in (image, truth))  # [1, 3, H, W] each
         if not self._raw:
             first, second = 2 * first - 1, 2 * second - 1
         return float(self._network(first, second, mask))
+
+    measure_masked = measure
 
 
 class Flip:
@@ -176,11 +172,9 @@ class Evaluator:
         more: Sequence[str] = (),
     ) -> None:
         variants = lpips_variants()
-        unknown = [variant for variant in lpips or () if variant not in variants]
-        if unknown:
-            raise InputError(f"unknown LPIPS variant {unknown[0]!r}; choose among {', '.join(variants)}")
-        if unknown := [key for key in more if key not in further_keys()]:
-            raise InputError(f"unknown metric {unknown[0]!r}; choose among {', '.join(further_keys())}")
+        for what, given, known in (("LPIPS variant", lpips or (), variants), ("metric", more, further_keys())):
+            if unknown := [key for key in given if key not in known]:
+                raise InputError(f"unknown {what} {unknown[0]!r}; choose among {', '.join(known)}")
         self.protocol = protocol
         self.device = torch.device(device)
         self.unavailable: dict[str, str] = {}

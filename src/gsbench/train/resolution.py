@@ -49,7 +49,9 @@ def scale_schedule(images: Sequence[NDArray[np.uint8]], until: int) -> ScaleSche
     the energy of every picture, but divides sides by at most 8. The points of the schedule are equally spaced in the
     energy of the mean picture. Their iterations are proportional to the logarithm of energy / first energy.
     """
-    fractions = _window_sizes({image.shape[:2] for image in images})
+    sides = {side for image in images for side in image.shape[:2]}
+    # From 0 to 1, the fractions at which a central window over a spectrum gains pixels.
+    fractions = np.unique([0.0, 1.0, *(2 * k / side for side in sides for k in range(side // 2 + 1))])  # [F]
     curves = np.stack([_window_energies(image, fractions) for image in images])  # [V, F]
     if not (curves[:, -1] > 0).all():  # a black picture has no energy at any size
         return ScaleSchedule((0,), (1.0,))
@@ -62,11 +64,6 @@ def scale_schedule(images: Sequence[NDArray[np.uint8]], until: int) -> ScaleSche
     begins[-1] = until
     points = dict(zip(begins, map(float, scales), strict=True))  # of several points at one iteration, the last
     return ScaleSchedule(tuple(points), tuple(points.values()))
-
-
-def _window_sizes(shapes: set[tuple[int, ...]]) -> NDArray[np.float64]:
-    """The fractions [F] from 0 to 1 at which a central window over a spectrum of one of the ``shapes`` gains pixels."""
-    return np.unique([0.0, 1.0, *(2 * k / side for shape in shapes for side in shape for k in range(side // 2 + 1))])
 
 
 def _window_energies(image: NDArray[np.uint8], fractions: NDArray[np.float64]) -> NDArray[np.float64]:
