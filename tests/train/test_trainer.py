@@ -20,7 +20,7 @@ from gsbench.scene.types import Scene
 from gsbench.train import trainer
 from gsbench.train.checkpoint import CheckpointWriter
 from gsbench.train.options import TrainConfig
-from gsbench.train.trainer import Status, Trainer, learning_rates, snapshot_file
+from gsbench.train.trainer import Status, Trainer, snapshot_file
 from gsbench.train.views import CameraOrder, generator
 
 CPU = torch.device("cpu")
@@ -240,7 +240,7 @@ def test_every_view_is_used_once_before_any_is_used_again() -> None:
 
 
 def test_learning_rate_of_the_means_is_log_linear() -> None:
-    rates = learning_rates(TrainConfig(name="x"))
+    rates = TrainConfig(name="x")
     assert rates.position(0) == pytest.approx(1.6e-4)
     assert rates.position(15_000) == pytest.approx(1.6e-5)  # the geometric middle
     assert rates.position(30_000) == pytest.approx(1.6e-6)

@@ -3,21 +3,23 @@
 import math
 from dataclasses import dataclass
 
+from pydantic import PositiveFloat, PositiveInt
+
 VOLUME_THRESHOLD = 0.03  # V_th of the paper, in the units of its COLMAP models, cubed
 
 
-@dataclass(frozen=True)
+@dataclass
 class LearningRates:
     """Adam's learning rates; the defaults are those of the 2023 code of 3DGS (late-2024 code: 0.025 for opacity)."""
 
-    position_initial: float = 1.6e-4  # times the scene extent
-    position_final: float = 1.6e-6  # times the scene extent
-    position_steps: int = 30_000  # the position rate falls log-linearly over so many iterations
-    sh_dc: float = 2.5e-3
-    sh_rest: float = 2.5e-3 / 20
-    opacity: float = 0.05
-    scale: float = 5e-3
-    rotation: float = 1e-3
+    position_initial: PositiveFloat = 1.6e-4  # times the scene extent
+    position_final: PositiveFloat = 1.6e-6  # times the scene extent
+    position_steps: PositiveInt = 30_000  # the position rate falls log-linearly over so many iterations
+    sh_dc: PositiveFloat = 2.5e-3
+    sh_rest: PositiveFloat = 2.5e-3 / 20
+    opacity: PositiveFloat = 0.05
+    scale: PositiveFloat = 5e-3
+    rotation: PositiveFloat = 1e-3
 
     def position(self, step: float) -> float:
         """The learning rate of the means at iteration ``step``, before multiplication by the scene extent."""

@@ -12,20 +12,12 @@ WITHOUT_EFFECT_ON_MODEL = ("name", "log_every", "checkpoint_every", "checkpoint_
 
 
 @dataclass
-class TrainConfig:
+class TrainConfig(LearningRates):
     name: str = MISSING
     iterations: NonNegativeInt = 30_000  # 0: the initial Gaussians are evaluated without training
     sh_interval: PositiveInt = 1000  # iterations after which spherical harmonics gain a degree
     ssim_weight: Fraction = 0.2  # loss = 0.8 L1 + 0.2 (1 - SSIM)
     background: tuple[Fraction, Fraction, Fraction] = (0.0, 0.0, 0.0)
-    position_initial: PositiveFloat = LearningRates.position_initial  # learning rates; positions: times scene extent
-    position_final: PositiveFloat = LearningRates.position_final
-    position_steps: PositiveInt = LearningRates.position_steps
-    sh_dc: PositiveFloat = LearningRates.sh_dc
-    sh_rest: PositiveFloat = LearningRates.sh_rest
-    opacity: PositiveFloat = LearningRates.opacity
-    scale: PositiveFloat = LearningRates.scale
-    rotation: PositiveFloat = LearningRates.rotation
     densify_start: NonNegativeInt = 500  # the densification window; densifiers read it from here
     densify_stop: NonNegativeInt = 15_000
     densify_interval: PositiveInt = 100

@@ -7,7 +7,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, TextIO
@@ -23,7 +23,6 @@ from gsbench.eval.images import replace_ignored
 from gsbench.events import RefineEvent
 from gsbench.files import write_text
 from gsbench.gaussians.model import MAX_SH_DEGREE, Gaussians
-from gsbench.gaussians.paper_values import LearningRates
 from gsbench.gaussians.ply import write_ply
 from gsbench.gaussians.trainable import TrainableGaussians
 from gsbench.raster import Rasterizer
@@ -119,7 +118,7 @@ class Trainer:
         self.device = initial.means.device
         initial = densifier.prepare(initial)
         self.background = torch.tensor(list(options.background), dtype=torch.float32, device=self.device)  # [3]
-        self.gaussians = TrainableGaussians(initial, learning_rates(options), scene.extent)
+        self.gaussians = TrainableGaussians(initial, options, scene.extent)
         self.loss = PhotometricLoss(options.ssim_weight, torch.get_num_threads())
         self.rngs = generators(seed)
         self.order = CameraOrder(len(scene.train), self.rngs["cameras"])
@@ -319,11 +318,6 @@ def snapshot_file(step: int) -> str:
 def sh_degree_at(options: TrainConfig, step: int) -> int:
     """The degree of spherical harmonics at iteration ``step``."""
     return min(MAX_SH_DEGREE, step // options.sh_interval)
-
-
-def learning_rates(options: TrainConfig) -> LearningRates:
-    """The learning rates in the settings of a training."""
-    return LearningRates(**{field.name: getattr(options, field.name) for field in fields(LearningRates)})
 
 
 LOG_VOLUME_BINS = np.linspace(-18, 3, 85)  # log10 of world units^3, in steps of a quarter
