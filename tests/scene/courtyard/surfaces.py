@@ -19,11 +19,7 @@ def surface_distance(points: NDArray[np.float64], seed: int = 0, limit: float = 
     """
     layout = build_layout(seed)
     result = np.empty(len(points))
-    _distances(
-        layout.kind, layout.center, layout.rotation, layout.size,
-        layout.group_start, layout.group_low, layout.group_high,
-        np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 3), limit, result,
-    )  # fmt: skip
+    _distances(layout, np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 3), limit, result)
     return result
 
 
@@ -34,18 +30,6 @@ def fingerprint(values: NDArray[Any]) -> float:
 
 
 @njit
-def _distances(
-    kind: Any,
-    center: Any,
-    rotation: Any,
-    size: Any,
-    start: Any,
-    low: Any,
-    high: Any,
-    points: Any,
-    limit: float,
-    result: Any,
-) -> None:
+def _distances(layout: Any, points: Any, limit: float, result: Any) -> None:
     for p in range(len(points)):
-        x, y, z = points[p, 0], points[p, 1], points[p, 2]
-        result[p] = nearest_surface(kind, center, rotation, size, start, low, high, x, y, z, limit)
+        result[p] = nearest_surface(layout, points[p, 0], points[p, 1], points[p, 2], limit)

@@ -29,7 +29,6 @@ def uncompiled(*modules: ModuleType) -> SimpleNamespace:
 PLAIN = uncompiled(textures, kernels)
 LAYOUT = build_layout(0)
 SOLIDS = [LAYOUT.kind, LAYOUT.center, LAYOUT.rotation, LAYOUT.size]
-GROUPS = [LAYOUT.group_start, LAYOUT.group_low, LAYOUT.group_high]
 SHAPES = {
     "box": (BOX, (0.5, 0.8, 0.3)),
     "sphere": (SPHERE, (0.7, 9.0, 9.0)),
@@ -112,9 +111,9 @@ def test_the_first_hit_is_that_of_trying_every_primitive() -> None:
         ground = -origin[2] / direction[2] if direction[2] < 0 else inf
         expected = min(ground, *local)
         index = PLAIN.SKY if expected == inf else PLAIN.GROUND if expected == ground else int(np.argmin(local))
-        t, hit = PLAIN.cast(*SOLIDS, *GROUPS, *origin, *direction, False)
+        t, hit = PLAIN.cast(LAYOUT, *origin, *direction, False)
         assert (hit, t) == (index, pytest.approx(expected))
-        _, anything = PLAIN.cast(*SOLIDS, *GROUPS, *origin, *direction, True)
+        _, anything = PLAIN.cast(LAYOUT, *origin, *direction, True)
         assert (anything == PLAIN.SKY) == (min(local) == inf)
         found.add(hit)
     assert {PLAIN.GROUND, PLAIN.SKY} < found
@@ -130,7 +129,7 @@ def test_the_nearest_surface_is_that_of_trying_every_primitive() -> None:
         ]
         expected = min(abs(point[2]), *distances)
         for limit in (0.2, 5.0):
-            found = PLAIN.nearest_surface(*SOLIDS, *GROUPS, *point, limit)
+            found = PLAIN.nearest_surface(LAYOUT, *point, limit)
             assert found == pytest.approx(min(expected, limit))
 
 

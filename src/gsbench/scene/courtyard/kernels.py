@@ -87,7 +87,7 @@ def hit_primitive(kind, size, ox, oy, oz, dx, dy, dz):
 
 
 @inlined
-def cast(kind, center, rotation, size, start, low, high, ox, oy, oz, dx, dy, dz, any_hit):
+def cast(layout, ox, oy, oz, dx, dy, dz, any_hit):
     """(distance, primitive) of the nearest hit, GROUND or SKY included.
 
     With ``any_hit``, for shadow rays, the first primitive found ends the search, and the ground is ignored.
@@ -96,20 +96,20 @@ def cast(kind, center, rotation, size, start, low, high, ox, oy, oz, dx, dy, dz,
     ix, iy, iz = inverse(dx), inverse(dy), inverse(dz)
     if dz < -1e-9 and not any_hit:
         best, index = -oz / dz, GROUND
-    for g in range(len(start) - 1):
-        entry, exit_ = enter_box(
-            low[g, 0], low[g, 1], low[g, 2], high[g, 0], high[g, 1], high[g, 2], ox, oy, oz, ix, iy, iz
-        )
+    for g in range(len(layout.group_low)):
+        low, high = layout.group_low[g], layout.group_high[g]
+        entry, exit_ = enter_box(low[0], low[1], low[2], high[0], high[1], high[2], ox, oy, oz, ix, iy, iz)
         if entry > exit_ or exit_ < 0.0 or entry > best:
             continue
-        for i in range(start[g], start[g + 1]):
-            x, y, z = ox - center[i, 0], oy - center[i, 1], oz - center[i, 2]
+        for i in range(layout.group_start[g], layout.group_start[g + 1]):
+            center, size = layout.center[i], layout.size[i]
+            x, y, z = ox - center[0], oy - center[1], oz - center[2]
             along = x * dx + y * dy + z * dz
-            if along * along < x * x + y * y + z * z - size[i, 3] * size[i, 3]:
+            if along * along < x * x + y * y + z * z - size[3] * size[3]:
                 continue  # misses the bounding sphere
-            lx, ly, lz = to_local(rotation[i], x, y, z)
-            ux, uy, uz = to_local(rotation[i], dx, dy, dz)
-            t = hit_primitive(kind[i], size[i], lx, ly, lz, ux, uy, uz)
+            lx, ly, lz = to_local(layout.rotation[i], x, y, z)
+            ux, uy, uz = to_local(layout.rotation[i], dx, dy, dz)
+            t = hit_primitive(layout.kind[i], size, lx, ly, lz, ux, uy, uz)
             if t < best:
                 best, index = t, i
                 if any_hit:
@@ -132,21 +132,25 @@ def signed_distance(kind, size, x, y, z):
 
 
 @inlined
-def nearest_surface(kind, center, rotation, size, start, low, high, x, y, z, limit):
+def nearest_surface(layout, x, y, z, limit):
     """The smallest |distance| from a point to any surface, the ground included, if below ``limit``, else ``limit``."""
     best = min(abs(z), limit)
-    for g in range(len(start) - 1):
-        qx = max(low[g, 0] - x, 0.0, x - high[g, 0])
-        qy = max(low[g, 1] - y, 0.0, y - high[g, 1])
-        qz = max(low[g, 2] - z, 0.0, z - high[g, 2])
+    for g in range(len(layout.group_low)):
+        low, high = layout.group_low[g], layout.group_high[g]
+        qx, qy, qz = (
+            max(low[0] - x, 0.0, x - high[0]),
+            max(low[1] - y, 0.0, y - high[1]),
+            max(low[2] - z, 0.0, z - high[2]),
+        )
         if qx * qx + qy * qy + qz * qz >= best * best:
             continue
-        for i in range(start[g], start[g + 1]):
-            rx, ry, rz = x - center[i, 0], y - center[i, 1], z - center[i, 2]
-            if rx * rx + ry * ry + rz * rz >= (best + size[i, 3]) ** 2:
+        for i in range(layout.group_start[g], layout.group_start[g + 1]):
+            center, size = layout.center[i], layout.size[i]
+            rx, ry, rz = x - center[0], y - center[1], z - center[2]
+            if rx * rx + ry * ry + rz * rz >= (best + size[3]) ** 2:
                 continue
-            lx, ly, lz = to_local(rotation[i], rx, ry, rz)
-            best = min(best, abs(signed_distance(kind[i], size[i], lx, ly, lz)))
+            lx, ly, lz = to_local(layout.rotation[i], rx, ry, rz)
+            best = min(best, abs(signed_distance(layout.kind[i], size, lx, ly, lz)))
     return best
 
 
@@ -182,9 +186,9 @@ def sky(dx, dy, dz, seed):
 
 
 @inlined
-def shade(kind, center, rotation, size, material, tint, start, low, high, ox, oy, oz, dx, dy, dz, pixel, seed):
+def shade(layout, ox, oy, oz, dx, dy, dz, pixel, seed):
     """The linear colour that a camera ray sees; ``pixel`` is the angle that one subsample covers, in rad."""
-    t, i = cast(kind, center, rotation, size, start, low, high, ox, oy, oz, dx, dy, dz, False)
+    t, i = cast(layout, ox, oy, oz, dx, dy, dz, False)
     if i == SKY:
         return sky(dx, dy, dz, seed)
     x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
@@ -193,29 +197,26 @@ def shade(kind, center, rotation, size, material, tint, start, low, high, ox, oy
         footprint = t * pixel / max(sqrt(-dz), 0.15)
         red, green, blue = ground(x, y, footprint, seed)
     else:
-        px, py, pz = to_local(rotation[i], x - center[i, 0], y - center[i, 1], z - center[i, 2])
-        lx, ly, lz, u, v = local_normal(kind[i], size[i], px, py, pz)
-        nx = rotation[i, 0, 0] * lx + rotation[i, 0, 1] * ly + rotation[i, 0, 2] * lz
-        ny = rotation[i, 1, 0] * lx + rotation[i, 1, 1] * ly + rotation[i, 1, 2] * lz
-        nz = rotation[i, 2, 0] * lx + rotation[i, 2, 1] * ly + rotation[i, 2, 2] * lz
+        center, rotation, tint = layout.center[i], layout.rotation[i], layout.tint[i]
+        px, py, pz = to_local(rotation, x - center[0], y - center[1], z - center[2])
+        lx, ly, lz, u, v = local_normal(layout.kind[i], layout.size[i], px, py, pz)
+        nx = rotation[0, 0] * lx + rotation[0, 1] * ly + rotation[0, 2] * lz
+        ny = rotation[1, 0] * lx + rotation[1, 1] * ly + rotation[1, 2] * lz
+        nz = rotation[2, 0] * lx + rotation[2, 1] * ly + rotation[2, 2] * lz
         facing = abs(nx * dx + ny * dy + nz * dz)
         footprint = t * pixel / max(sqrt(facing), 0.15)
-        light, warmth = shade_factors(material[i], px, py, pz, u, v, footprint, seed + 1009 * (i + 1))
-        red, green, blue = (
-            tint[i, 0] * light * (1.0 + 0.30 * warmth),
-            tint[i, 1] * light,
-            tint[i, 2] * light * (1.0 - 0.30 * warmth),
-        )
+        light, warmth = shade_factors(layout.material[i], px, py, pz, u, v, footprint, seed + 1009 * (i + 1))
+        red = tint[0] * light * (1.0 + 0.30 * warmth)
+        green = tint[1] * light
+        blue = tint[2] * light * (1.0 - 0.30 * warmth)
     occlusion = 1.0
     for step in OCCLUSION_STEPS:
-        free = nearest_surface(
-            kind, center, rotation, size, start, low, high, x + step * nx, y + step * ny, z + step * nz, step
-        )
+        free = nearest_surface(layout, x + step * nx, y + step * ny, z + step * nz, step)
         occlusion -= 0.38 * (1.0 - free / step)
     sun = nx * SUN[0] + ny * SUN[1] + nz * SUN[2]
     if sun > 0.0:
         sx, sy, sz = x + _EPSILON * nx, y + _EPSILON * ny, z + _EPSILON * nz
-        _, blocker = cast(kind, center, rotation, size, start, low, high, sx, sy, sz, SUN[0], SUN[1], SUN[2], True)
+        _, blocker = cast(layout, sx, sy, sz, SUN[0], SUN[1], SUN[2], True)
         sun = sun if blocker == SKY else 0.0
     sun = max(sun, 0.0)
     up = 0.5 + 0.5 * nz
@@ -237,9 +238,7 @@ def encode(value):
 
 
 @kernel
-def render(
-    kind, center, rotation, size, material, tint, start, low, high, camera_rotation, origin, intrinsics, image, seed
-):
+def render(layout, camera_rotation, origin, intrinsics, image, seed):
     """Render one view into ``image`` [H, W, 3] uint8; ``intrinsics`` is (fx, fy, cx, cy) in px."""
     fx, fy, cx, cy = intrinsics
     ox, oy, oz = origin
@@ -253,9 +252,7 @@ def render(
                 down = (row + (sub // SUBSAMPLES + 0.5) / SUBSAMPLES - cy) / fy
                 scale = 1.0 / sqrt(across * across + down * down + 1.0)
                 dx, dy, dz = to_local(camera_rotation, across * scale, down * scale, scale)
-                r, g, b = shade(
-                    kind, center, rotation, size, material, tint, start, low, high, ox, oy, oz, dx, dy, dz, pixel, seed
-                )
+                r, g, b = shade(layout, ox, oy, oz, dx, dy, dz, pixel, seed)
                 red += share * min(r, 1.5)
                 green += share * min(g, 1.5)
                 blue += share * min(b, 1.5)

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 from itertools import pairwise
 from math import cos, pi, radians, sin
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,8 +25,7 @@ _IRON, _GLASS, _WATER = (0.06, 0.06, 0.065), (0.05, 0.075, 0.10), (0.02, 0.045, 
 _LEAF, _DEEP_LEAF, _PALE_LEAF = (0.10, 0.20, 0.045), (0.055, 0.13, 0.04), (0.17, 0.25, 0.06)
 
 
-@dataclass(frozen=True)
-class Layout:
+class Layout(NamedTuple):
     """The primitives as arrays, sorted by group; rays test the bounding box of a group first.
 
     The first three values of ``size`` are half extents of a BOX, (radius, -, -) of a SPHERE, or (outer radius, half

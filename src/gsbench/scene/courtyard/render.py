@@ -83,10 +83,6 @@ def ring_camera(angle: float, width: int, height: int) -> Camera:
 def render_view(layout: Layout, camera: Camera, seed: int) -> NDArray[np.uint8]:
     """Render one photograph, [H, W, 3] uint8 sRGB; surfaces are matt, so a point has one colour in all views."""
     image = np.empty((camera.height, camera.width, 3), dtype=np.uint8)
-    render(
-        layout.kind, layout.center, layout.rotation, layout.size, layout.material, layout.tint,
-        layout.group_start, layout.group_low, layout.group_high,
-        np.ascontiguousarray(camera.rotation), np.ascontiguousarray(camera.center),
-        (camera.fx, camera.fy, camera.cx, camera.cy), image, seed,
-    )  # fmt: skip
+    pose = np.ascontiguousarray(camera.rotation), np.ascontiguousarray(camera.center)
+    render(layout, *pose, (camera.fx, camera.fy, camera.cx, camera.cy), image, seed)
     return image
