@@ -27,7 +27,6 @@ log = logging.getLogger(__name__)
 
 WEIGHTS_VARIABLE = "GSBENCH_WEIGHTS"
 ONE_TRY = downloads.RetryPolicy(timeout=10.0, tries=1)  # without a network, the error must come at once
-SAFETENSORS_SUFFIX = ".safetensors"
 
 
 class MissingWeightsError(InputError):
@@ -104,12 +103,12 @@ def _find_local(spec: WeightsFile, folders: Sequence[tuple[Path, bool]]) -> Path
     faults = []
     for folder, sub_folders in folders:
         for path in _candidates(folder, spec.names, sub_folders):
-            fault = _checksum_fault(path, spec)
-            if fault is None:
+            if spec.sha256 is None or (sha256 := file_sha256(path)).startswith(spec.sha256):
                 return path
-            faults.append(fault)
+            faults.append(f"weights file {path} has sha256 {sha256[:16]}…, expected {spec.sha256[:16]}…")
     if faults:
-        raise MissingWeightsError(f"{faults[0]}; replace it with the file from {spec.url or spec.source}")
+        origin = spec.url or spec.source
+        raise MissingWeightsError(f"{faults[0]}: wrong or truncated; replace it with the file from {origin}")
     return None
 
 
@@ -122,7 +121,7 @@ def load_state(path: Path, entry: str | None = None) -> dict[str, Tensor]:
     import torch
 
     try:
-        if path.suffix == SAFETENSORS_SUFFIX:
+        if path.suffix == ".safetensors":
             from safetensors.torch import load_file
 
             return load_file(path, device="cpu")
@@ -169,15 +168,6 @@ def _candidates(folder: Path, names: tuple[str, ...], sub_folders: bool) -> list
     return list(dict.fromkeys(files))
 
 
-def _checksum_fault(path: Path, spec: WeightsFile) -> str | None:
-    if spec.sha256 is None:
-        return None
-    sha256 = file_sha256(path)
-    if sha256.startswith(spec.sha256.lower()):
-        return None
-    return f"weights file {path} has sha256 {sha256[:16]}…, expected {spec.sha256[:16]}…: wrong or truncated"
-
-
 def _download(spec: WeightsFile, folder: Path) -> Path:
     """Download ``spec`` into ``folder``. The file appears under its name only after it is complete and checked."""
     assert spec.url is not None
@@ -192,7 +182,7 @@ def _download(spec: WeightsFile, folder: Path) -> Path:
                 log.info("downloading %s (%s) from %s to %s", target.name, readable_bytes(total), spec.url, folder)
 
         sha256 = downloads.download(spec.url, temporary, ONE_TRY, advance)
-        if not sha256.startswith((spec.sha256 or "").lower()):
+        if not sha256.startswith(spec.sha256 or ""):
             raise MissingWeightsError(
                 f"the download of {target.name} from {spec.url} is damaged: try again (its sha256 is {sha256[:16]}…)"
             )

@@ -63,9 +63,10 @@ def test_pixels_are_prepared_anew_for_another_colour_behind_them(make_scene: Mak
 def test_a_mask_of_another_name_is_none(tmp_path: Path) -> None:
     for name in ("a.jpg.png", "b.png"):
         save(tmp_path / name, half())
-    assert find_masks(tmp_path, ["a.jpg"]) == {"a.jpg": tmp_path / "a.jpg.png"}
+    save(tmp_path / "images" / "a.jpg", half())
+    assert find_masks(tmp_path, tmp_path / "images", ["a.jpg"]) == {"a.jpg": tmp_path / "a.jpg.png"}
     with pytest.raises(InputError, match=r"no mask of b\.jpg in .*: add b\.jpg\.png"):
-        find_masks(tmp_path, ["a.jpg", "b.jpg"])
+        find_masks(tmp_path, tmp_path / "images", ["a.jpg", "b.jpg"])
 
 
 def test_masks_below_bare_photographs_are_no_photographs(make_scene: MakeScene) -> None:

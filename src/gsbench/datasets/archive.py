@@ -139,10 +139,8 @@ def extract(archive: zipfile.ZipFile, member: zipfile.ZipInfo, target: Path, adv
     target.parent.mkdir(parents=True, exist_ok=True)
     written = 0
     try:
-        with (
-            atomic(
-                target, sync=False
-            ) as temporary,  # not synced, because a later fetch checks the CRC of existing files
+        with (  # not synced, because a later fetch checks the CRC of existing files
+            atomic(target, sync=False) as temporary,
             archive.open(member) as source,
             temporary.open("wb") as file,
         ):
@@ -209,10 +207,8 @@ def fetch_scene(
         say(files.scene, done, total)
 
     for name, info in sorted(missing.items(), key=lambda member: member[1].header_offset):
-        for is_last_try in (
-            False,
-            True,
-        ):  # two tries against damage in transit; `with_retries` handles lost connections
+        # Two tries against damage in transit; `with_retries` handles lost connections.
+        for is_last_try in (False, True):
             try:
                 with_retries(lambda: extract(archive, info, staging / name, advance), where, policy)  # noqa: B023
                 break

@@ -70,13 +70,11 @@ def wanted_files(scene: str, images: str | None = None) -> SceneFiles:
 def read_catalog() -> dict[str, PublicDataset]:
     """The data sets of gsbench's catalogue by name."""
     content: dict[str, Any] = yaml.safe_load(CATALOG_FILE.read_text(encoding="utf-8"))
-    return {name: _dataset(name, entry) for name, entry in content.items()}
-
-
-def _dataset(name: str, entry: Mapping[str, Any]) -> PublicDataset:
-    texts = {key: entry[key] for key in ("title", "page", "licence", "citation")}
-    archives = tuple(Archive(one["url"], one.get("size", ""), one["scenes"]) for one in entry["archives"])
-    return PublicDataset(name=name, archives=archives, **texts)
+    datasets = {}
+    for name, entry in content.items():
+        archives = tuple(Archive(one["url"], one.get("size", ""), one["scenes"]) for one in entry.pop("archives"))
+        datasets[name] = PublicDataset(name=name, archives=archives, **entry)
+    return datasets
 
 
 def data_dir() -> Path:

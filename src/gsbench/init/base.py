@@ -22,7 +22,6 @@ WORK_FOLDER = "work"  # below the output folder, during a run
 REPORT_FILE = "report.json"
 GAUSSIANS_FILE = "gaussians.ply"  # only if training starts from given Gaussians instead of points
 PICTURE_FILE = "cloud.png"  # the cloud and its cameras from above
-MIN_IMAGES = 3  # with two views, no third one can reveal a wrong geometry
 Poses = Literal["shared", "own"]
 PointsFrom = Literal["all", "train"]
 Seed = Annotated[int, Interval(ge=0, le=2**31 - 1)]  # COLMAP accepts no larger seed

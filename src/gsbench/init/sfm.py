@@ -15,7 +15,6 @@ from pydantic import PositiveFloat, PositiveInt
 
 from gsbench.errors import InputError
 from gsbench.init.base import (
-    MIN_IMAGES,
     WORK_FOLDER,
     Initializer,
     InitReport,
@@ -27,6 +26,7 @@ from gsbench.init.base import (
 )
 from gsbench.init.colmap.pairs import STRONGEST, Pairing, proposed_pairs
 from gsbench.logs import Progress, no_progress
+from gsbench.scene.options import MIN_IMAGES
 from gsbench.scene.types import Array, Capture
 from gsbench.settings import Fraction, Threads, check_settings
 from gsbench.system.isolate import run_with_progress

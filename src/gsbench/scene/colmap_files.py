@@ -188,9 +188,6 @@ MAX_LENGTH = 1e6  # of a quaternion, and 1 / MAX_LENGTH is the minimum: COLMAP n
 MAX_SIDE = 1_000_000  # px
 MAX_ID = 2**32 - 2  # ids of cameras and images are 32-bit; the largest number means "no id" in COLMAP
 MAX_POINT_ID = 2**64 - 2  # ids of 3D points are 64-bit
-TWO_FOCAL_LENGTHS = (
-    "PINHOLE", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE",
-)  # fmt: skip
 
 
 class ModelChecks:
@@ -203,7 +200,7 @@ class ModelChecks:
         self._points: set[int] = set()
 
     def camera(self, camera_id: int, model: str, width: int, height: int, params: Sequence[float]) -> None:
-        focal_lengths = params[: 2 if model in TWO_FOCAL_LENGTHS else 1]
+        focal_lengths = params[: 1 if model.startswith(("SIMPLE_", "RADIAL")) else 2]
         is_size = 1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE
         if not is_size or not all(map(math.isfinite, params)) or min(focal_lengths) <= 0:
             raise InputError(

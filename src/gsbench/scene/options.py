@@ -12,7 +12,7 @@ from gsbench.errors import InputError
 from gsbench.settings import MISSING, FolderName, PathName, check_settings, is_folder_name
 
 MAX_IMAGES = 200  # the paper's limit per scene
-MIN_IMAGES = 3
+MIN_IMAGES = 3  # with two views, no third one can reveal a wrong geometry
 MIN_SIZE = 16  # px: the smallest side of an image that is trained on
 
 

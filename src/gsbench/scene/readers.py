@@ -13,7 +13,7 @@ from gsbench.errors import InputError
 from gsbench.files import require_regular
 from gsbench.scene.colmap_files import model_files
 from gsbench.scene.hold_out import CamerasByName, hold_out, select_images
-from gsbench.scene.images import IMAGE_SUFFIXES, check_mask_sizes, check_picture_names, find_masks, match_names
+from gsbench.scene.images import IMAGE_SUFFIXES, check_picture_names, find_masks, match_names
 from gsbench.scene.options import EVERY_NTH, MAX_IMAGES, MIN_IMAGES, TEST_LIST, TRAIN_LIST, SplitRule
 from gsbench.scene.transforms import Transforms
 from gsbench.scene.types import Capture
@@ -242,8 +242,7 @@ def _make_capture(
     kept = tuple(sorted([*held_out.train, *held_out.test]))
     check_picture_names(held_out.test, folder)
     _require_enough(len(kept), folder, "in the split lists" if split.by_lists else "left by the split")
-    masks = {} if mask_folder is None else find_masks(mask_folder, kept)
-    check_mask_sizes(folder, masks)
+    masks = {} if mask_folder is None else find_masks(mask_folder, folder, kept)
     return Capture(
         name=name,
         images=folder,

@@ -19,11 +19,12 @@ import pycolmap
 
 from gsbench.errors import InputError
 from gsbench.init import report
-from gsbench.init.base import MIN_IMAGES, OWN_GAUGE_FOLDER, InitReport, Preparation, Timer, TrainingPoints
+from gsbench.init.base import OWN_GAUGE_FOLDER, InitReport, Preparation, Timer, TrainingPoints
 from gsbench.init.colmap import database as colmap_database
 from gsbench.init.colmap import reconstruct
 from gsbench.init.colmap.alignment import Similarity
 from gsbench.logs import Progress
+from gsbench.scene.options import MIN_IMAGES
 from gsbench.scene.types import Capture
 
 if TYPE_CHECKING:

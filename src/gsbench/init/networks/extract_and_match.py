@@ -76,8 +76,8 @@ def extract_features(
     )
 
 
-def load_into(network: torch.nn.Module, state: Mapping[str, torch.Tensor], path: Path) -> None:
-    """Load ``state`` into ``network``. It must hold every parameter in its shape; buffers may be absent."""
+def load_into(network: torch.nn.Module, state: Mapping[str, torch.Tensor], path: Path, device: torch.device) -> None:
+    """Load ``state`` into ``network``, for use on ``device``. It must hold every parameter; buffers may be absent."""
     try:
         missing, unexpected = network.load_state_dict(dict(state), strict=False)
     except RuntimeError as error:
@@ -92,6 +92,7 @@ def load_into(network: torch.nn.Module, state: Mapping[str, torch.Tensor], path:
             f"weights file {path} is for another network ({len(missing)} tensors missing, {len(unexpected)} foreign, "
             f"for example {example}): replace it"
         )
+    network.to(device).eval()
 
 
 def _superpoint(settings: FeatureSettings, weights: Path | None, device: torch.device) -> Extractor:
@@ -116,8 +117,7 @@ def _superpoint(settings: FeatureSettings, weights: Path | None, device: torch.d
     prefix = LIGHTGLUE_DETECTOR_PREFIX
     if any(name.startswith(prefix) for name in state):
         state = {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}
-    load_into(network, state, weights)
-    torch.nn.Module.to(network.eval(), device)
+    load_into(network, state, weights, device)
 
     def extract(image: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         height, width = image.shape[-2:]
@@ -144,8 +144,7 @@ def _aliked(settings: FeatureSettings, weights: Path | None, device: torch.devic
         detection_threshold=settings.keypoint_threshold,
         nms_radius=settings.nms_radius,
     )
-    load_into(network, load_state(weights), weights)
-    network.to(device).eval()
+    load_into(network, load_state(weights), weights, device)
 
     def extract(image: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         features = network(image)[0]
@@ -159,8 +158,7 @@ def _disk(settings: FeatureSettings, weights: Path | None, device: torch.device)
 
     assert weights is not None
     network = DISK()
-    load_into(network, load_state(weights, entry="extractor"), weights)
-    network.to(device).eval()
+    load_into(network, load_state(weights, entry="extractor"), weights, device)
 
     def extract(image: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         features = network(
@@ -240,8 +238,7 @@ def lightglue_matcher(extractor: str, filter_threshold: float, weights: Path, de
         for kind in ("self_attn", "cross_attn"):
             old, new = f"{kind}.{layer}.", f"transformers.{layer}.{kind}."
             state = {name.replace(old, new) if name.startswith(old) else name: tensor for name, tensor in state.items()}
-    load_into(network, state, weights)
-    network.to(device).eval()
+    load_into(network, state, weights, device)
 
     def inputs(features: Features) -> dict[str, torch.Tensor]:
         return {
@@ -305,23 +302,22 @@ def extract_and_match(job: NetworkJob, progress: Progress) -> Preparation:
     options, capture = job.options, job.capture
     torch.set_num_threads(options.num_threads)
     device = choose_device(options.device)
-    store = open_store(job)
     reference = load_reference(capture, job.reference)
     names = options.select_images(capture, reference)
     pairs = select_pairs(names, options)
     timer = Timer()
     with timer.phase("extract"):
-        empty = _extract_all(job, store, names, device, progress)
+        empty = _extract_all(job, names, device, progress)
     if len(empty) == len(names):
         raise InputError(f"{options.name}: no keypoint in any image: lower init.keypoint_threshold or check the photos")
     if options.pairs == "lowres":
         with timer.phase("preselect"):
             small = at_low_resolution(job)
-            _extract_all(small, open_store(small), names, device, progress)
-            _match_all(small, open_store(small), pairs, device, progress)
+            _extract_all(small, names, device, progress)
+            _match_all(small, pairs, device, progress)
     candidates, pairs = len(pairs), choose_pairs(job, names, pairs)
     with timer.phase("match"):
-        without = _match_all(job, store, pairs, device, progress)
+        without = _match_all(job, pairs, device, progress)
     if len(without) == len(pairs):  # also true if no pair was selected
         raise InputError(f"{options.name}: no pair of images has a match: the photos need more overlap or texture")
     warnings = []
@@ -379,12 +375,9 @@ def choose_device(name: str) -> torch.device:
     return device
 
 
-def _extract_all(
-    job: NetworkJob, store: FeatureStore, names: Sequence[str], device: torch.device, progress: Progress
-) -> list[str]:
+def _extract_all(job: NetworkJob, names: Sequence[str], device: torch.device, progress: Progress) -> list[str]:
     """Store the features of all images; returns the names of images without features."""
-    settings, empty = job.settings, []
-    extractor = None
+    store, settings, empty, extractor = open_store(job), job.settings, [], None
     progress("extract", 0, len(names))
     for done, name in enumerate(names, start=1):
         features = store.read_features(name)
@@ -402,17 +395,16 @@ def _extract_all(
 
 
 def _match_all(
-    job: NetworkJob, store: FeatureStore, pairs: Sequence[tuple[str, str]], device: torch.device, progress: Progress
+    job: NetworkJob, pairs: Sequence[tuple[str, str]], device: torch.device, progress: Progress
 ) -> list[tuple[str, str]]:
     """Store the matches of all pairs; returns the pairs without a match."""
-    settings = job.settings
-    matcher, without = None, []
+    store, matcher, without = open_store(job), None, []
     read = _cached_reader(store, pairs)
     progress("match", 0, len(pairs))
     for done, (first, second) in enumerate(pairs, start=1):
         matches = store.read_matches(first, second)
         if matches is None:
-            matcher = matcher or build_matcher(settings, job.matcher_weights, device)
+            matcher = matcher or build_matcher(job.settings, job.matcher_weights, device)
             matches = match(matcher, read(first), read(second))
             store.write_matches(first, second, matches)
         if len(matches) == 0:

@@ -71,16 +71,8 @@ class FeatureSettings:
 
     def extraction(self) -> dict[str, object]:
         """The settings that features depend on."""
-        values: dict[str, object] = {
-            "extractor": self.extractor,
-            "max_image_size": self.max_image_size,
-            "max_keypoints": self.max_keypoints,
-            "keypoint_threshold": self.keypoint_threshold,
-            "nms_radius": self.nms_radius,
-        }
-        if self.extractor == "aliked":
-            values["aliked_model"] = self.aliked_model
-        return values
+        names = ["extractor", "max_image_size", "max_keypoints", "keypoint_threshold", "nms_radius"]
+        return {name: getattr(self, name) for name in names + ["aliked_model"] * (self.extractor == "aliked")}
 
     def matching(self) -> dict[str, object]:
         """The settings that matches depend on, in addition to the features."""

@@ -16,6 +16,7 @@ from gsbench.errors import InputError
 from gsbench.logs import Progress, no_progress
 from gsbench.scene.courtyard.kernels import render
 from gsbench.scene.courtyard.layout import Layout, build_layout
+from gsbench.scene.options import MIN_IMAGES, MIN_SIZE
 from gsbench.scene.types import Camera
 
 VERSION = 1  # to be raised when the images change
@@ -23,7 +24,6 @@ MAX_STEP = radians(7.5)  # between neighbouring views; wider steps gave wrong Sf
 RING_RADIUS = 4.55  # m
 FIELD_OF_VIEW = radians(56.0)  # horizontal
 TARGET = (0.0, 0.0, 0.72)  # m, what all cameras look at
-MIN_VIEWS = 3
 
 
 def render_courtyard(
@@ -59,10 +59,10 @@ def render_courtyard(
 
 def courtyard_cameras(views: int, width: int, height: int) -> dict[str, Camera]:
     """The cameras by file name, on a wavy ring in steps of 7.5 degrees, or of less for more than 48 views."""
-    if views < MIN_VIEWS:
-        raise InputError(f"scene.views must be at least {MIN_VIEWS}, got {views}")
-    if min(width, height) < 16:
-        raise InputError(f"scene.width and scene.height must be at least 16 px, got {width}x{height}")
+    if views < MIN_IMAGES:
+        raise InputError(f"scene.views must be at least {MIN_IMAGES}, got {views}")
+    if min(width, height) < MIN_SIZE:
+        raise InputError(f"scene.width and scene.height must be at least {MIN_SIZE} px, got {width}x{height}")
     step = min(MAX_STEP, 2 * pi / views)
     return {f"{index:04d}.png": ring_camera(index * step - 0.5 * pi, width, height) for index in range(views)}
 
