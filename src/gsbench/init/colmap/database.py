@@ -147,22 +147,18 @@ def create_database(path: Path, groups: CameraGroups) -> dict[str, int]:
 
 def write_keypoints(path: Path, keypoints: Mapping[str, NDArray[np.float32]]) -> None:
     """Add ``keypoints`` [K, 2] by image name, in px of the image file; the centre of the first pixel is (0.5, 0.5)."""
+    ids = image_ids(path)
     with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
-        image_ids = {image.name: image.image_id for image in database.read_all_images()}
         for name, points in keypoints.items():
-            if points.ndim != 2 or points.shape[1] != 2:
-                raise ValueError(f"keypoints of {name} must be [K, 2], got {points.shape}")
-            database.write_keypoints(image_ids[name], np.ascontiguousarray(points, dtype=np.float32))
+            database.write_keypoints(ids[name], points)
 
 
 def write_matches(path: Path, matches: Mapping[tuple[str, str], NDArray[np.uint32]]) -> None:
     """Add ``matches`` [M, 2] by pairs of image names: indices of keypoints in the first and the second image."""
+    ids = image_ids(path)
     with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
-        image_ids = {image.name: image.image_id for image in database.read_all_images()}
         for (first, second), indices in matches.items():
-            database.write_matches(
-                image_ids[first], image_ids[second], np.ascontiguousarray(indices, dtype=np.uint32).reshape(-1, 2)
-            )
+            database.write_matches(ids[first], ids[second], indices)
 
 
 def verify_pairs(

@@ -57,19 +57,9 @@ class _Builder:
         self.starts.append(len(self.rows))
         self.place, self.turn = np.array([x, y, 0.0]), _rotation(yaw=yaw)
 
-    def add(
-        self,
-        kind: int,
-        at: tuple[float, float, float],
-        size: tuple[float, float, float],
-        material: int,
-        tint: tuple,
-        yaw: float = 0.0,
-        tilt: float = 0.0,
-        roll: float = 0.0,
-    ) -> None:
+    def add(self, kind: int, at, size, material: int, tint, **angles: float) -> None:
         center = self.place + self.turn @ np.array(at)
-        self.rows.append((kind, center, self.turn @ _rotation(yaw, tilt, roll), size, material, tint))
+        self.rows.append((kind, center, self.turn @ _rotation(**angles), size, material, tint))
 
     def box(self, at, size, material, tint, **angles: float) -> None:
         """A box given by its whole side lengths."""
