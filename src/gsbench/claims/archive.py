@@ -332,7 +332,7 @@ def _table(rows: Sequence[tuple[str, str, Mapping[str, float]]]) -> bytes:
 def crate_metadata(name: str, trials: Sequence[TrialResult], sizes: Mapping[str, int]) -> dict[str, Any]:
     """The archive in the terms of RO-Crate; ``sizes`` are the bytes of each of its files."""
     scenes = sorted({trial.scene for trial in trials})
-    arms = sorted({f"{trial.init}-{trial.densify}" for trial in trials})
+    arms = sorted({str(trial.arm) for trial in trials})
     protocols = sorted({trial.record.protocol for trial in trials})
     day = time.strftime("%Y-%m-%d", time.gmtime(max(trial.measured for trial in trials)))
     root = {
@@ -355,10 +355,6 @@ def crate_metadata(name: str, trials: Sequence[TrialResult], sizes: Mapping[str,
         }
         for file, size in sizes.items()
     ]
-    descriptor = {
-        "@id": CRATE,
-        "@type": "CreativeWork",
-        "conformsTo": {"@id": SPECIFICATION},
-        "about": {"@id": "./"},
-    }
+    about = {"conformsTo": {"@id": SPECIFICATION}, "about": {"@id": "./"}}
+    descriptor = {"@id": CRATE, "@type": "CreativeWork"} | about
     return {"@context": f"{SPECIFICATION}/context", "@graph": [descriptor, root, *files]}

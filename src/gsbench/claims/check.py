@@ -119,12 +119,8 @@ class Check:
 
     def _failures(self, verdict: Verdict) -> list[str]:
         """The reasons why trials of an undecided question failed, each once."""
-        folders = [
-            self.home / f"{key}{SEED}{seed}"
-            for both in verdict.question.scenes.values()
-            for key in both
-            for seed in verdict.question.seeds
-        ]
+        keys = [key for both in verdict.question.scenes.values() for key in both]
+        folders = [self.home / f"{key}{SEED}{seed}" for key in keys for seed in verdict.question.seeds]
         failures = [read_if_sound(folder / FAILED, Failure) for folder in ([] if verdict.final else folders)]
         return list(dict.fromkeys(failure.reason for failure in failures if failure is not None))
 
@@ -161,9 +157,8 @@ def prepare(file: ClaimsFile, runs: Path, find_missing: FindMissing, permissions
             questions.append(file.question(claim, scenes))
         if reasons:
             missing[claim.id] = [without_folders(f"{some_of(names)}: {reason}") for reason, names in reasons.items()]
-    declaration = declared_now(
-        questions=tuple(questions), error_rate=file.error_rate, looks=file.looks, missing=missing
-    )
+    asked = tuple(questions)
+    declaration = declared_now(questions=asked, error_rate=file.error_rate, looks=file.looks, missing=missing)
     return Check(file, runs, declaration, first_trials)
 
 

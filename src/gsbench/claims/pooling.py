@@ -175,9 +175,8 @@ def read_studies(path: Path, question: PooledQuestion, name: str) -> tuple[list[
             for arms in groups:
                 qualifiers = [protocol] * (len(by_protocol) > 1) + [arms[0][0].init] * (len(groups) > 1)
                 label = f"{name} ({', '.join(qualifiers)})" if qualifiers else name
-                pairs_by_arms = [
-                    pair(own, Question(metric=question.metric, baseline=baseline, arm=arm)) for baseline, arm in arms
-                ]
+                questions = [Question(metric=question.metric, baseline=one, arm=other) for one, other in arms]
+                pairs_by_arms = [pair(own, asked) for asked in questions]
                 together = Pairs(tuple(row for pairs in pairs_by_arms for row in pairs.rows))
                 if not together.rows:
                     reason = next((f" ({line})" for pairs in pairs_by_arms for line in pairs.left_out), "")

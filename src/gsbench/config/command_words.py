@@ -42,11 +42,8 @@ def parse(argv: Sequence[str]) -> tuple[list[str], bool, bool]:
             folders.append(Path(word.partition("=")[2] or next(words, "")))
         elif word.startswith("-"):
             group = word.lstrip("-").partition("=")[0]
-            near = (
-                f"; a setting has no dashes: {group}=…"
-                if group.partition(".")[0] in GROUPS
-                else did_you_mean(word, OPTIONS)
-            )
+            is_setting = group.partition(".")[0] in GROUPS
+            near = f"; a setting has no dashes: {group}=…" if is_setting else did_you_mean(word, OPTIONS)
             raise InputError(
                 f"{word} is not an option{near} "
                 "(there are -m, --dry-run, --config-dir FOLDER, --cfg job, --info, --help)"

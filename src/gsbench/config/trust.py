@@ -256,11 +256,8 @@ def _check_hydra(hydra: dict[str, Any]) -> None:
     if sweeper.get(TARGET) != OWN_SWEEPER:
         raise InputError("hydra.sweeper: gsbench has its own, which searches intervals, too: leave hydra/sweeper out")
     # Hydra instantiates these, and ${…} may stand for a mapping that names a class.
-    plugins = {
-        "callbacks": hydra["callbacks"],
-        "launcher": launcher,
-        "sweeper": sweeper | {"params": None, "grids": None},
-    }
+    own_sweeper = sweeper | {"params": None, "grids": None}
+    plugins = {"callbacks": hydra["callbacks"], "launcher": launcher, "sweeper": own_sweeper}
     for place, key, value in _entries(plugins, ("hydra",)):
         if isinstance(value, str) and "${" in value:
             raise InputError(f"{'.'.join((*place, key))}: write the settings themselves here, without ${{…}}")

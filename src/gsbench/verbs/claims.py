@@ -209,7 +209,8 @@ def ablate(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: the exit code says, as a sweep's does, whether a trial failed; raises InputError for bad input."""
     options = _ablate_parser().parse_args(argv)
     settings = options.settings
-    words = [*settings, *([] if _names_experiment(settings) else [f"name={_default_name(settings)}"])]
+    named = any(word.startswith(("name=", "+experiment=")) for word in settings)
+    words = [*settings, *([] if named else [f"name={_default_name(settings)}"])]
     first = _trials(words)
     densify = _only_densifier(first)
     declared = ablation.declared_switches(_class_switches(first[0]), first[0].values["densify"])
@@ -277,10 +278,6 @@ def _words(settings: dict[str, Any], first: Trial) -> list[str]:
     """The words that give the densifier these settings; a key that it lacks needs Hydra's plus."""
     densify = first.values["densify"]
     return [f"{'' if key in densify else '+'}densify.{key}={value_text(value)}" for key, value in settings.items()]
-
-
-def _names_experiment(words: Sequence[str]) -> bool:
-    return any(word.startswith(("name=", "+experiment=")) for word in words)
 
 
 def _default_name(words: Sequence[str]) -> str:

@@ -25,21 +25,18 @@ def ask_hydra(argv: list[str]) -> int:
             raise InputError("-sc takes install=bash or uninstall=bash, and zsh and fish likewise")
         _check_typed(os.environ.get("COMP_LINE", ""))
     else:
-        _check(options.overrides, options.config_dir, options.package)
+        folders = [options.config_dir] if options.config_dir else []
+        check_single(options.overrides, "choose one whose configuration is shown")
+        with hydra_ready():
+            config = compose_whole([*search_path(folders, options.overrides), *options.overrides])
+        if options.package is not None and not has_key(config, options.package):
+            raise InputError(f"--package {options.package}: there is no such part of the configuration")
 
     def task(config: object) -> None:
         raise AssertionError("Hydra was asked a question, and ran the task instead")
 
     run_main(task, argv)
     return 0
-
-
-def _check(overrides: list[str], config_dir: Path | None, package: str | None) -> None:
-    check_single(overrides, "choose one whose configuration is shown")
-    with hydra_ready():
-        config = compose_whole([*search_path([config_dir] if config_dir else [], overrides), *overrides])
-    if package is not None and not has_key(config, package):
-        raise InputError(f"--package {package}: there is no such part of the configuration")
 
 
 def _check_typed(line: str) -> None:

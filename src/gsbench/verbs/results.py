@@ -61,16 +61,14 @@ def _trials(trials: Sequence[TrialResult], options: argparse.Namespace) -> dict[
 
 def _tables(experiment: Experiment, trials: Sequence[TrialResult], options: argparse.Namespace) -> dict[str, str]:
     """The texts of the tables, by the ending of their file's name."""
-    layout = options.layout or (_has_default_layout(options) and layout_of(experiment.name)) or "plain"
-    metrics = options.metrics
+    own_layout = layout_of(experiment.name) if options.rows is None and options.columns is None else None
+    layout, metrics = options.layout or own_layout or "plain", options.metrics
     if layout == FAIRNESS:
         return _fairness_sheets(experiment, options.format)
     if layout == "plain":
         rows, columns = options.rows, options.columns or ()
-        if set(rows or ()) & set(columns):
-            raise InputError(
-                f"{', '.join(sorted(set(rows or ()) & set(columns)))} is in --rows and --columns: choose one"
-            )
+        if both := sorted(set(rows or ()) & set(columns)):
+            raise InputError(f"{', '.join(both)} is in --rows and --columns: choose one")
         tables = [build_table(experiment, trials, rows, columns, metrics)]
     else:
         tables = paper_tables(experiment, layout, trials, metrics)
@@ -119,11 +117,6 @@ def _tables_parser() -> ArgumentParser:
         "tuned, and whose defaults those are",
     )
     return parser
-
-
-def _has_default_layout(options: argparse.Namespace) -> bool:
-    """Return whether the user chose neither rows nor columns."""
-    return options.rows is None and options.columns is None
 
 
 def _write(texts: Mapping[str, str], out: Path | None, name: str) -> None:

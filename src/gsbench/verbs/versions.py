@@ -11,21 +11,8 @@ from pathlib import Path
 from gsbench.analysis.cells import select_trials
 from gsbench.analysis.results import TrialResult, group_by, read_experiment
 from gsbench.app.command import one_trial_per_scene, run_trials
+from gsbench.claims import gate as gates
 from gsbench.claims.archive import unpack_archive
-from gsbench.claims.gate import (
-    BASELINE,
-    NEW,
-    NOT_DECIDED,
-    PASSED,
-    WORSE,
-    Gate,
-    declare_gate,
-    describe,
-    deviations,
-    first_worse,
-    most_steps,
-    result_of,
-)
 from gsbench.claims.stopping import KeyAndSeed, run_looks
 from gsbench.config.compose import Trial, with_seed
 from gsbench.errors import GsbenchError, InputError, TrainingError
@@ -38,7 +25,7 @@ from gsbench.system.install import WorkTrees
 from gsbench.verbs.arguments import ArgumentParser, add_question, add_where, path
 from gsbench.words import counted, listed, printable
 
-EXIT_CODES = {PASSED: 0, WORSE: 1, NOT_DECIDED: 3}  # of a gate
+EXIT_CODES = {gates.PASSED: 0, gates.WORSE: 1, gates.NOT_DECIDED: 3}  # of a gate
 FOUND, NOT_FOUND = 0, 3  # exit codes of a bisection
 HASH_LENGTH = 10  # characters of a commit's hash that are shown
 OWN_SOURCE = Path("src/gsbench/__init__.py")  # present in a checkout of gsbench itself
@@ -65,16 +52,16 @@ def gate(argv: Sequence[str], runs: Path) -> int:
         archived = unpack_archive(options.archive, Path(folder)).trials
         baseline = _baseline(select_trials(archived, dict(options.where)), by_scene)
         seeds = _seeds(baseline, options.seeds)
-        arms = {scene: (_arm(old[0]), by_scene[scene].folder.parent.name) for scene, old in baseline.items()}
-        declaration = declare_gate(options.metric, options.least, arms, seeds, example.values)
+        arms = {scene: (str(old[0].arm), by_scene[scene].folder.parent.name) for scene, old in baseline.items()}
+        declaration = gates.declare_gate(options.metric, options.least, arms, seeds, example.values)
         trials = {
-            (trial_key(scene, arms[scene][1], NEW), seed): with_seed(trial, seed)
+            (trial_key(scene, arms[scene][1], gates.NEW), seed): with_seed(trial, seed)
             for scene, trial in by_scene.items()
             for seed in seeds
         }
         make_runs_folder(checked_runs_folder(str(home.parent)))
         old = [trial for of_scene in baseline.values() for trial in of_scene if trial.seed in seeds]
-        gate = Gate(declare_questions(home, declaration), lambda: old, lambda: _done(home, list(trials.values())))
+        gate = gates.Gate(declare_questions(home, declaration), lambda: old, lambda: _done(home, list(trials.values())))
 
         def run(planned: Sequence[KeyAndSeed]) -> None:
             if code := run_trials([trials[key] for key in planned if key in trials]):
@@ -84,8 +71,8 @@ def gate(argv: Sequence[str], runs: Path) -> int:
         if verdict.answer is None and not verdict.equal:
             reasons = filter(None, (verdict.untestable, *verdict.notes, "trials are missing"))
             raise InputError(f"the versions cannot be compared: {next(reasons)}")
-        print("\n".join([describe(verdict), *deviations(old, list(gate.new()))]))
-    return EXIT_CODES[result_of(verdict)]
+        print("\n".join([gates.describe(verdict), *gates.deviations(old, list(gate.new()))]))
+    return EXIT_CODES[gates.result_of(verdict)]
 
 
 def _baseline(archived: Sequence[TrialResult], by_scene: Mapping[str, Trial]) -> dict[str, list[TrialResult]]:
@@ -99,8 +86,8 @@ def _baseline(archived: Sequence[TrialResult], by_scene: Mapping[str, Trial]) ->
         if not old:
             scenes = listed(sorted({trial.scene for trial in archived}))
             raise InputError(f"the archive has no trial on {scene} (it has {scenes})")
-        old = [trial for trial in old if _arm(trial) == new.folder.parent.name] or old
-        if len(variants := group_by(old, lambda trial: (_arm(trial), trial.config_hash))) > 1:
+        old = [trial for trial in old if str(trial.arm) == new.folder.parent.name] or old
+        if len(variants := group_by(old, lambda trial: (trial.arm, trial.config_hash))) > 1:
             arms = listed([f"{arm} ({settings})" for arm, settings in variants])
             raise InputError(f"the archive has several arms on {scene}, {arms}: choose by --where KEY=VALUE")
         baseline[scene] = old
@@ -125,10 +112,6 @@ def _done(home: Path, trials: Sequence[Trial]) -> list[TrialResult]:
     ]
 
 
-def _arm(trial: TrialResult) -> str:
-    return f"{trial.init}-{trial.densify}"
-
-
 def bisect(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: 0 if the commit is found, 3 if not; raises TrainingError if GOOD or BAD does not train."""
     parser = ArgumentParser(
@@ -147,7 +130,7 @@ def bisect(argv: Sequence[str], runs: Path) -> int:
         trees = WorkTrees(Path.cwd(), Path(scratch).resolve())
         commits = trees.commits(options.good, options.bad)
         search = _begin(options, trees, commits)
-        found = first_worse(len(commits) - 1, search.result)
+        found = gates.first_worse(len(commits) - 1, search.result)
     print("\n".join([*search.table(), "", *_conclusion(found, search)]))
     return FOUND if found is not None and found[1] - found[0] == 1 else NOT_FOUND
 
@@ -167,10 +150,10 @@ class CommitSearch:
     def result(self, number: int) -> str | None:
         """The result of a commit against the first one; None if it does not train. Trains what is missing."""
         good, new = (self.home.parent / f"{self.home.name}_{self.commits[k][0][:HASH_LENGTH]}" for k in (0, number))
-        gate = Gate(self.declaration, lambda: _trials(good), lambda: _trials(new))
+        gate = gates.Gate(self.declaration, lambda: _trials(good), lambda: _trials(new))
 
         def run(planned: Sequence[KeyAndSeed]) -> None:
-            for version, commit, home in ((BASELINE, 0, good), (NEW, number, new)):
+            for version, commit, home in ((gates.BASELINE, 0, good), (gates.NEW, number, new)):
                 self._train(commit, home, [seed for key, seed in planned if key.endswith(f"/{version}")])
 
         try:
@@ -180,8 +163,8 @@ class CommitSearch:
                 raise
             self.answers[number] = f"does not train: {error}"
             return None
-        self.answers[number] = describe(verdict)
-        return result_of(verdict)
+        self.answers[number] = gates.describe(verdict)
+        return gates.result_of(verdict)
 
     def _train(self, number: int, home: Path, seeds: Sequence[int]) -> None:
         """Train a commit with the seeds that are not done, by the code in its work tree."""
@@ -219,9 +202,9 @@ def _begin(options: argparse.Namespace, trees: WorkTrees, commits: Sequence[tupl
         if place and not Path(place).expanduser().is_absolute():
             raise InputError(f"scene.path={place}: commits are trained in other folders, so give the whole path")
     arms = {scene: (trial.folder.parent.name,) * 2 for scene, trial in by_scene.items()}
-    share = ERROR_RATE / most_steps(len(commits) - 1)  # of each step, so that all together err in 5 % at most
+    share = ERROR_RATE / gates.most_steps(len(commits) - 1)  # of each step, so that all together err in 5 % at most
     seeds = range(max(0, options.seeds))
-    declaration = declare_gate(options.metric, options.least, arms, seeds, example.values, share)
+    declaration = gates.declare_gate(options.metric, options.least, arms, seeds, example.values, share)
     settings = [word for word in options.settings if not word.startswith(("name=", "runs="))]
     runs = checked_runs_folder(str(example.files.runs))
     make_runs_folder(runs)
@@ -238,9 +221,7 @@ def _trials(home: Path) -> tuple[TrialResult, ...]:
 def _conclusion(found: tuple[int, int] | None, search: CommitSearch) -> list[str]:
     """The lines that say which commit, or which commits, the search found."""
     if found is None:
-        return [
-            "The last commit is not shown to be worse than the first: allow more --seeds, or look at another metric."
-        ]
+        return ["The last commit is not shown to be worse than the first: allow more --seeds, or take another metric."]
     good, bad = found
     commit, date, subject = search.commits[bad]
     if bad - good == 1:
