@@ -18,10 +18,9 @@ from skimage.metrics import structural_similarity
 from gsbench.errors import InputError
 from gsbench.eval.evaluator import Evaluator
 from gsbench.eval.facts import METRICS, further_keys
-from gsbench.eval.fsim import fsim, phase_congruency
 from gsbench.eval.metrics import gmsd
-from gsbench.eval.multiscale import MIN_SIZE, SCALE_WEIGHTS, iw_ssim, ms_ssim
 from gsbench.eval.protocol import PAPER
+from gsbench.eval.structure import MULTISCALE_MIN_SIZE, SCALE_WEIGHTS, fsim, iw_ssim, ms_ssim, phase_congruency
 
 FUNCTIONS = {"ms_ssim": ms_ssim, "iw_ssim": iw_ssim, "fsim": fsim, "gmsd": gmsd}
 PEERS = {
@@ -157,7 +156,7 @@ def test_a_batch_gives_the_values_of_its_images(key: str) -> None:
 
 @pytest.mark.parametrize(("key", "smallest"), [("ms_ssim", 161), ("iw_ssim", 161), ("fsim", 16), ("gmsd", 2)])
 def test_what_is_too_small_is_refused_and_reported(key: str, smallest: int) -> None:
-    assert MIN_SIZE == 161
+    assert MULTISCALE_MIN_SIZE == 161
     with pytest.raises(ValueError, match=f"at least {smallest} px"):
         FUNCTIONS[key](torch.rand(smallest - 1, 300, 3), torch.rand(smallest - 1, 300, 3))
     rng = np.random.default_rng(0)

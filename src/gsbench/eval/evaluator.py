@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gsbench.errors import InputError, TrainingError
-from gsbench.eval import fsim, metrics, multiscale
+from gsbench.eval import metrics, structure
 from gsbench.eval.facts import LPIPS, METRICS, MORE, facts_of, further_keys, lpips_variants
 from gsbench.eval.images import as_unit_range, in_double_precision, replace_ignored
 from gsbench.eval.lpips import Lpips, load_lpips
@@ -141,9 +141,9 @@ MEASURES: dict[str, Callable[[MetricContext], Metric]] = {
     "lpips_alex": partial(LpipsMetric, net="alex"),
     "lpips_squeeze": partial(LpipsMetric, net="squeeze"),
     "flip": Flip,
-    "ms_ssim": lambda _: StructuralMetric(multiscale.ms_ssim, multiscale.MIN_SIZE),
-    "iw_ssim": lambda _: StructuralMetric(multiscale.iw_ssim, multiscale.MIN_SIZE),
-    "fsim": lambda _: StructuralMetric(fsim.fsim, fsim.MIN_SIZE),
+    "ms_ssim": lambda _: StructuralMetric(structure.ms_ssim, structure.MULTISCALE_MIN_SIZE),
+    "iw_ssim": lambda _: StructuralMetric(structure.iw_ssim, structure.MULTISCALE_MIN_SIZE),
+    "fsim": lambda _: StructuralMetric(structure.fsim, structure.FSIM_MIN_SIZE),
     "gmsd": lambda _: StructuralMetric(metrics.gmsd, metrics.GMSD_MIN_SIZE),
 }
 
