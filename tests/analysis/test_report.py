@@ -26,7 +26,7 @@ from gsbench.analysis.report.build import (
     mean_by_step,
     trial_figures,
 )
-from gsbench.analysis.report.charts import Axis, ForestRow, forest_plot, line_chart
+from gsbench.analysis.report.charts import Axis, ForestRow, forest_plot, line_chart, short_number
 from gsbench.analysis.results import Experiment, load_experiment
 from gsbench.analysis.statistics import Interval
 from gsbench.analysis.verdicts import by_scene_lines, headline, judge_pairs
@@ -282,6 +282,39 @@ def test_an_axis_has_round_ticks_within_its_range(values: tuple[float, float], l
         assert places == pytest.approx([100, 200, 300])
 
 
+@pytest.mark.parametrize(
+    ("values", "log", "ticks", "labels"),
+    [
+        ((2, 5), False, [2, 3, 4, 5], ["2", "3", "4", "5"]),
+        ((0, 10), False, [0, 2.5, 5, 7.5, 10], ["0.0", "2.5", "5.0", "7.5", "10.0"]),
+        ((-3, 3), False, [-2, 0, 2], ["−2", "0", "2"]),
+        ((7000, 30000), False, [10000, 15000, 20000, 25000, 30000], ["10k", "15k", "20k", "25k", "30k"]),
+        ((0.3, 40), True, [1, 10], ["1", "10"]),
+        ((1, 1e6), True, [1, 100, 1e4, 1e6], ["1", "100", "10k", "1M"]),
+    ],
+)
+def test_ticks_of_an_axis(values: tuple[float, float], log: bool, ticks: list[float], labels: list[str]) -> None:
+    axis = Axis(values, log, 0.0, 100.0)
+    assert axis.ticks == pytest.approx(ticks)
+    assert [axis.label(tick) for tick in axis.ticks] == labels
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(0, "0"), (1e-4, "0.0001"), (9e-5, "9e−05"), (-0.0234, "−0.0234"), (999.4, "999"), (1000, "1000"), (9999, "9999"),
+     (1e4, "10k"), (26_100, "26.1k"), (1e6, "1M"), (-2.5e6, "−2.5M")],
+)  # fmt: skip
+def test_a_short_number_has_three_digits(value: float, text: str) -> None:
+    assert short_number(value) == text
+
+
+def test_a_row_of_a_forest_plot_has_the_colour_of_its_verdict() -> None:
+    green, red, grey = "#1b7837", "#b2182b", "#555555"
+    up, down = ForestRow("s", 0.2, Interval(0.1, 0.3)), ForestRow("s", -0.2, Interval(-0.3, -0.1))
+    assert [up.color(1), up.color(-1), down.color(1), down.color(-1)] == [green, red, red, green]
+    assert ForestRow("s", 0.2).color(1) == ForestRow("s", 0.2, Interval(-0.1, 0.5)).color(1) == grey
+
+
 def test_an_axis_from_zero_begins_at_zero() -> None:
     axis = Axis([0.0, 10.0], False, 0.0, 104.0)
     assert [axis.to_px(value) for value in (0, 5, 10)] == pytest.approx([0, 50, 100])
@@ -309,7 +342,7 @@ def test_the_threshold_of_a_chart_is_the_one_that_all_arms_have_in_scene_units(
 
 def test_nothing_to_draw_is_an_empty_string() -> None:
     assert line_chart("t", [("a", [])], "x", "y") == ""
-    assert line_chart("t", [("a", [(0, 1)])], "x", "y", log=True) == ""
+    assert line_chart("t", [("a", [(0, 1), (1, 0)])], "x", "y", log=True) == ""
     assert forest_plot("t", [], "x", 1) == ""
 
 

@@ -67,6 +67,18 @@ def test_of_single_pairs_the_spread_of_scenes_stands_for_that_of_trainings() -> 
     assert found.p == pytest.approx(scipy.stats.ttest_1samp(values[:, 0], 0).pvalue)
 
 
+def test_two_pairs_suffice_for_a_test() -> None:
+    for values in (np.array([[0.1, 0.3]]), np.array([[0.1], [0.3]])):
+        found = t_test(values)
+        assert found is not None
+        assert found.p == pytest.approx(scipy.stats.ttest_1samp([0.1, 0.3], 0).pvalue)
+
+
+@pytest.mark.parametrize(("low", "high", "known"), [(0, 1, False), (-1, 0, False), (-1, 1, False), (0.1, 1, True)])
+def test_an_interval_that_ends_at_zero_holds_it(low: float, high: float, known: bool) -> None:
+    assert Interval(low, high).excludes_zero() == Interval(-high, -low).excludes_zero() == known
+
+
 def test_trainings_that_do_not_differ_are_sure() -> None:
     same = t_test(np.full((2, 3), 0.2))
     assert same is not None
@@ -139,6 +151,14 @@ def test_scenes_like_these_are_asked_by_the_sign_test() -> None:
     assert found.power() == pytest.approx(0.9**8)
     assert judge_like_these(np.abs(means), 1, 0.001).outcome == "supported"  # type: ignore[union-attr]
     assert judge_like_these(means[:5], 1, 0.005) is None
+    nothing = judge_like_these(np.zeros(6), 1, 0.0)
+    assert nothing is not None
+    assert (nothing.helped, nothing.beyond, nothing.p) == (0, 6, 1.0)
+    none_helped = judge_like_these(-np.ones(6), 1, None)
+    assert none_helped is not None
+    assert (none_helped.share.low, none_helped.beyond, none_helped.outcome) == (0.0, None, "refuted")
+    assert none_helped.share.high == pytest.approx(scipy.stats.binomtest(0, 6).proportion_ci().high)
+    assert none_helped.p == pytest.approx(scipy.stats.binomtest(0, 6).pvalue)
 
 
 def test_the_interval_of_the_median_is_exact() -> None:
@@ -179,7 +199,11 @@ def test_no_look_may_use_more_than_its_share_and_where_the_looks_would_err_too_o
     ]
     assert np.mean(false) < 0.05 + 3 * (0.05 * 0.95 / len(sweeps)) ** 0.5
     assert look_levels(3, (4,), 0.05) == (0.05,)
+    assert look_levels(1, (2, 3), 1e-6)[0] == 0.0  # too little to spend for any of the simulated sequences
+    assert plan_looks(2) == (2,)
     assert plan_looks(4) == (2, 3, 4)
+    assert plan_looks(12) == tuple(range(2, 13))
+    assert plan_looks(21) == (*range(2, 13), 16, 20, 21)
     assert plan_looks(14) == (*range(2, 13), 14)
 
 

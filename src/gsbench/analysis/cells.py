@@ -148,11 +148,9 @@ def short_reason(reason: str) -> str:
 def best_cells(cells: Mapping[K, Cell], quantity: Quantity) -> set[K]:
     """The keys of the best means after rounding to the quantity's decimals; empty if all are equal."""
     means = {key: round(cell.mean, quantity.decimals) for key, cell in cells.items() if cell.mean is not None}
-    if quantity.cost or quantity.direction == 0 or len(means) < 2:
+    if quantity.cost or quantity.direction == 0 or len(set(means.values())) < 2:
         return set()
-    best = max(means.values()) if quantity.direction > 0 else min(means.values())
-    if len(set(means.values())) == 1:
-        return set()
+    best = max(means.values()) if quantity.direction == 1 else min(means.values())
     return {key for key, mean in means.items() if mean == best}
 
 

@@ -141,7 +141,7 @@ def _compare_view(which: str, pair: TrialPair, view: str) -> ViewComparison:
     errors = [absolute_error(image, truth) for image in (first, second)]  # [H, W] each
     gain = np.clip((errors[0] - errors[1]) / FULL_COLOUR, -1, 1)[..., None]  # [H, W, 1], 1 where the second is nearer
     white, blue, red = (np.array(colour) for colour in ((255, 255, 255), (33, 102, 172), (178, 24, 43)))
-    colours = white + np.abs(gain) * (np.where(gain > 0, blue, red) - white)
+    colours = white + np.abs(gain) * (np.where(gain > 0.0, blue, red) - white)
     return ViewComparison(
         which,
         pair[0].scene,

@@ -340,27 +340,27 @@ def read_experiment(folder: Path) -> Experiment:
             trials.append(read_trial(Path(path), runs_dir, settings))
         except _UnusableError as reason:
             warnings.append(f"{os.path.relpath(path, runs_dir)}: {one_line(str(reason))}")
-    trials, unreadable = _check_settings(trials, settings)
-    warnings += [f"{os.path.relpath(trial.path, runs_dir)}: damaged, {reason}" for trial, reason in unreadable]
+    faults = _read_settings(trials, settings)
+    for trial in trials:
+        if fault := faults.get(trial.key):
+            warnings.append(f"{os.path.relpath(trial.path, runs_dir)}: damaged, {fault}")
+    trials = [trial for trial in trials if not faults.get(trial.key)]
     trials.sort(key=lambda trial: (trial.scene, trial.init, trial.densify, trial.seed, trial.config_hash))
     return Experiment(folder.name, folder, tuple(trials), tuple(sorted(warnings)))
 
 
-def _check_settings(
-    trials: Sequence[TrialResult], settings: Configurations
-) -> tuple[list[TrialResult], list[tuple[TrialResult, str]]]:
-    """The usable trials, and those whose settings are needed but cannot be read, each with the reason.
+def _read_settings(trials: Sequence[TrialResult], settings: Configurations) -> dict[str, str]:
+    """Read the settings that are needed; return what is wrong with each, "" for nothing, by the trials' `key`.
 
     Settings are needed only if trials of one scene, initialiser and densifier have different ones. Other trials' files
     are not opened here, which saves time.
     """
-    folders: dict[str, dict[str, list[Path]]] = {}  # {scene and arm: {trial without the seed: its folders}}
-    for trial in trials:
-        folders.setdefault(trial.key.rpartition("/")[0], {}).setdefault(trial.key, []).append(trial.path)
-    several = [by_trial for by_trial in folders.values() if len(by_trial) > 1]
-    faults = {key: settings.read(key, paths) for by_trial in several for key, paths in by_trial.items()}
-    usable = [trial for trial in trials if not faults.get(trial.key)]
-    return usable, [(trial, faults[trial.key]) for trial in trials if faults.get(trial.key)]
+    faults: dict[str, str] = {}
+    for own in group_by(trials, lambda trial: trial.key.rpartition("/")[0]).values():
+        by_key = group_by(own, lambda trial: trial.key)
+        if len(by_key) > 1:
+            faults |= {key: settings.read(key, [trial.path for trial in same]) for key, same in by_key.items()}
+    return faults
 
 
 def read_views(trial: TrialResult) -> dict[str, dict[str, float]]:

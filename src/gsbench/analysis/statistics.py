@@ -116,7 +116,7 @@ def outcome_of(interval: Interval, sign: int, least: float | None) -> Outcome:
         return "too small to matter"
     if not interval.excludes_zero():
         return "undecided"
-    return "supported" if sign * interval.low > 0 or sign * interval.high > 0 else "refuted"
+    return "supported" if sign * interval.low > 0.0 else "refuted"
 
 
 @dataclass(frozen=True)

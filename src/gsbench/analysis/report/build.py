@@ -150,7 +150,7 @@ def _forest(verdict: Verdict) -> str:
     rows = [ForestRow(scene.scene, scene.mean, scene.interval) for scene in verdict.scenes]
     if len(rows) > 1:
         rows.append(ForestRow("mean of scenes", verdict.mean or 0.0, verdict.interval))
-    better = "right of zero is better" if verdict.quantity.direction > 0 else "left of zero is better"
+    better = "right of zero is better" if verdict.quantity.direction == 1 else "left of zero is better"
     return forest_plot(f"{verdict.quantity.name}: {better}", rows, "difference", verdict.quantity.direction)
 
 

@@ -35,7 +35,7 @@ class ForestRow:
         """Grey if the interval contains 0 or is unknown, green on the side of the sign ``better``, else red."""
         if self.interval is None or not self.interval.excludes_zero():
             return "#555555"
-        return "#1b7837" if self.mean * better > 0 else "#b2182b"
+        return "#1b7837" if self.mean * better > 0.0 else "#b2182b"
 
 
 def line_chart(
