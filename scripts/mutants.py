@@ -41,7 +41,14 @@ from queue import Queue
 ROOT = Path(__file__).parents[1]
 SOURCE = "src/gsbench"
 ROOMS = ["analysis", "claims", "densify", "eval", "gaussians", "init", "pipeline", "raster", "runs", "scene", "train"]
-FURTHER_TESTS = {"pipeline": ["tests/end_to_end/test_smoke.py"]}
+YAML = ["tests/config/test_yaml_defaults.py"]  # the defaults of classes
+FURTHER_TESTS = {
+    "pipeline": ["tests/end_to_end/test_smoke.py"],
+    "densify": YAML,
+    "eval": YAML,
+    "init": YAML,
+    "train": YAML,
+}
 LEFT_OUT = "triton"  # files with this in their path
 SYMMETRIC = {"maximum", "minimum", "min", "max", "add"}  # swapped arguments change nothing
 SPEED_ONLY = {"prefetch"}  # calls that change no result

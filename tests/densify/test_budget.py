@@ -204,3 +204,23 @@ def test_who_cannot_say_where_a_round_leads_is_not_governed(cap: str) -> None:
         Silent(cap=cap)  # type: ignore[arg-type]
     with pytest.raises(InputError, match=rf"densify\.max_gaussians must be set for densify\.cap={cap}"):
         ADC(cap=cap, max_gaussians=None)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("cap", "count", "most", "allowed"),
+    [("soft", 5, 9, 4), ("soft", 5, 3, 0), ("soft", 8, 20, 0), ("hard", 5, 9, 2), ("hard", 5, 6, 1), ("hard", 5, 3, 0)],
+)
+def test_a_training_may_limit_the_count_further(cap: str, count: int, most: int, allowed: int) -> None:
+    asked = []
+
+    def limit(refinement: Refinement, cap: int | None) -> int:
+        asked.append(cap)
+        return most
+
+    densifier = ADC(max_gaussians=7, cap=cap)  # type: ignore[arg-type]
+    densifier.begin(random_gaussians(3), DensifyContext(1.0, limit=limit))
+    assert densifier.allowance(at(600, range(count))) == allowed  # type: ignore[arg-type]
+    assert asked == [7 if cap == "hard" else None]
+    densifier.cap = "curve"  # follows its own
+    densifier.allowance(at(600, range(count)))  # type: ignore[arg-type]
+    assert len(asked) == 1

@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from gsbench.densify import ADC, MCMC, MRNF, DensifyContext, NoDensifier, Volumetric
-from gsbench.densify.base import revised_logits
+from gsbench.densify.base import faded, quantile, revised_logits
 from gsbench.densify.budget import Budgeted
-from gsbench.densify.mcmc import shared_opacity
+from gsbench.densify.mcmc import shared_opacity, spread_out
 from gsbench.errors import InputError
 from gsbench.gaussians.paper_values import LearningRates
 from gsbench.gaussians.trainable import TrainableGaussians
@@ -34,6 +34,45 @@ def test_revised_opacity_of_two_children_equals_the_parent() -> None:
     logits = torch.tensor([-4.0, 0.0, 3.0], dtype=torch.float64)
     child = torch.sigmoid(revised_logits(logits))
     torch.testing.assert_close(1 - (1 - child) ** 2, torch.sigmoid(logits))
+    assert revised_logits(torch.tensor([-40.0])).sigmoid().item() == pytest.approx(1e-6)
+    torch.testing.assert_close(faded(logits, 0.3).sigmoid(), 0.3 * logits.sigmoid())
+
+
+@pytest.mark.parametrize("share", [0.0, 0.1, 0.37, 0.5, 1.0])
+def test_quantiles_are_those_of_numpy(share: float) -> None:
+    values = np.sort(np.random.default_rng(0).normal(size=8))
+    for count in (1, 2, 8):
+        assert quantile(torch.from_numpy(values[:count]), share) == pytest.approx(np.quantile(values[:count], share))
+
+
+@pytest.mark.parametrize("densifier", [MCMC(initial_opacity=0.2), MRNF(initial_opacity=0.2)])
+def test_a_training_begins_with_small_gaussians_of_one_opacity(densifier: MCMC | MRNF) -> None:
+    initial = random_gaussians(5)
+    gaussians = densifier.prepare(initial)
+    torch.testing.assert_close(gaussians.opacities, torch.full((5,), 0.2, dtype=torch.float64))
+    torch.testing.assert_close(gaussians.scales, 0.1 * initial.scales)
+    assert gaussians.means is initial.means
+    torch.testing.assert_close(spread_out(initial, 0.7, 3.0).scales, 3 * initial.scales)
+
+
+def test_the_term_of_mcmc_in_the_loss() -> None:
+    gaussians = random_gaussians(5)
+    expected = 0.3 * float(gaussians.opacities.mean()) + 0.05 * float(gaussians.scales.mean())
+    assert float(MCMC(opacity_weight=0.3, scale_weight=0.05).regularizer(gaussians)) == pytest.approx(expected)
+
+
+def test_mcmc_leaves_a_model_alone_whose_gaussians_are_all_dead() -> None:
+    densifier, trainable = mcmc_state(8, max_gaussians=50, growth=0.5)
+    trainable.values.opacity_logits.data[:] = -9.0
+    event = densifier.refine(600, trainable, torch.Generator())
+    assert (event.relocated, event.added, event.after) == (0, 0, 8)
+
+
+def test_mcmc_shares_an_opacity_of_one_as_a_finite_logit() -> None:
+    densifier, trainable = mcmc_state(4, max_gaussians=50, growth=5.0)
+    trainable.values.opacity_logits.data[:] = 60.0
+    densifier.refine(600, trainable, torch.Generator())
+    assert float(trainable.values.opacities.detach().max()) == pytest.approx(1 - 1e-6, abs=1e-12)
 
 
 def mcmc_state(count: int = 40, **options: object) -> tuple[MCMC, TrainableGaussians]:

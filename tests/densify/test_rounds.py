@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from gsbench.densify import ADC, Densifier, DensifyContext, Volumetric
+from gsbench.densify import ADC, MCMC, MRNF, Densifier, DensifyContext, Refinement, Volumetric
 from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.paper_values import LearningRates
 from gsbench.gaussians.trainable import TrainableGaussians
 from gsbench.raster.base import RenderOutput
+from gsbench.train.options import TrainConfig
 from tests.densify import restatement
 from tests.gaussians.helpers import random_gaussians
 
@@ -297,3 +298,47 @@ def test_refinements_of_the_paper_schedule() -> None:
     assert due == list(range(600, 15_000, 100))
     assert len(due) == 144
     assert resets == [3000, 6000, 9000, 12_000]
+
+
+def test_windows_are_those_of_a_training() -> None:
+    window = TrainConfig.densify_start, TrainConfig.densify_stop, TrainConfig.densify_interval
+    assert (ADC.start, ADC.stop, ADC.interval) == window == (500, 15_000, 100)
+    assert (MCMC.start, MCMC.stop, MCMC.interval) == (500, TrainConfig.mcmc_stop, 100)
+    assert (MRNF.start, MRNF.stop, MRNF.interval) == (0, 25_000, 200)
+    assert ADC.opacity_reset_interval == TrainConfig.opacity_reset_interval == 3000
+
+
+@pytest.mark.parametrize(("white", "resets"), [(False, [3000, 6000]), (True, [500, 3000, 6000])])
+def test_before_a_white_background_opacities_are_reset_at_the_start_too(white: bool, resets: list[int]) -> None:
+    densifier = ADC(stop=9000)
+    trainable, _ = prepared(densifier, 0, count=3)
+    densifier.context = DensifyContext(EXTENT, white_background=white)
+    found = []
+    for step in (499, 500, 501, 3000, 4500, 6000, 9000):
+        refinement = Refinement(step, trainable, torch.Generator(), event=None)  # type: ignore[arg-type]
+        found += [step] if densifier.reset_opacity in densifier.rules(refinement) else []
+    assert found == resets
+
+
+def test_gradients_and_radii_are_gathered_until_the_window_ends() -> None:
+    densifier = ADC(stop=800)
+    densifier.begin(random_gaussians(3), DensifyContext(EXTENT))
+    shown = [(1, [4, 0, 2]), (799, [3, 5, 2]), (800, [9, 9, 9])]  # the last is after the window
+    for step, radii in shown:
+        points = torch.zeros(3, 2, dtype=torch.float64, requires_grad=True)
+        points.grad = torch.tensor([[3.0, 4.0]] * 3, dtype=torch.float64)
+        densifier.observe(step, RenderOutput(torch.empty(0), torch.empty(0), torch.tensor(radii).int(), points))
+    assert densifier.statistics["max_radii"].tolist() == [4, 5, 2]
+    assert densifier.statistics["visible_count"].tolist() == [2, 1, 2]
+    assert densifier.statistics["gradient_sum"].tolist() == [10.0, 5.0, 10.0]
+    assert densifier.mean_gradient().tolist() == [5.0] * 3
+
+
+def test_the_huge_are_pruned_after_the_first_reset_by_size_or_by_radius() -> None:
+    densifier = ADC(prune_screen_radius=20.0)
+    densifier.begin(random_gaussians(4), DensifyContext(EXTENT))
+    densifier.statistics["max_radii"] = torch.tensor([0, 20, 21, 0], dtype=torch.int32)
+    log_scales = torch.tensor([[-9.0, -9.0, 0.39], [-9.0] * 3, [-9.0] * 3, [-9.0, 0.41, -9.0]])
+    log_scales[[0, 3], [2, 1]] = log_scales[[0, 3], [2, 1]].log()  # of 0.1 times the extent of 4: just below and above
+    assert densifier.huge(3000, log_scales).tolist() == [False] * 4
+    assert densifier.huge(3001, log_scales).tolist() == [False, False, True, True]

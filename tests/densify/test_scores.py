@@ -228,6 +228,9 @@ def test_taming_prunes_half_as_many_draws_as_there_are_to_prune() -> None:
     assert 0 < event.pruned_opacity <= 20
     trainable, _ = started(densifier, 1)
     trainable.values.opacity_logits.data[:40] = -9.0
+    assert densifier.refine(500 + 2700, trainable, torch.Generator().manual_seed(0)).pruned_opacity > 0
+    trainable, _ = started(densifier, 1)
+    trainable.values.opacity_logits.data[:40] = -9.0
     late = densifier.refine(600 + 2700, trainable, torch.Generator().manual_seed(0))
     assert late.pruned_opacity == late.pruned_size == 0  # after 27 rounds no more
     assert densifier.statistics["score"].shape == (COUNT,)

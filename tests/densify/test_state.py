@@ -50,7 +50,13 @@ def test_statistics_and_lineage_follow_every_edit(seed: int) -> None:
         assert densifier.lineage.ids.tolist() == [row[0] for row in rows]
         assert densifier.statistics["sum"].tolist() == [row[1] for row in rows]
         assert densifier.statistics["seen"].tolist() == [row[2] for row in rows]
-    assert densifier.lineage.state_dict()["parents"].tolist() == list(parent_of.values())
+    saved = densifier.lineage.state_dict()
+    assert saved["parents"].tolist() == list(parent_of.values())
+    born = len(parent_of) - 12
+    assert saved["causes"].tolist() == [Cause.INITIAL] * 12 + [Cause.CLONE] * born
+    assert saved["steps"].tolist() == [0] * 12 + [7] * born
+    assert sum(densifier.lineage.causes_of_living().values()) == len(rows)
+    assert densifier.lineage.causes_of_living()[Cause.CLONE.key] == sum(row[0] >= 12 for row in rows)
     assert len(refinement.gaussians) == len(rows)
 
 

@@ -157,3 +157,23 @@ def test_admit_takes_the_best_and_says_how_many_it_refused() -> None:
     assert allowance(10, 10, "soft") is None
     assert allowance(11, 10, "soft") == 0
     assert allowance(11, None, "hard") is None
+
+
+def test_the_volume_rule_can_have_a_window_of_its_own() -> None:
+    own = Volumetric(volume_start=1000, volume_stop=2000, volume_interval=200)
+    assert [step for step in range(100, 3000, 100) if own.volume_due(step)] == [1200, 1400, 1600, 1800]
+    as_adc = Volumetric(start=1000, stop=1400)
+    assert [step for step in range(50, 3000, 50) if as_adc.volume_due(step)] == [1100, 1200, 1300]
+
+
+@pytest.mark.parametrize("mode", ["quantile", "auto"])
+def test_no_volume_is_above_the_threshold_of_none(mode: str) -> None:
+    assert Volumetric(threshold_mode=mode).log_threshold(torch.zeros(0)) == math.inf  # type: ignore[arg-type]
+
+
+def test_limits_by_hand() -> None:
+    assert [allowance(12, 10, cap) for cap in ("hard", "curve", "soft")] == [0, 0, 0]  # type: ignore[arg-type]
+    assert [allowance(12, 10, cap) for cap in ("freeze", "governor")] == [None, None]  # type: ignore[arg-type]
+    assert allowance(5, None, "hard") is None
+    admitted, refused = admit(torch.ones(4, dtype=torch.bool), torch.tensor([1.0, 2.0, 3.0, 4.0]), 2, 5)
+    assert (admitted.tolist(), refused) == ([False, False, True, True], 2)

@@ -153,7 +153,7 @@ class ADC(Budgeted):
         """Clone small Gaussians and split large ones if their mean gradient reaches the threshold."""
         gaussians, event = refinement.gaussians, refinement.event
         over, large = self.candidates(refinement)
-        selected, blocked = self.choose(refinement, over, max(1, self.split_children - 1))
+        selected, blocked = self.choose(refinement, over, self.split_children - 1)
         event.blocked_by_cap += blocked
         event.cloned += self.clone(refinement, selected & ~large, revised_opacity=self.revised_opacity)
         # Cloning appended Gaussians: extend the mask to them. A clone is not split in its first round, as in 3DGS.

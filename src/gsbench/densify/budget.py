@@ -39,7 +39,7 @@ def admit(candidates: Tensor, score: Tensor, gain: int, allowed: int | None) -> 
     count = int(candidates.sum())
     if allowed is None or count * gain <= allowed:
         return candidates, 0
-    num_admitted = allowed // gain if gain > 0 else count
+    num_admitted = allowed // gain
     index = candidates.nonzero().squeeze(-1)  # [C]
     best = index[torch.sort(score[index], descending=True, stable=True).indices[:num_admitted]]
     admitted = torch.zeros_like(candidates)
