@@ -7,7 +7,8 @@ from collections.abc import Iterator
 import pytest
 import torch
 
-from gsbench.train.device import flush_denormals, select_device
+from gsbench.errors import InputError
+from gsbench.train.device import flush_denormals, free_bytes, select_device
 
 
 @pytest.fixture
@@ -20,6 +21,39 @@ def rounding() -> Iterator[None]:
     yield
     for backend, value in zip(backends, before, strict=True):
         backend.allow_tf32 = value
+
+
+@pytest.mark.parametrize(
+    ("name", "gpus", "answer"),
+    [
+        ("auto", 0, "cpu"),
+        ("auto", 2, "cuda"),
+        ("cpu", 2, "cpu"),
+        ("cuda", 1, "cuda"),
+        ("cuda:1", 2, "cuda:1"),
+        ("cuda:2", 2, "there are 2 CUDA devices"),
+        ("cuda", 0, "torch finds no CUDA device here"),
+        ("gpu", 1, "is not known to torch"),
+    ],
+)
+def test_a_device_is_chosen_or_refused(
+    rounding: None, name: str, gpus: int, answer: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: gpus > 0)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: gpus)
+    if " " in answer:
+        with pytest.raises(InputError, match=f"device={name}.*{answer}"):
+            select_device(name)
+    else:
+        assert select_device(name) == torch.device(answer)
+
+
+def test_what_torch_has_reserved_and_does_not_use_is_free(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (1000, 9999))
+    monkeypatch.setattr(torch.cuda, "memory_reserved", lambda device: 50)
+    monkeypatch.setattr(torch.cuda, "memory_allocated", lambda device: 20)
+    assert free_bytes(torch.device("cuda")) == 1030
+    assert free_bytes(torch.device("cpu")) is None
 
 
 def test_no_gpu_rounds_float32_to_tf32(rounding: None, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,7 +7,6 @@ import pytest
 import torch
 
 from gsbench.scene.types import View
-from gsbench.train.device import free_bytes
 from gsbench.train.views import Targets
 from tests.gaussians.helpers import front_camera
 
@@ -37,7 +36,3 @@ def test_images_without_room_are_the_same(views: list[View]) -> None:
     targets = Targets(views, CPU, budget=0)
     for index, view in enumerate(views):
         assert np.array_equal(targets.get(index).numpy(), view.image)
-
-
-def test_a_cpu_has_no_memory_of_its_own() -> None:
-    assert free_bytes(CPU) is None

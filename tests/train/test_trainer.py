@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 import json
+import math
+import time
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 
@@ -21,7 +26,7 @@ from gsbench.train import trainer
 from gsbench.train.checkpoint import CheckpointWriter
 from gsbench.train.options import TrainConfig
 from gsbench.train.trainer import Status, Trainer, snapshot_file
-from gsbench.train.views import CameraOrder, generator
+from gsbench.train.views import STREAMS, CameraOrder, generator, generators
 
 CPU = torch.device("cpu")
 
@@ -292,3 +297,126 @@ def test_defaults_are_those_of_3dgs() -> None:
     }
     defaults = TrainConfig(name="paper")
     assert {name: getattr(defaults, name) for name in published} == published
+
+
+def new(scene: Scene, truth: Gaussians, rasterizer: Rasterizer, densifier: Densifier, **changes: object) -> Trainer:
+    return Trainer(scene, cloud(truth), densifier, rasterizer, options(**changes), 0)
+
+
+@pytest.mark.parametrize("before", [False, True])
+def test_the_optimiser_steps_after_or_before_a_refinement(
+    before: bool, tiny_scene: Scene, truth: Gaussians, rasterizer: Rasterizer, tmp_path: Path
+) -> None:
+    seen = []
+
+    class Watching(NoDensifier):
+        def refine(self, step: int, gaussians: object, rng: torch.Generator) -> None:
+            seen.append(gaussians.values.means.detach().clone())  # type: ignore[attr-defined]
+
+    training = new(tiny_scene, truth, rasterizer, Watching(), step_after_refine=before)
+    first = training.gaussians.values.means.detach().clone()
+    training.iterate(tmp_path)
+    assert torch.equal(seen[0], first) is not before
+    assert torch.equal(training.gaussians.values.means, seen[0]) is before
+
+
+@pytest.mark.parametrize("visible_adam", [False, True])
+def test_only_visible_gaussians_are_updated_if_asked(
+    visible_adam: bool, tiny_scene: Scene, truth: Gaussians, rasterizer: Rasterizer, tmp_path: Path
+) -> None:
+    training = new(tiny_scene, truth, rasterizer, NoDensifier(), visible_adam=visible_adam, sh_interval=1)
+    given = []
+    training.gaussians.optimizer_step = lambda *arguments: given.append(arguments)  # type: ignore[method-assign]
+    training.iterate(tmp_path)
+    ((degree, visible),) = given
+    assert degree == 1
+    assert (visible is not None) is visible_adam
+
+
+@pytest.mark.parametrize(("background", "white"), [([1.0, 1.0, 1.0], True), ([1.0, 1.0, 0.9], False)])
+def test_a_densifier_is_told_of_a_white_background(
+    background: list[float], white: bool, tiny_scene: Scene, truth: Gaussians, rasterizer: Rasterizer
+) -> None:
+    context = new(tiny_scene, truth, rasterizer, NoDensifier(), background=background).context
+    assert context.white_background is white
+    assert context.extent == tiny_scene.extent
+    assert context.limit is None
+
+
+@pytest.mark.parametrize(("spare", "resident"), [(0, True), (-2, False)])
+def test_images_may_take_half_of_the_free_memory(
+    spare: int,
+    resident: bool,
+    tiny_scene: Scene,
+    truth: Gaussians,
+    rasterizer: Rasterizer,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    size = sum(view.image.size for view in tiny_scene.train)
+    monkeypatch.setattr(trainer, "free_bytes", lambda _: 2 * size + spare)
+    assert new(tiny_scene, truth, rasterizer, NoDensifier()).targets.resident is resident
+
+
+def clocked(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A clock that goes on by a second each time the trainer looks at it."""
+    seconds = itertools.count()
+    monkeypatch.setattr(
+        trainer, "time", SimpleNamespace(perf_counter=lambda: float(next(seconds)), monotonic=time.monotonic)
+    )
+
+
+def test_seconds_and_rates_go_on_from_a_checkpoint(
+    tiny_scene: Scene, truth: Gaussians, rasterizer: Rasterizer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The trainer looks at the clock twice in an iteration that is logged."""
+    settings, shown = {"iterations": 5, "log_every": 1, "checkpoint_every": 2}, []
+
+    def look(status: Status) -> None:
+        shown.append((status.step, status.num_gaussians, status.iterations_per_second))
+        if len(shown) == 3:
+            raise KeyboardInterrupt
+
+    clocked(monkeypatch)
+    with pytest.raises(KeyboardInterrupt):
+        new(tiny_scene, truth, rasterizer, NoDensifier(), **settings).run(tmp_path, look)
+    clocked(monkeypatch)
+    new(tiny_scene, truth, rasterizer, NoDensifier(), **settings).run(tmp_path, look)
+    metrics = records(tmp_path / "metrics.jsonl")
+    assert [(r["step"], r["seconds"], r["num_gaussians"]) for r in metrics] == [(k, 2 * k, 80) for k in range(1, 6)]
+    assert shown == [(k, 80, 0.5) for k in (1, 2, 3, 3, 4, 5)]
+
+
+def test_a_time_budget_ends_with_the_iteration_that_reaches_it_and_logs_it(
+    tiny_scene: Scene, truth: Gaussians, rasterizer: Rasterizer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clocked(monkeypatch)
+    train(tiny_scene, truth, rasterizer, tmp_path, NoDensifier(), max_seconds=3.0, log_every=100)
+    assert [record["step"] for record in records(tmp_path / "metrics.jsonl")] == [3]
+
+
+def test_the_last_iteration_is_logged_too(
+    tiny_scene: Scene, truth: Gaussians, rasterizer: Rasterizer, tmp_path: Path
+) -> None:
+    train(tiny_scene, truth, rasterizer, tmp_path, NoDensifier(), iterations=7, log_every=3)
+    assert [record["step"] for record in records(tmp_path / "metrics.jsonl")] == [3, 6, 7]
+
+
+def test_a_model_without_gaussians_or_out_of_range_ends_the_training(
+    tiny_scene: Scene, truth: Gaussians, rasterizer: Rasterizer, tmp_path: Path
+) -> None:
+    class Emptying(NoDensifier):
+        def rules(self, refinement: object) -> list:
+            return [lambda refinement: self.remove(refinement, torch.ones(len(truth), dtype=torch.bool))]
+
+    with pytest.raises(TrainingError, match="no Gaussian was left after iteration 1"):
+        new(tiny_scene, truth, rasterizer, Emptying()).iterate(tmp_path)
+    broken = new(tiny_scene, truth, rasterizer, NoDensifier())
+    broken.gaussians.values.log_scales.data[0] = math.inf
+    with pytest.raises(TrainingError, match=r"^iteration 1: .*; the last good state is the newest checkpoint in "):
+        broken.iterate(tmp_path)
+
+
+def test_every_stream_of_random_numbers_is_seeded_by_numpy() -> None:
+    for stream, name in enumerate(STREAMS):
+        seed = int(np.random.SeedSequence([3, stream]).generate_state(1, np.uint64)[0]) // 2
+        assert generators(3)[name].initial_seed() == generator(3, stream).initial_seed() == seed

@@ -6,6 +6,7 @@ import torch
 
 from gsbench.densify import NoDensifier
 from gsbench.densify.scores import blended_sums
+from gsbench.eval.ssim import ssim_map
 from gsbench.gaussians.model import Gaussians
 from gsbench.raster.reference import ReferenceRasterizer
 from gsbench.scene.types import Scene
@@ -29,6 +30,11 @@ def test_views_are_rendered_and_measured_as_in_training(tiny_scene: Scene, truth
         expected, _, _ = photometric_loss(own.detach(), torch.from_numpy(view.image))
         assert views.loss(index, own) == expected
         assert not views.loss(index, own).requires_grad
+        photograph = torch.from_numpy(view.image) / 255
+        dissimilar = views.dissimilarity(index, own.detach())
+        torch.testing.assert_close(dissimilar, (1 - ssim_map(own.detach(), photograph).mean(0)).clamp_min(0))
+        assert dissimilar.shape == view.image.shape[:2]
+        assert float(views.dissimilarity(index, photograph).abs().max()) < 1e-6
 
 
 def test_looking_at_a_view_leaves_no_gradient(tiny_scene: Scene, truth: Gaussians) -> None:
