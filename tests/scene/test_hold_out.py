@@ -128,3 +128,5 @@ def test_too_many_sectors_and_photographs_without_cameras_are_refused() -> None:
         hold_out(NAMES[:5], SplitRule(split="sector"), cameras=cameras)
     with pytest.raises(InputError, match="needs the cameras"):
         hold_out(NAMES, SplitRule(split="sector"))
+    with pytest.raises(InputError, match="the last is 7"):
+        hold_out(NAMES, SplitRule(sector=8))

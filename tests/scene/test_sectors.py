@@ -56,6 +56,14 @@ def test_a_ring_is_cut_by_azimuth_whatever_its_names_and_gauge(seed: int, sector
     assert all(is_cyclic_run(part, around) for part in parts)
 
 
+def test_azimuths_do_not_depend_on_heights_and_are_rounded_to_a_millionth_of_a_degree() -> None:
+    angles = np.radians([*range(0, 360, 20), -3e-7])
+    eyes = [np.array([3 * np.cos(a), 3 * np.sin(a), 1.0 + (k % 2) * (k < 18)]) for k, a in enumerate(angles)]
+    found = arrange_cameras([looking(eye, np.zeros(3)) for eye in eyes])
+    assert found.order == (0, 18, *range(1, 18))
+    assert "gaps up to 20 degrees" in found.description
+
+
 def test_an_open_ring_begins_after_its_gap() -> None:
     cameras = ring([100.0, 60.0, 20.0, 140.0, 180.0, 220.0, 260.0])  # nothing from 260 to 380
     assert [round(np.degrees(np.arctan2(*cameras[k].center[1::-1])) % 360) for k in arrange_cameras(cameras).order] == [
@@ -75,6 +83,10 @@ def test_parallel_and_outward_looking_cameras_are_cut_by_planes() -> None:
     row = [looking(place, place + np.array([0.0, 5.0, 0.0])) for place in places]
     assert "one direction" in arrange_cameras(row).description
     assert arrange_cameras(row).order == (0, 2, 3, 1)
+    for side in (1, -1):  # the second camera fixes the direction, as the first stands at the mean
+        places = [np.array([side * x, 0.0, 0.0]) for x in (0.0, 1.0, -1.0, 2.0, -2.0)]
+        row = [looking(place, place + np.array([0.0, 5.0, 0.0])) for place in places]
+        assert arrange_cameras(row).order == (3, 1, 0, 2, 4)
     outward = [
         looking(camera.center, 2 * camera.center - [0, 0, 1.5]) for camera in ring([0.0, 90.0, 180.0, 270.0, 45.0])
     ]

@@ -92,7 +92,7 @@ def test_what_was_applied_is_undone_for_cameras_and_points(tmp_path: Path) -> No
     folder = write(
         tmp_path / "moved",
         frames=frames,
-        applied_transform=applied.tolist(),
+        applied_transform=[*applied.tolist(), [0, 0, 0, 1]],
         applied_scale=scale,
         ply_file_path="p.ply",
     )
@@ -243,6 +243,9 @@ def test_a_line_of_pixels_is_a_picture(tmp_path: Path) -> None:
     for k in range(len(EYES)):
         Image.new("RGB", (1, 30)).save(folder / "images" / f"{k}.png")
     assert {camera.width for camera, *_ in read_transforms(folder).images.values()} == {1}
+    for one_side in ({"w": None}, {"h": None}):
+        images = read_transforms(write(tmp_path / "in", **one_side)).images
+        assert {(camera.width, camera.height) for camera, *_ in images.values()} == {(40, 30)}
 
 
 def test_no_file_and_a_name_without_a_decision(tmp_path: Path) -> None:

@@ -75,7 +75,7 @@ def along_principal_axis(centers: Array) -> Array:
     coordinates: Array = offsets @ axes[0]
     # The SVD leaves the sign of the axis open: the first camera that is not at the mean fixes it.
     off_center = np.abs(coordinates) > 1e-9 * (np.abs(coordinates).max() + 1e-300)
-    return -coordinates if coordinates[np.argmax(off_center)] > 0 else coordinates
+    return -coordinates if coordinates[np.argmax(off_center)] > 0.0 else coordinates
 
 
 def point_looked_at(cameras: Sequence[Camera], centers: Array) -> Array | None:

@@ -202,7 +202,7 @@ def nearest_rotation(matrix: Array, what: str) -> Array:
     """The rotation nearest to ``matrix`` [3, 3]; raises InputError if ``matrix`` is far from a rotation."""
     left, _, right = np.linalg.svd(matrix)
     nearest: Array = left @ right
-    if np.abs(nearest - matrix).max() > ROTATION_TOLERANCE or np.linalg.det(matrix) < 0:
+    if np.abs(nearest - matrix).max() > ROTATION_TOLERANCE or np.linalg.det(matrix) < 0.0:
         raise InputError(f"{what} must only rotate and move, but it scales, shears or mirrors")
     return nearest
 
