@@ -204,6 +204,8 @@ def test_the_file_is_among_what_a_trial_is_made_of(tmp_path: Path) -> None:
         (lambda d: d["frames"][1].pop("transform_matrix"), "lacks 'frames.1.transform_matrix'"),
         (lambda d: d["frames"][1].update(transform_matrix=[[1, 0, 0, 0]]), r"frames\.1\.transform_matrix is "),
         (lambda d: d["frames"][1]["transform_matrix"][0].pop(), r"frames\.1\.transform_matrix\.0 is "),
+        (lambda d: d["frames"][1]["transform_matrix"][0].append(0), r"frames\.1\.transform_matrix\.0 is "),
+        (lambda d: d["frames"][1]["transform_matrix"].append([0] * 4), r"frames\.1\.transform_matrix is "),
         (lambda d: d["frames"][1]["transform_matrix"].__setitem__(0, [2, 0, 0, 0]), "scales, shears or mirrors"),
         (lambda d: d["frames"][1]["transform_matrix"].__setitem__(2, [0.0] * 4), "scales, shears or mirrors"),
         (

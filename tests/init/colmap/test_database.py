@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +14,7 @@ from PIL import Image
 from gsbench.init import Sfm
 from gsbench.init.colmap import database as made
 from gsbench.init.colmap import sift
+from gsbench.logs import Progress
 
 SIZES = {"a.png": (40, 30), "b.png": (40, 30), "c.png": (40, 32), "left/a.png": (40, 30), "left/b.png": (40, 30)}
 
@@ -194,3 +197,34 @@ def test_the_references_cameras_are_known_and_have_its_placed_images() -> None:
     assert [(camera.mean_focal_length(), camera.width) for camera, _ in groups] == [(60.0, 80), (50.0, 40)]
     assert all(camera.has_prior_focal_length for camera, _ in groups)
     assert not any(camera.has_prior_focal_length for camera in model.cameras.values())  # copies
+
+
+@pytest.mark.parametrize(("count", "processes", "size"), [(48, 2, 10), (10, 1, 3), (4, 8, 2), (200, 1, 16), (33, 3, 6)])
+def test_parts_are_small_enough_for_six_a_process(count: int, processes: int, size: int) -> None:
+    """Blocks of ``size`` images: sqrt(12 processes) of them, rounded up, of 2 to 16 images each."""
+    assert sift._block_size(count, processes) == size
+
+
+def test_matching_is_divided_over_processes_and_tells_one_sum(database: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    jobs, told = [], []
+
+    def match(function: object, job: sift.MatchingJob, progress: Progress, what: str) -> None:
+        """A process that finds one match in its first pair."""
+        jobs.append(job)
+        assert made.image_ids(job.template) == {str(number): number for number in range(1, 6)}
+        shutil.copyfile(job.template, job.result)
+        with pycolmap.Database.open(job.result) as opened:
+            opened.write_matches(*job.parts[0][0], np.array([[3, 4]], dtype=np.uint32))
+        progress("match", sum(map(len, job.parts)), None)
+
+    monkeypatch.setattr(sift, "run_with_progress", match)
+    pairs = list(itertools.combinations(SIZES, 2))
+    sift.match_sift(database, pairs, Sfm(), 3, lambda phase, done, total: told.append((phase, done, total)))
+    assert (told[0], max(told)) == (("match", 0, 10), ("match", 10, 10))
+    assert len({job.result for job in jobs}) == len(jobs) == 3
+    divided = [pair for job in jobs for part in job.parts for pair in part]
+    assert sorted(divided) == list(itertools.combinations(range(1, 6), 2))
+    with pycolmap.Database.open(database) as opened:
+        found, _ = opened.read_all_matches()
+    assert {pycolmap.pair_id_to_image_pair(pair) for pair in found} == {job.parts[0][0] for job in jobs}
+    assert sorted(path.name for path in database.parent.iterdir()) == ["database.db", "images"]
