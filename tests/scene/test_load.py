@@ -127,6 +127,19 @@ def test_downscaled_and_distorted_views_come_back_from_the_cache(make_scene, tmp
     assert len(done) == 4  # but on the cameras
 
 
+def test_a_set_without_its_cameras_is_prepared_again(make_scene, tmp_path: Path):
+    capture = read_colmap("toy", make_scene())
+    options = {"downscale": 2, "resample": "area"}
+    first = load_scene(capture, capture.model, tmp_path / "cache", **options)
+    (file,) = (tmp_path / "cache").rglob("cameras.json")
+    before = file.read_bytes()
+    file.unlink()
+    again = load_scene(capture, capture.model, tmp_path / "cache", **options)
+    assert file.read_bytes() == before
+    np.testing.assert_array_equal(first.train[0].image, again.train[0].image)
+    assert [folder.name for folder in (tmp_path / "cache").iterdir()] == [file.parent.name]
+
+
 def test_centred_moves_the_principal_point_only(make_scene, tmp_path: Path):
     capture = read_colmap("toy", make_scene(params=[50, 51, 18, 16]))
     used = load_scene(capture, capture.model, tmp_path)

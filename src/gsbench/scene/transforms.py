@@ -234,7 +234,7 @@ def _camera(image: Path, path: Path, record: TransformsRecord, frame: FrameRecor
     if focal_x is None and angle is not None and 0 < angle < math.pi:
         focal_x = width / (2 * math.tan(angle / 2))
     focal_y = value("fl_y") or focal_x
-    if focal_x is None or focal_y is None or min(focal_x, focal_y) <= 0:
+    if focal_x is None or focal_y is None or min(focal_x, focal_y) <= 0.0:
         raise InputError(f"{where}: no focal length: fl_x, or camera_angle_x between 0 and pi, must be given")
     cx, cy = value("cx"), value("cy")
     center = (width / 2 if cx is None else cx, height / 2 if cy is None else cy)

@@ -31,6 +31,8 @@ LAYOUT = build_layout(0)
 SOLIDS = [LAYOUT.kind, LAYOUT.center, LAYOUT.rotation, LAYOUT.size]
 SHAPES = {
     "box": (BOX, (0.5, 0.8, 0.3)),
+    "long box": (BOX, (0.8, 0.3, 0.5)),
+    "high box": (BOX, (0.3, 0.5, 0.8)),
     "sphere": (SPHERE, (0.7, 9.0, 9.0)),
     "tube": (TUBE, (0.6, 0.4, 0.0)),
     "tube with a bore": (TUBE, (0.8, 0.5, 0.5)),
