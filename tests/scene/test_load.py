@@ -12,13 +12,15 @@ import pytest
 from PIL import Image
 
 from gsbench.errors import InputError
+from gsbench.logs import no_progress
 from gsbench.scene.colmap import read_model
-from gsbench.scene.load import ImageToPrepare, load_scene, prepare_all, undistort
+from gsbench.scene.load import Downscaling, ImageToPrepare, load_scene, prepare_all, undistort
 from gsbench.scene.options import SplitRule
 from gsbench.scene.readers import read_colmap
 from gsbench.scene.types import CameraModel
 
 WIDTH, HEIGHT = 200, 150
+UNCHANGED = Downscaling(1, None, "lanczos")
 MODELS = {
     "SIMPLE_RADIAL": [150, 100, 75, 0.08],
     "RADIAL": [150, 100, 75, -0.1, 0.02],
@@ -75,7 +77,23 @@ def test_panoramas_are_refused(tmp_path: Path):
         undistort(np.zeros((HEIGHT, WIDTH, 3), dtype=np.uint8), camera)
     Image.new("RGB", (WIDTH, HEIGHT)).save(tmp_path / "a.png")
     with pytest.raises(InputError, match="EQUIRECTANGULAR"):  # and so from the isolated process
-        prepare_all([ImageToPrepare(tmp_path / "a.png", camera, tmp_path / "b.png")])
+        prepare_all([ImageToPrepare(tmp_path / "a.png", camera, tmp_path / "b.png", UNCHANGED)], no_progress)
+
+
+def test_images_are_prepared_sixteen_at_a_time_in_their_order(tmp_path: Path):
+    images, told = [], []
+    for width in range(20, 56):
+        Image.new("RGB", (width, 10)).save(tmp_path / f"{width}.png")
+        camera = CameraModel("PINHOLE", width, 10, (5.0, 6.0, width / 2, 4.0))
+        target = tmp_path / "made" / f"{width}.png"
+        images.append(ImageToPrepare(tmp_path / f"{width}.png", camera, target, Downscaling(2, None, "area")))
+    cameras = prepare_all(images, lambda *state: told.append(state))
+    assert told == [("views", done, 36) for done in (16, 32, 36)]
+    for image, camera in zip(images, cameras, strict=True):
+        with Image.open(image.target) as made:
+            assert made.size == (camera.width, camera.height) == ((image.camera.width + 1) // 2, 5)
+        assert (camera.fy, camera.cy) == (3.0, 2.0)
+        assert camera.cx == pytest.approx(camera.width / 2)
 
 
 def test_untouched_views_are_the_files(make_scene, tmp_path: Path):
@@ -101,7 +119,7 @@ def test_downscaled_and_distorted_views_come_back_from_the_cache(make_scene, tmp
     assert done == [("views", 6, 6)]
     second = load_scene(capture, capture.model, tmp_path / "cache", **options)
     assert done == [("views", 6, 6)]  # nothing was prepared again
-    third = load_scene(capture, capture.model, tmp_path / "other", threads=1, **options)
+    third = load_scene(capture, capture.model, tmp_path / "other", **options)
     for scene in (second, third):
         for a, b in zip(first.train, scene.train, strict=True):
             np.testing.assert_array_equal(a.image, b.image)

@@ -45,6 +45,7 @@ from gsbench.scene.images import (
 from gsbench.scene.options import MIN_IMAGES, downscaled_size
 from gsbench.scene.types import Camera, CameraModel, Capture, Scene, View, to_pinhole
 from gsbench.system.isolate import CrashError, run_isolated
+from gsbench.system.resources import available_threads
 from gsbench.words import some_of
 
 log = logging.getLogger(__name__)
@@ -60,9 +61,9 @@ _CHUNK = 16  # images per isolated process: limits what a crash loses, and progr
 class Downscaling:
     """Settings of shrinking images (see `downscaled_size`)."""
 
-    downscale: int = 1
-    max_size: int | None = None
-    resample: Resample = "lanczos"
+    downscale: int
+    max_size: int | None
+    resample: Resample
 
     def final_size(self, width: int, height: int) -> tuple[int, int]:
         """The final size in px of an image of ``width`` x ``height`` px."""
@@ -77,7 +78,6 @@ def load_scene(
     max_size: int | None = None,
     resample: Resample = "lanczos",
     principal_point: PrincipalPoint = "used",
-    threads: int = 2,
     progress: Progress = no_progress,
     made_by: Mapping[str, str | None] = MappingProxyType({}),
 ) -> Scene:
@@ -96,7 +96,7 @@ def load_scene(
     downscaling = Downscaling(downscale, max_size, resample)
     folder = Path(cache_dir) / _cache_key(capture, Path(model_dir), downscaling, made_by)
     if not (folder / CAMERAS_FILE).is_file():
-        _prepare_views(folder, capture, Path(model_dir), downscaling, threads, progress)
+        _prepare_views(folder, capture, Path(model_dir), downscaling, progress)
     entries = json.loads((folder / CAMERAS_FILE).read_text(encoding="utf-8"))["views"]
     _report_unregistered(capture, set(entries))
 
@@ -118,7 +118,7 @@ def load_scene(
         return View(name, camera, image, mask_of(name))
 
     names = [name for name in capture.image_names if name in entries]
-    with ThreadPoolExecutor(max_workers=max(1, threads)) as pool:
+    with ThreadPoolExecutor(available_threads()) as pool:
         views = list(pool.map(view, names))
     held_out = set(capture.test_names)
     return Scene(
@@ -129,7 +129,7 @@ def load_scene(
 
 
 def _prepare_views(
-    folder: Path, capture: Capture, model_dir: Path, downscaling: Downscaling, threads: int, progress: Progress
+    folder: Path, capture: Capture, model_dir: Path, downscaling: Downscaling, progress: Progress
 ) -> None:
     """Prepare all registered images of the capture and publish them as ``folder``."""
     cameras = _model_cameras(capture, model_dir)
@@ -149,7 +149,7 @@ def _prepare_views(
                 changes[name] = ImageToPrepare(capture.images / name, model, work / file, downscaling, mask)
             else:
                 entries[name] |= _intrinsics(to_pinhole(model))
-        for name, camera in zip(changes, prepare_all(list(changes.values()), threads, progress), strict=True):
+        for name, camera in zip(changes, prepare_all(list(changes.values()), progress), strict=True):
             entries[name] |= _intrinsics(camera)
         document = {"version": CACHE_VERSION, "scene": capture.name, "views": entries}
         (work / CAMERAS_FILE).write_text(json.dumps(document, indent=1), encoding="utf-8")
@@ -236,7 +236,7 @@ class ImageToPrepare:
     source: Path
     camera: CameraModel
     target: Path
-    downscaling: Downscaling = Downscaling()
+    downscaling: Downscaling
     mask: Path | None = None
 
 
@@ -245,7 +245,7 @@ def mask_file(image_file: str) -> str:
     return Path(image_file).with_suffix(".mask.png").name
 
 
-def prepare_all(images: Sequence[ImageToPrepare], threads: int = 2, progress: Progress = no_progress) -> list[Camera]:
+def prepare_all(images: Sequence[ImageToPrepare], progress: Progress) -> list[Camera]:
     """Prepare all images and return their final cameras, at the origin, in the order of ``images``.
 
     Distorted images are undistorted in child processes, because COLMAP's native code can abort its process. Such an
@@ -256,19 +256,19 @@ def prepare_all(images: Sequence[ImageToPrepare], threads: int = 2, progress: Pr
         chunk = images[start : start + _CHUNK]
         if any(image.camera.distorted for image in chunk):
             try:
-                cameras += run_isolated(prepare_chunk, chunk, threads, what="undistortion")
+                cameras += run_isolated(prepare_chunk, chunk, what="undistortion")
             except CrashError as error:
                 names = f"{chunk[0].source} to {chunk[-1].source.name}"
                 raise InputError(f"{error} ({names}): check these images and their cameras") from error
         else:
-            cameras += prepare_chunk(chunk, threads)
+            cameras += prepare_chunk(chunk)
         progress("views", len(cameras), len(images))
     return cameras
 
 
-def prepare_chunk(images: Sequence[ImageToPrepare], threads: int) -> list[Camera]:
+def prepare_chunk(images: Sequence[ImageToPrepare]) -> list[Camera]:
     """Prepare some images in this process."""
-    with ThreadPoolExecutor(max_workers=max(1, threads)) as pool:
+    with ThreadPoolExecutor(available_threads()) as pool:
         return list(pool.map(prepare_image, images))
 
 

@@ -26,8 +26,12 @@ def capture_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_same_arguments_same_bytes(capture_dir: Path, tmp_path: Path):
-    render_courtyard(tmp_path, views=4, width=160, height=120, threads=1)
+@pytest.mark.parametrize("threads", [1, 5])
+def test_same_arguments_same_bytes(capture_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, threads: int):
+    monkeypatch.setattr("gsbench.scene.courtyard.render.available_threads", lambda: threads)
+    told = []
+    render_courtyard(tmp_path, views=4, width=160, height=120, progress=lambda *state: told.append(state))
+    assert told == [("courtyard", done, 4) for done in range(1, 5)]
     names = sorted(path.relative_to(capture_dir).as_posix() for path in capture_dir.rglob("*") if path.is_file())
     same, different, failed = filecmp.cmpfiles(capture_dir, tmp_path, names, shallow=False)
     assert len(same) == len(names) >= 7

@@ -18,6 +18,7 @@ from gsbench.scene.courtyard.kernels import render
 from gsbench.scene.courtyard.layout import Layout, build_layout
 from gsbench.scene.options import MIN_IMAGES, MIN_SIZE
 from gsbench.scene.types import Camera
+from gsbench.system.resources import available_threads
 
 VERSION = 1  # to be raised when the images change
 MAX_STEP = radians(7.5)  # between neighbouring views; wider steps gave wrong SfM models on scenes like this one
@@ -32,13 +33,12 @@ def render_courtyard(
     width: int = 400,
     height: int = 300,
     seed: int = 0,
-    threads: int = 2,
     progress: Progress = no_progress,
 ) -> None:
     """Write the capture: ``output_dir/images/*.png`` and the exact COLMAP model ``output_dir/sparse/0`` without points.
 
-    ``width`` and ``height`` are in px. The same arguments give the same bytes, whatever ``threads`` is. ``progress``
-    counts views. Raises `InputError` for fewer than 3 views or images below 16 px.
+    ``width`` and ``height`` are in px. The same arguments give the same bytes. ``progress`` counts views. Raises
+    `InputError` for fewer than 3 views or images below 16 px.
     """
     from gsbench.scene.colmap import write_model  # loads pycolmap, which is slow and only needed here
 
@@ -51,7 +51,7 @@ def render_courtyard(
         name, camera = item
         Image.fromarray(render_view(layout, camera, seed)).save(images / name, format="PNG")
 
-    with ThreadPoolExecutor(max_workers=max(1, threads)) as pool:
+    with ThreadPoolExecutor(available_threads()) as pool:
         for done, _ in enumerate(pool.map(work, cameras.items()), start=1):
             progress("courtyard", done, views)
     write_model(output_dir / "sparse" / "0", cameras)
