@@ -73,6 +73,9 @@ def test_every_500_iterations_opacities_are_lowered_to_the_ceiling() -> None:
     assert not trainable.adam["opacity_logits"].first.any()
     assert not event.opacity_reset
     assert densifier.refine(15_000, trainable, torch.Generator()) is None
+    assert densifier.refine(501, trainable, torch.Generator()) is None
+    refinement = Refinement(3000, trainable, torch.Generator(), event=None)  # type: ignore[arg-type]
+    assert densifier.rules(refinement)[-2:] == [densifier.lower_opacity, densifier.reset_opacity]
     densifier.refine(3000, trainable, torch.Generator())
     assert float(trainable.values.opacities.detach().max()) == pytest.approx(0.01)
 
@@ -234,6 +237,15 @@ def test_quantile_round(rate: float, step: int) -> None:
     assert event.pruned_opacity == sum(faint) > 0
     assert event.balances()
     assert event.after == foreseen
+
+
+def test_the_faintest_share_is_pruned_and_of_none_nobody() -> None:
+    densifier, logits = QuantileADC(prune_share=0.1), torch.arange(11.0)
+    assert densifier.faint(logits).tolist() == [True] + [False] * 10
+    densifier.cull = 3.0
+    assert densifier.faint(logits).tolist() == [True] * 3 + [False] * 8
+    assert densifier.faint(logits[:0]).shape == (0,)
+    assert densifier.faint(logits[:1]).tolist() == [False]
 
 
 def test_the_governor_moves_the_rate() -> None:
@@ -519,6 +531,9 @@ def test_in_a_short_window_there_is_no_pause_and_phases_must_rise() -> None:
         densifier.stage(step) for step in range(300, 1000, 100)
     )
     assert not any(densifier.warming_up(step) for step in range(1000))
+    # Phases end at 1 and 3: too short for three stages, each of which takes one iteration.
+    shortest = ResGS(start=0, stop=6, interval=1, phase_ends=[0.2, 0.5])
+    assert [shortest.stage(step) for step in (1, 2, 3, 4)] == [1, 6, 7, 9]
     with pytest.raises(InputError, match=r"densify\.phase_ends must rise"):
         ResGS(phase_ends=[0.5, 0.2])
 

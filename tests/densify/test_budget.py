@@ -125,7 +125,9 @@ def test_a_governed_round_ends_at_its_target(kind: type[ADC]) -> None:
     trainable, gradient = prepared(densifier, 2, count=300)
     scales = np.array([row["log_scales"] for row in to_rows(trainable)])
     opacities = trainable.values.opacities.detach().numpy()
+    ungoverned = densifier.forecast(at(900, trainable))
     event = densifier.refine(900, trainable, generator(0))
+    assert event.blocked_by_cap == max(0, ungoverned - event.after)
     assert event.target == 300 + round(150 * (1 - (2 / 3) ** 2))
     assert abs(event.after - event.target) <= 2
     assert event.balances()

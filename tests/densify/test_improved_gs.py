@@ -158,6 +158,8 @@ def test_the_growth_control_is_a_root() -> None:
     rng = torch.Generator()
     allowed = [densifier.allowance(at(step, trainable, rng)) for step in (600, 7500, 14_500, 14_900)]
     assert allowed == [int(10_000 * np.sqrt(x)) - COUNT for x in (100 / 14_000, 0.5, 1, 1)]
+    short = EdgeAware(max_gaussians=1000, start=100, stop=400, interval=100)  # shorter than the closing rounds
+    assert [short.limit(step) for step in (150, 200, 300)] == [707, 1000, 1000]
     densifier.max_gaussians = COUNT
     assert densifier.allowance(at(7500, trainable, rng)) == 0
     event = densifier.refine(7500, trainable, rng)
@@ -191,6 +193,7 @@ def test_the_prunings_of_the_schedule() -> None:
 def test_gradients_are_gathered_from_iteration_500_on() -> None:
     densifier = EdgeAware()
     trainable, _ = prepared(densifier, 0)  # shows it iterations 1 to 3
+    observe(densifier, trainable, np.random.default_rng(0), 500)
     assert not densifier.statistics["visible_count"].any()
     observe(densifier, trainable, np.random.default_rng(0), 501)
     assert densifier.statistics["visible_count"].any()
@@ -316,6 +319,16 @@ def test_a_selection_that_has_met_its_budget_warns_of_nothing(caplog: pytest.Log
     trainable, _ = started(densifier, 0)
     assert densifier.refine(16_050, trainable, torch.Generator().manual_seed(0)).after == COUNT - 1
     assert caplog.text == ""
+
+
+def test_the_pressure_of_the_shortest_window_lasts_a_round() -> None:
+    shortest = GNS(start=0, stop=3, interval=1, pressure_length=1e-3)
+    shortest.begin(random_gaussians(3), DensifyContext(1.0))
+    assert (shortest.pressure_interval, shortest.pressure_time) == (1, 1)
+    assert [shortest.pressing(step) for step in (2, 3, 4, 5)] == [False, True, True, False]
+    usual = GNS()
+    assert (usual.pressure_interval, usual.pressure_time) == (50, 8000)
+    assert [usual.in_first_part(step) for step in (15_999, 16_000)] == [True, False]
 
 
 def test_the_selection_survives_saving() -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsbench.densify import ADC, MCMC, MRNF, DensifyContext
+from gsbench.densify import ADC, MCMC, MRNF, DensifyContext, Refinement
 from gsbench.densify.mcmc import bounds
 from gsbench.densify.scores import draw
 from gsbench.gaussians.model import Gaussians
@@ -175,6 +175,24 @@ def test_mrnf_round(step: int, room: int) -> None:
     assert not densifier.statistics["seen"].any()
 
 
+def test_decay_ends_and_keeps_opaque_gaussians_finite() -> None:
+    densifier = MRNF(decay_until=1000)
+    trainable = placed(densifier, 0)
+    before = trainable.values.log_scales.detach().clone()
+    for step, remaining in ((500, 0.5), (1000, 0.0), (2000, 0.0)):
+        trainable.values.log_scales.data.copy_(before)
+        with torch.no_grad():
+            densifier.decay(Refinement(step, trainable, torch.Generator(), event=None))  # type: ignore[arg-type]
+        shrunk = (trainable.values.log_scales - before).exp()
+        torch.testing.assert_close(shrunk, torch.full_like(shrunk, 1 - 0.002 * remaining))
+    single = TrainableGaussians(random_gaussians(3, dtype=torch.float32), LearningRates(), 4.0)
+    single.values.opacity_logits.data[:] = torch.tensor([50.0, -50.0, 0.0])
+    with torch.no_grad():
+        densifier.decay(Refinement(1000, single, torch.Generator(), event=None))  # type: ignore[arg-type]
+    expected = [math.log((1 - 2**-23) / 2**-23), math.log(1e-12), 0.0]
+    assert single.values.opacity_logits.tolist() == pytest.approx(expected, abs=0.1)
+
+
 def test_rounds_and_their_end() -> None:
     densifier = MRNF(stop=1000)
     trainable, _ = begun(densifier, 0)
@@ -219,5 +237,7 @@ def test_noise_moves_the_faint_that_were_seen_and_is_limited() -> None:
     wild.statistics["seen"][:] = True
     before = trainable.values.means.detach().clone()
     size = bounds(before)[2]
+    wild.after_step(wild.stop, trainable, torch.Generator().manual_seed(0))
+    assert torch.equal(trainable.values.means, before)  # no more noise after the window
     wild.after_step(1, trainable, torch.Generator().manual_seed(0))
     assert float((trainable.values.means.detach() - before).abs().max()) == pytest.approx(size)

@@ -101,6 +101,10 @@ def test_without_bad_pixels_nobody_grows() -> None:
     trainable, _, _ = ready(densifier, 0)
     event = densifier.refine(600, trainable, torch.Generator())
     assert event.cloned == event.split_gradient == 0
+    rules = densifier.rules(at(600, trainable, torch.Generator()))
+    assert [rule.__name__ for rule in rules] == [
+        "score", "grow_by_gradient", "prune", "lower_opacity", "reset_statistics"
+    ]  # fmt: skip
     over, _ = densifier.candidates(at(700, trainable, torch.Generator()))
     assert not over.any()
 

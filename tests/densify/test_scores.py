@@ -132,6 +132,7 @@ def test_draws_are_in_proportion_and_without_replacement() -> None:
     assert draw(candidates, scores, 4, rng).tolist() == candidates.tolist()  # the one without a score comes last
     assert draw(candidates, scores, 9, rng).tolist() == candidates.tolist()
     assert not draw(candidates, scores, 0, rng).any()
+    assert not draw(candidates, scores, -1, rng).any()
 
 
 def started(densifier: ADC, seed: int) -> tuple[TrainableGaussians, np.ndarray]:
@@ -218,6 +219,15 @@ def test_taming_round(seed: int) -> None:
     assert not faint.any()  # nothing to prune yet
     assert_same(trainable, grown)
     assert event.balances()
+
+
+def test_taming_lets_a_single_candidate_grow() -> None:
+    densifier = Taming(max_gaussians=COUNT + 5, cap="hard", prune_opacity=0.0)
+    trainable, _ = started(densifier, 0)
+    densifier.statistics["gradient_sum"][1:] = 0.0
+    densifier.statistics["gradient_sum"][0] = 1e-3
+    event = densifier.refine(600, trainable, torch.Generator())
+    assert (event.cloned + event.split_gradient, event.blocked_by_cap) == (1, 0)
 
 
 def test_taming_prunes_half_as_many_draws_as_there_are_to_prune() -> None:
