@@ -7,6 +7,7 @@ import random
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -16,6 +17,7 @@ import torch
 from gsbench.gaussians.paper_values import LearningRates
 from gsbench.gaussians.trainable import TrainableGaussians
 from gsbench.system.stopping import Stopped, deferred, requested, stop_on_signals
+from gsbench.train import checkpoint
 from gsbench.train.checkpoint import CheckpointWriter, load_checkpoint, save_checkpoint, to_host
 from tests.gaussians.helpers import random_gaussians
 
@@ -45,6 +47,16 @@ def test_newest_is_loaded_and_two_are_kept(tmp_path: Path) -> None:
     assert sorted(path.name for path in tmp_path.iterdir()) == ["checkpoint-00000020.pt", "checkpoint-00000030.pt"]
     loaded = load_checkpoint(tmp_path)
     assert equal(loaded, state(30))
+
+
+def test_the_folder_is_synced_and_the_thread_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    synced = []
+    monkeypatch.setattr(checkpoint, "sync_to_disk", synced.append)
+    writer = CheckpointWriter(tmp_path, background=True)
+    writer.save(1, state(1))
+    writer.close()
+    assert synced == [tmp_path]
+    assert not any(thread.name.startswith("gsbench-checkpoint") for thread in threading.enumerate())
 
 
 def test_torch_reads_the_file_by_itself(tmp_path: Path) -> None:

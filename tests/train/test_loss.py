@@ -120,5 +120,9 @@ def test_inputs_that_do_not_fit_are_refused() -> None:
     image, target = _images(16, 18)
     with pytest.raises(ValueError, match="shape"):
         photometric_loss(image, target[:-1])
-    with pytest.raises(ValueError, match="ssim_weight"):
-        photometric_loss(image, target, 1.5)
+    for wrong in (image[..., :2], image[0], image[None]):
+        with pytest.raises(ValueError, match=r"must have one shape: \[H, W, 3\]"):
+            photometric_loss(wrong, wrong)
+    for weight in (1.01, -0.01):
+        with pytest.raises(ValueError, match="ssim_weight"):
+            photometric_loss(image, target, weight)

@@ -125,6 +125,24 @@ def test_a_small_picture_is_the_filtered_one_from_the_same_place(scale: int, hei
     assert (small.fy * y / z + small.cy) / height == pytest.approx(down)
 
 
+def test_a_picture_keeps_a_pixel_at_least() -> None:
+    view = View("a.png", orbit_camera(0.0, 5, 3), np.full((3, 5, 3), 7, np.uint8))
+    cameras, targets = ScaledViews([view], Targets([view], CPU), CPU, None).at(8)
+    assert (cameras[0].width, cameras[0].height) == (1, 1)
+    assert targets.get(0).tolist() == [[[7, 7, 7]]]
+
+
+def test_rounds_tell_the_schedule_of_their_candidates(
+    tiny_scene: Scene, truth: Gaussians, rasterizer: Rasterizer, tmp_path: Path
+) -> None:
+    settings = options(resolution_schedule="pictures_and_count", iterations=50, **SHORT)
+    trainer, told = Trainer(tiny_scene, cloud(truth), small(), rasterizer, settings, 0), []
+    assert trainer.resolution is not None
+    trainer.resolution.observe = told.append  # type: ignore[method-assign]
+    trainer.run(tmp_path)
+    assert [event.step for event in told] == [40]
+
+
 def scheduled(scene: Scene, kind: str = "pictures_and_count", **changes: object) -> Resolution:
     return Resolution(options(resolution_schedule=kind, **(SHORT | changes)), scene.train, 100)
 

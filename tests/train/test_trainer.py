@@ -190,6 +190,22 @@ def test_non_finite_loss_names_the_iteration(
     assert (tmp_path / "checkpoint-00000050.pt").exists()
 
 
+def test_no_checkpoint_holds_a_state_after_a_loss_that_was_not_finite(
+    tiny_scene: Scene, truth: Gaussians, rasterizer: Rasterizer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On a device that is behind, a loss arrives only when it is waited for."""
+
+    class Explode(NoDensifier):
+        def regularizer(self, gaussians: Gaussians) -> torch.Tensor | None:
+            self.calls = getattr(self, "calls", 0) + 1
+            return torch.tensor(float("inf")) if self.calls == 3 else None
+
+    monkeypatch.setattr(Readback, "arrived", property(lambda self: False))
+    with pytest.raises(TrainingError, match="iteration 3;"):
+        train(tiny_scene, truth, rasterizer, tmp_path, Explode(), iterations=9, checkpoint_every=1)
+    assert max(path.name for path in tmp_path.glob("*.pt")) == "checkpoint-00000002.pt"
+
+
 def test_a_full_device_names_the_last_checkpoint_and_what_to_lower(
     tiny_scene: Scene, truth: Gaussians, rasterizer: Rasterizer, tmp_path: Path
 ) -> None:
