@@ -44,6 +44,7 @@ def _cap(trial: TrialResult) -> str:
 SHOWN: dict[str, tuple[str, str, KindOf, Sequence[str]]] = {
     "plants": ("volumetric", "adc", _split, ("interpolation", "extrapolation")),
     "parts": ("no_shrink", "adc", _split, ("interpolation",)),
+    "schedule": ("volumetric", "adc", _split, ("interpolation",)),
     "volume": ("volumetric", "adc", _split, ("interpolation", "extrapolation")),
     "dimension": ("volumetric-1", "adc", _split, ("interpolation", "extrapolation")),
     "full": ("volumetric", "adc", _cap, ("governor", "soft")),

@@ -58,6 +58,8 @@ ASKED = [
     ("dimension", "rule_where_no_camera_went", "more of the rule, sector"),
     ("dimension", "once_between_cameras", "more of it without runaway splits, between the cameras"),
     ("dimension", "once_where_no_camera_went", "more of it without runaway splits, sector"),
+    ("schedule", "plants", "`lewis` (plants), 30,000 iterations, 20,000 Gaussians each"),
+    ("schedule", "no_plants", "`horns` (no plants), the same"),
     ("full", "one_count", "30,000 iterations, 40,000 Gaussians each"),
     ("full", "lower_lpips", "30,000 iterations, each growing up to 100,000"),
     ("full", "lower_lpips_once", "the same, without runaway splits"),
@@ -274,9 +276,11 @@ def budgets_table(name: str, arms: Sequence[str], against: str = "adc") -> str:
     return table(["budget", "arm", *(title for title, _ in columns.values()), f"LPIPS − {against}"], rows)
 
 
-def arms_table(name: str, against: Mapping[str, str]) -> str:
-    """A row per scene and arm: means over the seeds, and the differences from the arm that ``against`` names."""
+def arms_table(name: str, against: Mapping[str, str], scenes: Sequence[str] = ()) -> str:
+    """A row per scene (default: all) and arm: means over the seeds, and the differences from the arm that ``against``
+    names; views between the cameras."""
     frame = read_trials(name)
+    frame = frame[(frame.split == "interpolation") & (frame.scene.isin(scenes) if scenes else True)]
     columns = {"num_gaussians": ("Gaussians", 0)} | {key: METRICS[key] for key in ("psnr", "ssim", LPIPS)}
     asked = ("psnr", LPIPS)
     found = {arm: [differences(frame, arm, other, key) for key in asked] for arm, other in against.items()}
@@ -373,6 +377,13 @@ def sections() -> list[tuple[str, list[Callable[[], str] | str]]]:
         ]),
         ("Other rules at one count", [
             made(claims_table, "rules"), "Means over the seeds:", made(arms_table, "rules", others),
+        ]),
+        ("A longer training", [
+            made(claims_table, "schedule"), "Means over the seeds:",
+            made(arms_table, "schedule", {"volumetric": "adc"}),
+            by_volume, made(shares_table, "schedule", ("volumetric",)),
+            "The same captures after 5,000 iterations (`plants`):",
+            made(arms_table, "plants", {"volumetric": "adc"}, ("horns", "lewis")),
         ]),
         ("OpenSplat beside ours", [
             made(claims_table, "opensplat"), "Means over the seeds:", made(arms_table, "opensplat", peers),
