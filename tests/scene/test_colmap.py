@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from PIL import Image
 
 from gsbench.errors import InputError
 from gsbench.scene.colmap import model_points, read_model, read_reference, write_model
-from gsbench.scene.colmap_files import ModelChecks, check_model
+from gsbench.scene.colmap_files import _MODELS, ModelChecks, check_model
 from gsbench.scene.options import SplitRule
 from gsbench.scene.readers import read_colmap, read_photos
 from gsbench.scene.types import Camera
@@ -125,6 +126,20 @@ def test_written_cameras_project_alike(tmp_path: Path, text: bool):
         np.testing.assert_allclose(back.center, model.find_image_with_name(name).projection_center(), atol=1e-12)
 
 
+def test_models_of_cameras_are_those_of_colmap() -> None:
+    """Their numbers, how many parameters they have, and that the first ones are the focal lengths."""
+    known = {int(number): name for name, number in pycolmap.CameraModelId.__members__.items() if name != "INVALID"}
+    assert {number: name for number, (name, _) in _MODELS.items()} == known
+    for name, length in _MODELS.values():
+        camera = pycolmap.Camera.create_from_model_name(1, name, 50.0, 40, 30)
+        assert len(camera.params) == length
+        focal = list(camera.focal_length_idxs()) or [0, 1]  # EQUIRECTANGULAR has its two sides
+        ModelChecks().camera(1, name, 40, 30, [float(place in focal) for place in range(length)])
+        for place in focal:
+            with pytest.raises(InputError, match="is damaged"):
+                ModelChecks().camera(1, name, 40, 30, [float(at != place) for at in range(length)])
+
+
 POSE = (1.0, 0, 0, 0, 0, 0, 5)
 LARGEST = {"camera": 2**32 - 2, "image": 2**32 - 2, "point": 2**64 - 2}  # COLMAP's numbers for "none" are one above
 
@@ -133,9 +148,9 @@ def sound_model() -> list[tuple[str, tuple]]:
     """The calls of `ModelChecks` for a model with two images and two points, each with numbers at both ends."""
     return [
         ("camera", (0, "SIMPLE_PINHOLE", 1, 1, (0.5, 0, 0))),
-        ("camera", (LARGEST["camera"], "OPENCV", 40, 30, (50.0, 50, 20, 15, 0, -0.1, 0, 0))),
+        ("camera", (LARGEST["camera"], "OPENCV", 40, 30, (50.0, 50, -20, 15, 0, -0.1, 0, 0))),
         ("image", (0, POSE, 0, "a.png", 0)),
-        ("image", (LARGEST["image"], POSE, LARGEST["camera"], "b.png", 3)),
+        ("image", (LARGEST["image"], (1.5e-6, *POSE[1:]), LARGEST["camera"], "b.png", 3)),
         ("point", (0, (0.0, 0, 0), [])),
         ("point", (LARGEST["point"], (-1.0, 2, 3), [(LARGEST["image"], 0), (LARGEST["image"], 2)])),
     ]
@@ -204,18 +219,29 @@ def test_each_file_of_a_model_with_rigs_is_walked_to_its_end(rigs: Path, stem: s
             check_model(rigs)
 
 
-@pytest.mark.parametrize(("stem", "start", "said"), [("rigs", 33, "a sensor of rig 1"), ("frames", 16, "frame 1")])
+def test_a_rig_without_a_sensor_has_no_reference(rigs: Path) -> None:
+    if (rigs / "rigs.bin").is_file():
+        (rigs / "rigs.bin").write_bytes(struct.pack("<QIIII", 2, 1, 0, 2, 0))
+    else:
+        (rigs / "rigs.txt").write_text("1 0\n2 0\n")
+    check_model(rigs)
+
+
+@pytest.mark.parametrize(
+    ("stem", "start", "at", "said"),
+    [("rigs", 33, 7, "a sensor of rig 1"), ("rigs", 98, 17, "a sensor of rig 1"), ("frames", 16, 2, "frame 1")],
+)
 def test_a_pose_of_a_rig_or_a_frame_without_a_direction_is_refused(
-    rigs: Path, stem: str, start: int, said: str
+    rigs: Path, stem: str, start: int, at: int, said: str
 ) -> None:
-    """``start``: of the first pose, behind the count, ids and, in a rig, the reference, the sensor and a mark."""
+    """``start`` of a pose: behind the count, ids and, in a rig, the reference, the sensor and a mark; ``at`` in text."""
     (file,) = rigs.glob(f"{stem}.*")
     if file.suffix == ".bin":
         data = file.read_bytes()
         file.write_bytes(data[:start] + bytes(32) + data[start + 32 :])
     else:
         first, *rest = [line for line in file.read_text().splitlines() if not line.startswith("#")]
-        words, at = first.split(), 7 if stem == "rigs" else 2
+        words = first.split()
         words[at : at + 4] = ["0"] * 4
         file.write_text("\n".join([" ".join(words), *rest]))
     with pytest.raises(InputError, match=f"{said} has no pose that can be used"):
@@ -227,6 +253,17 @@ def test_a_pose_of_a_rig_or_a_frame_without_a_direction_is_refused(
     [
         ("cameras", "1 PINHOLE 40 30 50 50 20", "lacks parameters"),
         ("cameras", "1 OTHER 40 30 50 50 20 15", "unknown model"),
+        ("cameras", "1 PINHOLE 0 30 50 50 20 15", "camera 1 is damaged"),
+        ("cameras", "1 PINHOLE 40 0 50 50 20 15", "camera 1 is damaged"),
+        ("cameras", "1 PINHOLE 40 30 0 50 20 15", "camera 1 is damaged"),
+        ("images", "1 0 0 0 0 0 0 5 1 a.png\n1 2 -1", "image 1 .* has no pose"),
+        ("images", "1 1 0 0 0 0 0 nan 1 a.png\n1 2 -1", "image 1 .* has no pose"),
+        ("images", "1 1 0 0 0 0 0 5 2 a.png\n1 2 -1", "names camera 2"),
+        ("points3D", "1 0 0 nan 0 0 0 0.1", "point 1 lies nowhere"),
+        ("points3D", "1 nan 0 5 0 0 0 0.1", "point 1 lies nowhere"),
+        ("points3D", "1 0 0 5 0 0 0 x", "truncated or damaged"),
+        ("points3D", "1 0 0 5 0 0 0 0.1 1 1", "2D point 1 of image 1"),
+        ("points3D", "1 0 0 5 0 0 0 0.1 2 0", "2D point 0 of image 2"),
         ("images", "1 1 0 0 0 0 0 5 1 a.png\n1 2", "image 1 lacks numbers"),
         ("images", "1 1 0 0 0 0 0 5 1 a.png\n1 nan -1", "image 1 lacks numbers"),
         ("images", "1 1 0 0 0 0 0 5 1\n", "image 1 lacks numbers"),

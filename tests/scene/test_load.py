@@ -145,6 +145,13 @@ def test_downscaled_and_distorted_views_come_back_from_the_cache(make_scene, tmp
     assert len(done) == 4  # but on the cameras
 
 
+def test_a_file_of_another_shape_than_its_camera_is_refused(make_scene, tmp_path: Path):
+    capture = read_colmap("toy", make_scene())
+    Image.new("RGB", (40, 26)).save(capture.images / "01.png")
+    with pytest.raises(InputError, match=r"01\.png: the image is 40x26 px but its camera .* 40x30"):
+        load_scene(capture, capture.model, tmp_path / "cache")
+
+
 def test_a_set_without_its_cameras_is_prepared_again(make_scene, tmp_path: Path):
     capture = read_colmap("toy", make_scene())
     options = {"downscale": 2, "resample": "area"}

@@ -311,9 +311,7 @@ def undistort(image: NDArray[np.uint8], camera: CameraModel) -> tuple[NDArray[np
 
     from gsbench.scene.colmap import plain_camera
 
-    source = pycolmap.Camera(
-        camera_id=1, model=camera.name, width=camera.width, height=camera.height, params=list(camera.params)
-    )
+    source = pycolmap.Camera(model=camera.name, width=camera.width, height=camera.height, params=list(camera.params))
     refusal = (
         f"images of the camera model {camera.name} with parameters {camera.params} cannot be made pinhole images: "
         "use another camera model"
