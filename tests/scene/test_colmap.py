@@ -234,7 +234,7 @@ def test_a_rig_without_a_sensor_has_no_reference(rigs: Path) -> None:
 def test_a_pose_of_a_rig_or_a_frame_without_a_direction_is_refused(
     rigs: Path, stem: str, start: int, at: int, said: str
 ) -> None:
-    """``start`` of a pose: behind the count, ids and, in a rig, the reference, the sensor and a mark; ``at`` in text."""
+    """``start`` of a pose: behind the count, ids and, in a rig, the reference, the sensor and a mark."""
     (file,) = rigs.glob(f"{stem}.*")
     if file.suffix == ".bin":
         data = file.read_bytes()

@@ -130,3 +130,39 @@ def test_too_many_sectors_and_photographs_without_cameras_are_refused() -> None:
         hold_out(NAMES, SplitRule(split="sector"))
     with pytest.raises(InputError, match="the last is 7"):
         hold_out(NAMES, SplitRule(sector=8))
+
+
+@pytest.mark.parametrize(
+    ("name", "least", "most"),
+    [
+        *[
+            ("max_images", 3, 10**6),
+            ("test_every", 2, 999),
+            ("sectors", 2, 999),
+            ("sector", 0, 7),
+            ("downscale", 1, 99),
+        ],
+        *[("max_size", 16, 10**6), ("views", 3, 9999), ("width", 16, 16384), ("height", 16, 16384)],
+        ("seed", 0, 2**31 - 1),
+    ],
+)
+def test_a_setting_has_limits(name: str, least: int, most: int) -> None:
+    def config(value: int) -> SceneConfig:
+        return SceneConfig(name="a", kind="colmap", path="/a", **{name: value})  # type: ignore[arg-type]
+
+    assert [getattr(config(value), name) for value in (least, most)] == [least, most]
+    for value in (least - 1, *([most + 1] if most in (7, 9999, 16384, 2**31 - 1) else [])):
+        with pytest.raises(InputError, match=rf"scene\.{name}"):
+            config(value)
+
+
+def test_settings_without_a_value_are_those_of_the_paper() -> None:
+    config = SceneConfig(name="a", kind="courtyard")
+    assert (config.max_images, config.test_every, config.sectors, config.sector) == (200, 8, 8, 0)
+    assert (config.views, config.width, config.height, config.seed) == (48, 400, 300, 0)
+    assert (config.downscale, config.max_size) == (1, None)
+    for kind, path, said in (("colmap", None, "scene.path is not set"), ("courtyard", "/a", "built-in courtyard")):
+        with pytest.raises(InputError, match=said):
+            SceneConfig(name="a", kind=kind, path=path)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="at least 16 px are needed"):
+        SceneConfig(name="a", kind="courtyard", downscale=20)

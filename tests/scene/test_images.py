@@ -10,7 +10,7 @@ from PIL import Image
 
 from gsbench.errors import InputError
 from gsbench.scene.images import image_size, read_image, resize_image, same_up_to_rounding
-from gsbench.scene.options import downscaled_size
+from gsbench.scene.options import check_final_size, downscaled_size
 
 from .conftest import smooth_image
 
@@ -81,7 +81,23 @@ def test_sizes_never_grow_and_the_longest_side_is_exact():
     for bad in ({"downscale": 0}, {"max_size": 0}):
         with pytest.raises(InputError):
             downscaled_size(9, 9, **bad)
-    assert not same_up_to_rounding((40, 26), (40, 30))
+    assert downscaled_size(3, 3000, downscale=100) == (1, 30)
+    assert downscaled_size(9, 6, max_size=1) == (1, 1)
+
+
+@pytest.mark.parametrize(
+    ("size", "same"), [((40, 26), False), ((42, 30), True), ((43, 30), False), ((40, 31), True), ((40, 32), False)]
+)
+def test_sides_may_be_rounded_by_one_pixel(size: tuple[int, int], same: bool):
+    assert same_up_to_rounding(size, (40, 30)) == same
+
+
+def test_a_side_in_training_has_sixteen_pixels():
+    check_final_size((16, 40), 1, None, "a.png")
+    check_final_size((40, 32), 2, None, "a.png")
+    for size, downscale, max_size in (((15, 40), 1, None), ((40, 31), 3, None), ((40, 20), 1, 30)):
+        with pytest.raises(InputError, match="at least 16 px are needed"):
+            check_final_size(size, downscale, max_size, "a.png")
 
 
 def test_area_is_the_block_mean_and_lanczos_keeps_a_ramp():

@@ -175,6 +175,42 @@ def test_a_plane_is_filled_with_its_own_colour_and_a_ramp_without_a_step() -> No
     assert np.abs(np.diff(filled[25, :, 0])).max() < 60, "black in its place would make a step of 180"
 
 
+def test_between_two_pixels_the_filling_is_linear() -> None:
+    """Blocks of two pixels have the values 0 and 100; a finer pixel lies a quarter of a block from its middle."""
+    row = np.array([[0, 7, 9, 100]], dtype=np.uint8)[..., None].repeat(3, 2)
+    counts = np.array([[True, False, False, True]])
+    assert fill_ignored(row, counts)[0, :, 0].tolist() == [0, 25, 75, 100]
+    assert fill_ignored(row.swapaxes(0, 1), counts.T)[:, 0, 2].tolist() == [0, 25, 75, 100]
+
+
+@pytest.mark.parametrize(
+    ("mask", "alpha", "backdrop", "copied"),
+    [
+        (None, 255, "black", True),
+        (None, 9, "black", True),  # as it is read over black anyway
+        (None, 255, "white", True),
+        (None, 9, "white", False),
+        (np.full((6, 8), 255, np.uint8), 255, "black", True),
+        (np.full((6, 8), 255, np.uint8), 9, "white", False),
+        (half(8, 6), 255, "black", False),
+        (half(8, 6), 255, "white", False),
+    ],
+)
+def test_a_photograph_that_stays_as_it_is_is_copied(tmp_path: Path, mask, alpha, backdrop, copied) -> None:
+    pixels = np.full((6, 8, 4), (200, 100, 50, alpha), np.uint8)
+    original = save(tmp_path / "in" / "a.png", pixels if alpha < 255 else pixels[..., :3])
+    masks = {} if mask is None else {"a.png": save(tmp_path / "a.png", mask)}
+    prepare_photograph(tmp_path / "out", tmp_path / "in", masks, "a.png", backdrop)
+    made = tmp_path / "out" / "images" / "a.png"
+    assert (made.read_bytes() == original.read_bytes()) == copied
+    assert prepared_mask(tmp_path / "out", "a.png").is_file() == (mask is not None)
+    if not copied:
+        shade = 255 if alpha == 9 else 0
+        expected = np.rint((alpha * pixels[0, 0, :3].astype(float) + (255 - alpha) * shade) / 255)
+        with Image.open(made) as picture:
+            np.testing.assert_allclose(np.asarray(picture), np.broadcast_to(expected, (6, 8, 3)), atol=1)
+
+
 @pytest.mark.parametrize(("width", "height"), [(25, 18), (10, 9), (20, 12), (17, 13)])
 def test_a_resized_pixel_counts_where_all_in_its_area_do(width: int, height: int) -> None:
     """In its area is what has its centre there; what has it on the edge may belong to either side."""

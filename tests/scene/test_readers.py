@@ -154,10 +154,13 @@ def test_truncated_model_is_one_clear_line(make_scene, file: str, keep: float):
     assert "\n" not in str(caught.value)
 
 
-def test_a_scene_is_called_after_its_folder_and_a_missing_model_is_named(tmp_path: Path) -> None:
+def test_a_scene_is_called_after_its_folder_and_a_missing_model_is_named(make_scene, tmp_path: Path) -> None:
     assert SceneConfig(name=None, kind="photos", path=str(tmp_path / "my fern")).name == "my fern"
     assert SceneConfig(name=None, kind="photos", path="/").name == "scene"
     assert missing_model("fern", tmp_path, None).startswith(f"scene fern: {tmp_path}: no COLMAP model in")
+    root = make_scene(sparse="model")
+    assert missing_model("fern", root, "model") == ""
+    assert missing_model("fern", root, "other").startswith(f"scene fern: {root / 'other'}: no COLMAP model here")
 
 
 def test_a_list_that_is_not_there_is_said_in_few_words(make_scene):

@@ -223,7 +223,7 @@ def read_mask(path: Path) -> Mask:
     if pixels.ndim == 3:
         if (pixels != pixels[..., :1]).any():
             raise InputError(f"{path}: is in colours, and no mask: make it black where pixels are ignored, else white")
-        pixels = pixels[..., 0]
+        pixels = pixels.max(axis=2)
     mask: Mask = pixels != 0
     if not mask.any():
         raise InputError(f"{path}: the mask is black all over, so no pixel counts: correct it, or leave the image out")
