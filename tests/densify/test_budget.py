@@ -116,6 +116,8 @@ def test_who_keeps_to_the_curve_ends_at_the_limit(kind: type[Budgeted]) -> None:
     late = densifier.target(at(1200, range(300)))  # type: ignore[arg-type]
     assert late == 300 + round(800 * (1 - (2 / 3) ** 2))  # two rounds are left after it
     assert densifier.target(at(1400, range(late))) == 1100  # type: ignore[arg-type]
+    densifier.start = 550  # between two rounds: 8.5 rounds from there to the last
+    assert densifier.target(at(600, range(100))) == 100 + round(1000 * (1 - (8 / 8.5) ** 2))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("kind", [ADC, Volumetric])
@@ -165,6 +167,7 @@ def test_far_over_its_target_a_round_prunes_more_of_the_faint() -> None:
     trainable.values.opacity_logits.data.copy_(torch.logit(torch.linspace(0.006, 0.06, 60, dtype=torch.float64)))
     rounds_after_a_reset = range(3100, 3800, 100)
     assert [densifier.may_cull(step) for step in (3000, *rounds_after_a_reset)] == [True] + [False] * 5 + [True] * 2
+    assert densifier.may_cull(6000)  # it resets after it has pruned
     opacities = trainable.values.opacities.detach().clone()
     event = densifier.refine(14_900, trainable, generator(0))  # the last round
     assert event.target == 30

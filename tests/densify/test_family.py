@@ -61,6 +61,14 @@ def test_the_term_of_mcmc_in_the_loss() -> None:
     assert float(MCMC(opacity_weight=0.3, scale_weight=0.05).regularizer(gaussians)) == pytest.approx(expected)
 
 
+def test_mcmc_moves_and_adds_a_single_gaussian() -> None:
+    densifier, trainable = mcmc_state(8, max_gaussians=9, growth=0.5)
+    trainable.values.opacity_logits.data[1] = 0.0  # of two dead ones
+    event = densifier.refine(600, trainable, torch.Generator().manual_seed(0))
+    assert (event.relocated, event.added, event.after) == (1, 1, 9)
+    assert len(trainable) == 9
+
+
 def test_mcmc_leaves_a_model_alone_whose_gaussians_are_all_dead() -> None:
     densifier, trainable = mcmc_state(8, max_gaussians=50, growth=0.5)
     trainable.values.opacity_logits.data[:] = -9.0
@@ -91,6 +99,8 @@ def test_mcmc_moves_the_dead_and_grows_to_an_exact_cap() -> None:
     assert (trainable.values.opacities > densifier.min_opacity * 0.999).all()
     event = densifier.refine(700, trainable, rng)
     assert (event.added, event.blocked_by_cap, event.after) == (2, 7, 50)
+    event = densifier.refine(800, trainable, rng)
+    assert (event.added, event.blocked_by_cap, event.after) == (0, 10, 50)
     assert len(densifier.lineage.ids) == 50
     assert densifier.lineage.causes_of_living()["relocated"] > 0
 

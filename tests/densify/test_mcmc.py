@@ -145,7 +145,7 @@ def begun(densifier: MRNF, seed: int) -> tuple[TrainableGaussians, np.ndarray]:
     return trainable, seen
 
 
-@pytest.mark.parametrize(("step", "room"), [(600, 1000), (600, 5), (16_000, 1000)])
+@pytest.mark.parametrize(("step", "room"), [(600, 1000), (600, 5), (600, 0), (16_000, 1000)])
 def test_mrnf_round(step: int, room: int) -> None:
     densifier = MRNF(max_gaussians=COUNT + room, growth_share=0.4, growth_threshold=0.5)
     trainable, seen = begun(densifier, 1)
@@ -173,6 +173,13 @@ def test_mrnf_round(step: int, room: int) -> None:
     assert_same(trainable, [decayed(row, 1 - step / 30_000) for row in kept + children])
     assert event.balances()
     assert not densifier.statistics["seen"].any()
+
+
+def test_a_replacement_is_no_growth() -> None:
+    densifier = MRNF(growth_share=0.0)
+    trainable, _ = begun(densifier, 1)
+    event = densifier.refine(600, trainable, torch.Generator().manual_seed(0))
+    assert (event.pruned_opacity, event.split_gradient, event.after) == (7, 7, COUNT)
 
 
 def test_decay_ends_and_keeps_opaque_gaussians_finite() -> None:

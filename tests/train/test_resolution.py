@@ -21,7 +21,7 @@ from gsbench.raster.base import Rasterizer
 from gsbench.runs.keys import config_hash
 from gsbench.scene.types import Scene, View
 from gsbench.train.options import TrainConfig
-from gsbench.train.resolution import Resolution, ScaledViews, ScaleSchedule, scale_schedule
+from gsbench.train.resolution import Resolution, ScaledViews, ScaleSchedule, _window_energies, scale_schedule
 from gsbench.train.trainer import Status, Trainer
 from gsbench.train.views import Targets
 from tests.config.test_schema import composed
@@ -125,6 +125,20 @@ def test_a_small_picture_is_the_filtered_one_from_the_same_place(scale: int, hei
     assert (small.fy * y / z + small.cy) / height == pytest.approx(down)
 
 
+@pytest.mark.parametrize(("height", "width"), [(7, 5), (8, 5), (6, 4)])
+def test_the_energy_within_a_window(height: int, width: int) -> None:
+    """A window has as many pixels on either side of frequency zero; the last is the whole spectrum."""
+    (picture,) = soft_pictures(1, height, width, 3)
+    spectrum = sum(np.abs(np.fft.fftshift(np.fft.fft2(picture[..., c] / 255.0))) for c in range(3))
+    fractions = np.array([0.0, 0.4, 0.8, 1.0])
+    found = _window_energies(picture, fractions)
+    for fraction, energy in zip(fractions[:-1], found, strict=False):
+        tall, wide = int(height * fraction / 2), int(width * fraction / 2)
+        rows, columns = (slice(side // 2 - half, side // 2 + half) for side, half in ((height, tall), (width, wide)))
+        assert energy == pytest.approx(float(spectrum[rows, columns].sum()))
+    assert found[-1] == pytest.approx(float(spectrum.sum()))
+
+
 def test_a_picture_keeps_a_pixel_at_least() -> None:
     view = View("a.png", orbit_camera(0.0, 5, 3), np.full((3, 5, 3), 7, np.uint8))
     cameras, targets = ScaledViews([view], Targets([view], CPU), CPU, None).at(8)
@@ -160,6 +174,8 @@ def test_sizes_change_after_rounds_and_rates_wait_for_them(tiny_scene: Scene) ->
     assert resolution.position_step(wait) == resolution.position_step(1) == 0
     assert resolution.position_step(120) == 120
     assert resolution.position_step((120 + wait) / 2) == pytest.approx(60)  # type: ignore[arg-type]
+    resolution.options.position_steps = wait  # no iteration is left for the schedule
+    assert resolution.position_step(wait + 1) == wait
 
 
 def test_the_count_that_a_round_may_reach(tiny_scene: Scene) -> None:

@@ -402,6 +402,19 @@ def test_seconds_and_rates_go_on_from_a_checkpoint(
     assert shown == [(k, 80, 0.5) for k in (1, 2, 3, 3, 4, 5)]
 
 
+def test_checkpoints_come_so_many_minutes_after_the_last(
+    tiny_scene: Scene, truth: Gaussians, rasterizer: Rasterizer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A clock that goes on by half a minute each time: at the start, in each iteration, and after each checkpoint."""
+    looks, clock = itertools.count(), SimpleNamespace(perf_counter=time.perf_counter)
+    clock.monotonic = lambda: 30.0 * next(looks)
+    monkeypatch.setattr(trainer, "time", clock)
+    settings = {"iterations": 8, "checkpoint_every": 100, "checkpoint_minutes": 1.2}
+    train(tiny_scene, truth, rasterizer, tmp_path, NoDensifier(), **settings)  # type: ignore[arg-type]
+    names = sorted(path.name for path in tmp_path.glob("*.pt"))
+    assert names == ["checkpoint-00000003.pt", "checkpoint-00000006.pt"]
+
+
 def test_a_time_budget_ends_with_the_iteration_that_reaches_it_and_logs_it(
     tiny_scene: Scene, truth: Gaussians, rasterizer: Rasterizer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
