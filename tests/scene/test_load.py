@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 from dataclasses import replace
 from pathlib import Path
@@ -143,6 +144,14 @@ def test_downscaled_and_distorted_views_come_back_from_the_cache(make_scene, tmp
     model.write_binary(capture.model)
     load_scene(capture, capture.model, tmp_path / "cache", **options)
     assert len(done) == 4  # but on the cameras
+
+
+def test_images_that_were_not_selected_are_not_prepared(make_scene, tmp_path: Path):
+    capture = read_colmap("toy", make_scene(), max_images=3)
+    load_scene(capture, capture.model, tmp_path / "cache", downscale=2)
+    (file,) = (tmp_path / "cache").rglob("cameras.json")
+    assert list(json.loads(file.read_text())["views"]) == ["00.png", "02.png", "04.png"]
+    assert sorted(path.name for path in file.parent.glob("*.png")) == [f"0000{k}.png" for k in range(3)]
 
 
 def test_a_file_of_another_shape_than_its_camera_is_refused(make_scene, tmp_path: Path):

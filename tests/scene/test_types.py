@@ -31,6 +31,12 @@ def test_only_what_is_no_camera_is_refused(name: str, value: object) -> None:
         Camera(**(SOUND | {name: value}))
 
 
+def test_numbers_of_any_type_become_float64() -> None:
+    camera = Camera(**(SOUND | {"rotation": [[0, -1, 0], [1, 0, 0], [0, 0, 1]], "translation": [1, 2, 3]}))
+    assert camera.rotation.dtype == camera.translation.dtype == np.float64
+    assert camera.center.tolist() == [-2, 1, -3]
+
+
 def test_its_centre_is_where_it_stands() -> None:
     eye = np.array([3.0, -2.0, 1.5])
     np.testing.assert_allclose(looking(eye, np.array([0.5, 0.0, 0.2])).center, eye, atol=1e-12)

@@ -24,7 +24,13 @@ from gsbench.init.colmap.database import (
     write_matches,
 )
 from gsbench.init.colmap.mapping import MappingResult, map_images
-from gsbench.init.colmap.reconstruct import poses_by_name, verification_options
+from gsbench.init.colmap.reconstruct import (
+    common_poses,
+    poses_by_name,
+    select_pairs,
+    similarity_to,
+    verification_options,
+)
 from gsbench.logs import no_progress
 
 WIDTH, HEIGHT, FOCAL = 640, 480, 520.0  # px; COLMAP's guess without EXIF is 1.2 x 640 = 768
@@ -246,3 +252,76 @@ def test_half_of_the_points_must_be_seen_under_an_angle(share: float, plausible:
         model.add_point3D(np.array([0.0, 0.0, 1.0]), track, np.zeros(3, dtype=np.uint8))
     assert mapping._is_plausible(model) == plausible
     assert not mapping._is_plausible(pycolmap.Reconstruction())
+
+
+@pytest.mark.parametrize("intrinsics", ["estimate", "reference"])
+def test_settings_reach_colmaps_mappers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, intrinsics: Any) -> None:
+    given: list[Any] = []
+    monkeypatch.setattr(
+        pycolmap, "incremental_mapping", lambda *_, next_image_callback, options: given.append(options) or {}
+    )
+    monkeypatch.setattr(pycolmap, "global_mapping", lambda *_, options: given.append(options) or {})
+    tracks, refine = intrinsics == "estimate", intrinsics == "estimate"
+    settings = Sfm(seed=7, mapper_threads=3, min_model_size=5, two_view_tracks=tracks, intrinsics=intrinsics)
+    mapper = mapping._Mapper(tmp_path / "a.db", tmp_path, tmp_path / "out", settings, no_progress, 3)
+    mapper.incremental(mapper.database)
+    mapper.incremental(mapper.database, 2.5)
+    mapper.global_mapping()
+    *incremental, together = given
+    assert [options.mapper.init_min_tri_angle for options in incremental] == [16.0, 2.5]
+    for options in incremental:
+        assert (options.num_threads, options.mapper.num_threads, options.min_model_size) == (3, 3, 5)
+        seeds = (options.random_seed, options.mapper.random_seed, options.triangulation.random_seed)
+        assert seeds == (7, 7, 7)
+        assert (options.multiple_models, options.triangulation.ignore_two_view_tracks) == (True, not tracks)
+        assert (options.ba_refine_focal_length, options.ba_refine_extra_params) == (refine, refine)
+        own = options.mapper.abs_pose_refine_focal_length, options.mapper.abs_pose_refine_extra_params
+        assert own == (refine, refine)
+    assert (together.num_threads, together.random_seed, together.min_model_size) == (3, 7, 5)
+    adjustment = together.mapper.bundle_adjustment
+    assert (adjustment.refine_focal_length, adjustment.refine_extra_params) == (refine, refine)
+
+
+def test_a_focal_length_is_assumed_in_a_copy_that_is_verified_anew(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls: list[tuple[Any, ...]] = []
+    database = tmp_path / "a.db"
+    database.write_text("cameras")
+    made = mapping.colmap_database
+    monkeypatch.setattr(made, "assume_focal_lengths", lambda *given: calls.append(given) or [("a", "b")])
+    monkeypatch.setattr(made, "verify_pairs", lambda *given: calls.append(given))
+    monkeypatch.setattr(mapping._Mapper, "incremental", lambda _, *given: calls.append(given) or ["model"])
+    mapper = mapping._Mapper(database, tmp_path, tmp_path / "out", Sfm(seed=4, min_inliers=9), no_progress, 3)
+    assert mapper.with_assumed_focal_lengths(1.4) == ["model"]
+    assumed, (copy, pairs, options, progress), mapped_from = calls
+    assert assumed == (tmp_path / "assumed-1.4.db", 1.4)
+    assert (copy.read_text(), database.read_text()) == ("cameras", "cameras")
+    assert (pairs, progress) == ([("a", "b")], no_progress)
+    assert (options.ransac.random_seed, options.min_num_inliers, options.min_inlier_ratio) == (4, 9, 0.0)
+    assert mapped_from == (copy, 2.0)
+
+
+def test_pairs_are_all_or_those_of_neighbours() -> None:
+    assert select_pairs("abcd", Sfm()) == [(a, b) for a in "abcd" for b in "abcd" if a < b]
+    assert select_pairs("abcd", Sfm(pairs="sequential", overlap=1)) == [("a", "b"), ("b", "c"), ("c", "d")]
+
+
+def test_common_poses_are_in_the_order_of_names() -> None:
+    def model(centers: dict[str, list[float]], flip: float) -> pycolmap.Reconstruction:
+        made = pycolmap.Reconstruction()
+        made.add_camera_with_trivial_rig(pycolmap.Camera.create_from_model_name(1, "PINHOLE", 100.0, 100, 80))
+        for number, (name, center) in enumerate(centers.items(), start=1):
+            rotation = np.diag([flip, flip, 1.0])
+            pose = pycolmap.Rigid3d(np.column_stack([rotation, -rotation @ center]))
+            made.add_image_with_trivial_frame(pycolmap.Image(name=name, camera_id=1, image_id=number), pose)
+        return made
+
+    one = model({"b": [1.0, 2, 3], "a": [4.0, 5, 6], "x": [0.0, 0, 0]}, 1.0)
+    other = model({"y": [9.0, 9, 9], "a": [7.0, 8, 9], "b": [3.0, 1, 2]}, -1.0)
+    centers, rotations, other_centers, other_rotations = common_poses(one, other)
+    assert (centers.tolist(), other_centers.tolist()) == ([[4, 5, 6], [1, 2, 3]], [[7, 8, 9], [3, 1, 2]])
+    np.testing.assert_array_equal(rotations, [np.eye(3)] * 2)
+    np.testing.assert_array_equal(other_rotations, [np.diag([-1.0, -1, 1])] * 2)
+    assert similarity_to(one, other) is None
+    assert [part.shape for part in common_poses(one, pycolmap.Reconstruction())] == [(0, 3), (0, 3, 3)] * 2
