@@ -57,10 +57,13 @@ def test_absgs_round(seed: int, step: int) -> None:
 
 def test_both_gradients_are_gathered() -> None:
     densifier = AbsGS()
-    _, mean = prepared(densifier, 0)  # shows it the same for both
+    trainable, mean = prepared(densifier, 0)  # shows it the same for both
     np.testing.assert_allclose(densifier.mean_gradient(), mean, rtol=1e-6)
     np.testing.assert_allclose(densifier.mean_absolute_gradient(), mean, rtol=1e-6)
     assert densifier.needs_absolute_gradient
+    before = densifier.statistics["absolute_sum"].clone()
+    observe(densifier, trainable, np.random.default_rng(0), densifier.stop)
+    assert torch.equal(densifier.statistics["absolute_sum"], before)
 
 
 def test_every_500_iterations_opacities_are_lowered_to_the_ceiling() -> None:
@@ -178,6 +181,12 @@ def test_views_of_equal_footprints_count_as_in_adc() -> None:
     views.pixels[1:] = 0
     views.show(densifier, trainable)
     np.testing.assert_allclose(densifier.mean_gradient(), np.hypot(*views.gradients[0].T), rtol=1e-6)
+    views.pixels[0] = 1
+    views.show(densifier, trainable)
+    np.testing.assert_allclose(densifier.mean_gradient(), np.hypot(*views.gradients[0].T), rtol=1e-6)
+    densifier.stop = 1  # nothing is gathered after the window
+    views.show(densifier, trainable)
+    assert not densifier.statistics["pixel_sum"].any()
 
 
 def test_large_gaussians_at_the_edge_of_views_are_not_held_back() -> None:
@@ -336,6 +345,8 @@ def test_the_eigenvalue_is_one_of_the_mean_matrix_in_units_of_the_squared_extent
     values, directions = densifier.steepest(torch.arange(60) < 2)
     assert values.tolist() == pytest.approx([-3e-8 * EXTENT**2] * 2)
     assert directions.tolist() == [[0.0, 1.0, 0.0]] * 2
+    densifier.statistics["visible_count"][:] = 1
+    assert densifier.steepest(torch.arange(60) < 1)[0].tolist() == pytest.approx([-6e-8 * EXTENT**2])
 
 
 def test_each_ingredient_can_be_taken_out() -> None:

@@ -9,7 +9,7 @@ from PIL import Image, ImageFilter
 
 from gsbench.densify import DensifyContext, EdgeAware, Refinement, Taming
 from gsbench.densify.adc import ADC
-from gsbench.densify.scores import blended_sums, by_mean, by_median, draw, edge_map
+from gsbench.densify.scores import blended_sums, by_mean, by_median, draw, draw_views, edge_map
 from gsbench.errors import InputError
 from gsbench.eval.ssim import ssim_map
 from gsbench.events import RefineEvent
@@ -133,6 +133,8 @@ def test_draws_are_in_proportion_and_without_replacement() -> None:
     assert draw(candidates, scores, 9, rng).tolist() == candidates.tolist()
     assert not draw(candidates, scores, 0, rng).any()
     assert not draw(candidates, scores, -1, rng).any()
+    assert sorted(draw_views(Room(), 9, rng)) == [0, 1, 2]
+    assert len({*draw_views(Room(), 2, rng)}) == 2
 
 
 def started(densifier: ADC, seed: int) -> tuple[TrainableGaussians, np.ndarray]:

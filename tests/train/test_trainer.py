@@ -423,6 +423,20 @@ def test_a_time_budget_ends_with_the_iteration_that_reaches_it_and_logs_it(
     assert [record["step"] for record in records(tmp_path / "metrics.jsonl")] == [3]
 
 
+def test_on_a_cpu_checkpoints_are_written_without_a_thread(
+    tiny_scene: Scene, truth: Gaussians, rasterizer: Rasterizer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = []
+
+    def writer(folder: Path, background: bool) -> CheckpointWriter:
+        asked.append(background)
+        return CheckpointWriter(folder, background)
+
+    monkeypatch.setattr(trainer, "CheckpointWriter", writer)
+    train(tiny_scene, truth, rasterizer, tmp_path, NoDensifier(), iterations=1)
+    assert asked == [False]
+
+
 def test_the_last_iteration_is_logged_too(
     tiny_scene: Scene, truth: Gaussians, rasterizer: Rasterizer, tmp_path: Path
 ) -> None:
