@@ -127,6 +127,31 @@ def test_normal_draws_on_the_cpu_are_those_of_the_generator() -> None:
     assert torch.equal(drawn, torch.randn(4, 3, generator=torch.Generator().manual_seed(3), dtype=torch.float64))
 
 
+def test_normal_draws_on_another_device_are_seeded_by_the_generator(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng, again = (torch.Generator().manual_seed(3) for _ in range(2))
+    seeds = []
+
+    class There:
+        def __init__(self, device: torch.device) -> None:
+            assert device.type == "meta"
+
+        def manual_seed(self, seed: int) -> There:
+            seeds.append(seed)
+            return self
+
+    monkeypatch.setattr(torch, "Generator", There)
+    monkeypatch.setattr(torch, "randn", lambda shape, generator, dtype, device: (shape, dtype, device.type))
+    drawn = standard_normal((4, 3), rng, torch.zeros(1, device="meta", dtype=torch.float64))
+    assert drawn == ((4, 3), torch.float64, "meta")
+    assert seeds == [int(torch.randint(2**62, (1,), generator=again))]
+
+
+def test_a_keyword_that_no_base_takes_is_refused() -> None:
+    with pytest.raises(TypeError, match="keyword"):
+
+        class Wrong(Densifier, wrong=1): ...
+
+
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 def test_state_goes_through_a_checkpoint_on_a_gpu() -> None:

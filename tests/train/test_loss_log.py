@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import pytest
 import torch
 from torch import Tensor
 
 from gsbench.raster.staged import Readback
-from gsbench.train.trainer import LossLog, volume_histogram
+from gsbench.train.trainer import LossLog, append, volume_histogram
 
 
 def scalars(step: int, total: float | None = None) -> tuple[Tensor, ...]:
@@ -57,6 +58,12 @@ def test_regularisers_of_another_type_and_graphs_are_taken() -> None:
     leaf = torch.ones((), requires_grad=True)
     losses.add(1, leaf * 2, torch.tensor(0.5), torch.tensor(0.25), (leaf * 3).double())
     assert losses.wait() == {"step": 1, "loss": 2.0, "l1": 0.5, "ssim": 0.25}
+
+
+def test_readers_see_a_record_at_once(tmp_path: Path) -> None:
+    with (tmp_path / "events.jsonl").open("a") as stream:
+        append(stream, {"step": 1})
+        assert (tmp_path / "events.jsonl").read_text() == '{"step": 1}\n'
 
 
 def test_volumes_are_counted_by_quarter_decades() -> None:
