@@ -52,14 +52,15 @@ def write_ply(gaussians: Gaussians, path: Path) -> None:
 
 def check_ply(path: Path) -> None:
     """Raise InputError if a file cannot be a PLY of Gaussians, judged only by its header and length."""
-    with _reading(path):
-        _check_length(path)
+    with _checked(path):
+        pass
 
 
 @contextmanager
-def _reading(path: Path) -> Iterator[None]:
-    """Turn every error that a damaged file can cause into an InputError that names the file."""
+def _checked(path: Path) -> Iterator[None]:
+    """Check the length of a file; turn every error that damage can cause into an InputError that names the file."""
     try:
+        _check_length(path)
         yield
     except (OSError, LookupError, PlyParseError, ValueError, TypeError, OverflowError, MemoryError) as error:
         raise InputError(f"{path}: not a readable PLY of Gaussians ({error})") from error
@@ -81,7 +82,7 @@ def _check_length(path: Path) -> None:
             count = int(words[2])
             if count < 0:
                 raise ValueError("it counts below zero")
-        elif words[:1] == ["property"] and len(words) > 2:
+        elif words[:1] == ["property"]:
             announced += count * (MIN_TEXT_BYTES if is_text else SIZES.get(words[1], 1))
     if announced > path.stat().st_size:
         raise ValueError(f"it is cut short: its header promises {announced} bytes or more")
@@ -92,8 +93,7 @@ def read_ply(path: Path, device: torch.device | str = "cpu") -> Gaussians:
 
     Raises InputError if the file is not a PLY, lacks a property, or has invalid values.
     """
-    with _reading(path):
-        _check_length(path)
+    with _checked(path):
         vertices = PlyData.read(str(path))["vertex"].data
     present = set(vertices.dtype.names or ())
     present_rest = {name for name in present if name.startswith(REST)}

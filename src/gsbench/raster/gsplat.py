@@ -181,24 +181,22 @@ class _Composite(torch.autograd.Function):
         with torch.enable_grad():
             ctx.outputs = rasterize(*ctx.leaves)  # [1, H, W, 3], [1, H, W, 1]
         ctx.half_size, ctx.absolute = half_size, absolute
-        ctx.set_materialize_grads(False)
         image, alpha = (output.detach() for output in ctx.outputs)
         return image[0], alpha[0, ..., 0]
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, g_image: Tensor | None, g_alpha: Tensor | None) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, g_image: Tensor, g_alpha: Tensor) -> tuple[Tensor | None, ...]:
         image, alpha = ctx.outputs
-        g_image = torch.zeros_like(image) if g_image is None else g_image.unsqueeze(0)
-        g_alpha = torch.zeros_like(alpha) if g_alpha is None else g_alpha.unsqueeze(0).unsqueeze(-1)
+        g_outputs = g_image.unsqueeze(0), g_alpha.unsqueeze(0).unsqueeze(-1)
         wanted = [leaf for leaf in ctx.leaves if leaf.requires_grad]
-        computed = iter(torch.autograd.grad((image, alpha), wanted, (g_image, g_alpha), retain_graph=True))
+        computed = iter(torch.autograd.grad((image, alpha), wanted, g_outputs, retain_graph=True))
         gradients = [next(computed) if leaf.requires_grad else None for leaf in ctx.leaves]
         g_means = gradients[0]
         g_screen = None if g_means is None else g_means[0] * ctx.half_size
         if ctx.absolute is not None and g_means is not None:
             ctx.absolute.add_(ctx.leaves[0].absgrad[0] * ctx.half_size)
-        g_background = (g_image * (1 - alpha.detach())).sum((0, 1, 2)) if ctx.needs_input_grad[7] else None
+        g_background = (g_image * (1 - alpha.detach()[0])).sum((0, 1)) if ctx.needs_input_grad[7] else None
         return None, None, None, *gradients, g_background, g_screen
 
 

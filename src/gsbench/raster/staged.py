@@ -232,7 +232,6 @@ class _Render(torch.autograd.Function):
         _, _, wants_background, *_ = ctx.needs_input_grad
         ctx.save_for_backward(alpha if wants_background else None, *gaussians.tensors().values())
         ctx.set_materialize_grads(False)
-        ctx.mark_non_differentiable(radii)
         return image, alpha, radii, frame
 
     @staticmethod

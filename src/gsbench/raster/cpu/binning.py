@@ -162,8 +162,4 @@ def balance_tiles(starts, shards, bounds, tile_shard):
         while tile < tiles and (starts[tile + 1] + TILE_WORK * (tile + 1)) * shards <= total * (shard + 1):
             tile_shard[tile] = shard
             tile += 1
-        if shard == shards - 1:
-            while tile < tiles:
-                tile_shard[tile] = shard
-                tile += 1
         bounds[shard + 1] = tile

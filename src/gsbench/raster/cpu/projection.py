@@ -220,6 +220,13 @@ def _row_sums(array, place):
 
 
 @inlined
+def _first_shard(record_ints, base, v, tile_shard):
+    """The shard of the first tile that the record at ``base`` can touch."""
+    column, row = record_ints[base + at.TILES_X] & 0xFFFF, record_ints[base + at.TILES_Y] & 0xFFFF
+    return tile_shard[row * v.tiles_x + column]
+
+
+@inlined
 def _take_rows(record, count, past, v, record_ints, tile_shard, rows, indices, sums):
     """Sum the gradient rows of ``count`` records over the shards of their tiles, and clear the rows.
 
@@ -230,18 +237,15 @@ def _take_rows(record, count, past, v, record_ints, tile_shard, rows, indices, s
     shard_rows = len(record_ints)  # a row is as long as a record
     for lane in range(count):
         ahead = min(record + lane + AHEAD, past - 1) * at.RECORD
-        tiles_x, tiles_y = record_ints[ahead + at.TILES_X], record_ints[ahead + at.TILES_Y]
-        shard = tile_shard[(tiles_y & 0xFFFF) * v.tiles_x + (tiles_x & 0xFFFF)]
-        prefetch(rows, shard * shard_rows + ahead)
+        prefetch(rows, _first_shard(record_ints, ahead, v, tile_shard) * shard_rows + ahead)
         prefetch(record_ints, min(record + lane + 3 * AHEAD, past - 1) * at.RECORD)
     for lane in range(count):
         base = (record + lane) * at.RECORD
         indices[lane] = record_ints[base + at.INDEX]
-        tiles_x, tiles_y = record_ints[base + at.TILES_X], record_ints[base + at.TILES_Y]
-        first = tile_shard[(tiles_y & 0xFFFF) * v.tiles_x + (tiles_x & 0xFFFF)]
-        last = tile_shard[((tiles_y >> 16) - 1) * v.tiles_x + (tiles_x >> 16) - 1]
+        past_x, past_y = record_ints[base + at.TILES_X] >> 16, record_ints[base + at.TILES_Y] >> 16
+        last = tile_shard[(past_y - 1) * v.tiles_x + past_x - 1]
         total = splat(ZERO)
-        for shard in range(first, last + 1):
+        for shard in range(_first_shard(record_ints, base, v, tile_shard), last + 1):
             row = shard * shard_rows + base
             total += load(rows, row)
             store(rows, row, splat(ZERO))

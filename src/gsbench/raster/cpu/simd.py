@@ -83,8 +83,8 @@ def as_vectors(context: Any, builder: Any, values: Sequence[Any], kinds: Sequenc
 
 
 def _fits(kinds: Sequence[Any]) -> bool:
-    """Whether the numba types are vectors and numbers, at least one a vector."""
-    return VECTOR in kinds and all(isinstance(kind, Vector | types.Number) for kind in kinds)
+    """Whether the numba types are vectors and numbers."""
+    return all(isinstance(kind, Vector | types.Number) for kind in kinds)
 
 
 def _register_operator(
