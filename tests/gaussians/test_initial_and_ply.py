@@ -13,6 +13,7 @@ from plyfile import PlyData, PlyElement
 
 from gsbench.errors import InputError
 from gsbench.gaussians.initial import gaussians_from_cloud
+from gsbench.gaussians.model import dc_to_rgb, rgb_to_dc
 from gsbench.gaussians.ply import check_ply, read_ply, write_ply
 from tests.gaussians.helpers import random_gaussians
 
@@ -134,3 +135,75 @@ def test_harmonics_that_would_shift_are_refused(tmp_path: Path, old: bytes, new:
     write_ply(random_gaussians(4, seed=2), tmp_path / "a.ply")
     with pytest.raises(InputError, match=said):
         read_ply(rewritten(tmp_path / "a.ply", old, new))
+
+
+def test_coefficients_become_colours_again() -> None:
+    assert dc_to_rgb(torch.tensor([0.0, 1.0])).tolist() == pytest.approx([0.5, 0.78209479])
+    rgb = torch.tensor([0.0, 0.25, 1.0])
+    assert dc_to_rgb(rgb_to_dc(rgb)).tolist() == pytest.approx(rgb.tolist())
+
+
+@pytest.mark.parametrize(("degree", "stored"), [(0, 0), (1, 3), (2, 8), (3, 15)])
+def test_fewer_harmonics_are_read(tmp_path: Path, degree: int, stored: int) -> None:
+    """Other programs store fewer coefficients, channel by channel; the others are zero."""
+    gaussians = random_gaussians(4, dtype=torch.float32)
+    write_ply(gaussians, tmp_path / "a.ply")
+    table = PlyData.read(str(tmp_path / "a.ply"))["vertex"].data
+    places = [15 * channel + k for channel in range(3) for k in range(stored)]  # in the full table
+    names = [name for name in table.dtype.names if not name.startswith("f_rest_")]
+    kind = [(name, "f4") for name in [*names, *(f"f_rest_{k}" for k in range(len(places)))]]
+    small = np.empty(4, dtype=kind)
+    for name in names:
+        small[name] = table[name]
+    for k, place in enumerate(places):
+        small[f"f_rest_{k}"] = table[f"f_rest_{place}"]
+    PlyData([PlyElement.describe(small, "vertex")]).write(str(tmp_path / "b.ply"))
+    back = read_ply(tmp_path / "b.ply")
+    assert torch.equal(back.sh_rest[:, :stored], gaussians.sh_rest[:, :stored])
+    assert not back.sh_rest[:, stored:].any()
+    assert torch.equal(back.means, gaussians.means)
+
+
+SIZES = {"char": 1, "int8": 1, "uchar": 1, "uint8": 1, "short": 2, "ushort": 2, "int16": 2, "uint16": 2}
+SIZES |= {"int": 4, "int32": 4, "uint": 4, "uint32": 4, "float": 4, "float32": 4, "double": 8, "float64": 8}
+
+
+@pytest.mark.parametrize("kind", SIZES)
+def test_a_promise_counts_the_bytes_of_each_type(tmp_path: Path, kind: str) -> None:
+    path = tmp_path / "a.ply"
+    header = f"ply\nformat binary_little_endian 1.0\nelement vertex 1000\nproperty {kind} x\nend_header\n"
+    path.write_text(header)
+    promised = 1000 * SIZES[kind]
+    with pytest.raises(InputError, match=f"promises {promised} bytes or more"):
+        check_ply(path)
+    path.write_bytes(header.encode() + bytes(promised - len(header)))
+    check_ply(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "said"),
+    [
+        ("x", np.nan, "x is not a finite number everywhere"),
+        ("f_rest_44", np.inf, "f_rest_44 is not a finite number everywhere"),
+        ("rot_", 0.0, r"a Gaussian has a rotation of \(0, 0, 0, 0\)"),
+    ],
+)
+def test_values_without_meaning_are_named(tmp_path: Path, name: str, value: float, said: str) -> None:
+    write_ply(random_gaussians(3), tmp_path / "a.ply")
+    table = PlyData.read(str(tmp_path / "a.ply"))["vertex"].data.copy()
+    for column in table.dtype.names:
+        if column.startswith(name) and (name == "rot_" or column == name):
+            table[column][1] = value
+    PlyData([PlyElement.describe(table, "vertex")]).write(str(tmp_path / "b.ply"))
+    with pytest.raises(InputError, match=rf"b\.ply: {said}"):
+        read_ply(tmp_path / "b.ply")
+
+
+def test_a_model_without_gaussians_or_without_a_property_is_refused(tmp_path: Path) -> None:
+    write_ply(random_gaussians(3), tmp_path / "a.ply")
+    table = PlyData.read(str(tmp_path / "a.ply"))["vertex"].data
+    PlyData([PlyElement.describe(table[:0].copy(), "vertex")]).write(str(tmp_path / "b.ply"))
+    with pytest.raises(InputError, match="missing or odd properties: all, since it is empty"):
+        read_ply(tmp_path / "b.ply")
+    with pytest.raises(InputError, match=r"missing or odd properties: opacity$"):
+        read_ply(rewritten(tmp_path / "a.ply", b" opacity\n", b" opaqueness\n"))

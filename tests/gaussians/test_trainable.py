@@ -97,3 +97,49 @@ def test_values_of_another_shape_are_refused() -> None:
     trainable = TrainableGaussians(random_gaussians(5), LearningRates(), 3.0)
     with pytest.raises(ValueError, match=r"overwrite: opacity_logits has shape \(5,\), got \(4,\)"):
         trainable.overwrite("opacity_logits", torch.zeros(4, dtype=torch.float64))
+
+
+def test_overwriting_forgets_the_moments_where_it_is_said() -> None:
+    trainable = TrainableGaussians(random_gaussians(5), LearningRates(), 3.0)
+    step_with(trainable, 0)
+    before = trainable.adam["means"].second.clone()
+    where = torch.tensor([True, False, False, True, False])
+    values = torch.full((5, 3), 2.0, dtype=torch.float64)
+    trainable.overwrite("means", values, where)
+    assert torch.equal(trainable.values.means, values)
+    assert trainable.values.means.requires_grad
+    assert not trainable.adam["means"].second[where].any()
+    assert torch.equal(trainable.adam["means"].second[~where], before[~where])
+    assert trainable.adam["means"].first[~where].all()
+    trainable.overwrite("means", values + 1)
+    assert not trainable.adam["means"].first.any()
+    assert not trainable.adam["means"].second.any()
+    assert trainable.adam["sh_dc"].second.all()
+    assert trainable.adam["means"].step == 1
+
+
+def test_an_edit_keeps_moments_and_appends_zeros() -> None:
+    trainable = TrainableGaussians(random_gaussians(4), LearningRates(), 3.0)
+    step_with(trainable, 0)
+    old, added = trainable.values.detach(), random_gaussians(2, seed=1)
+    second = trainable.adam["quaternions"].second.clone()
+    trainable.edit(keep=torch.tensor([True, False, True, True]), append=added)
+    assert len(trainable) == 5
+    assert torch.equal(trainable.values.means, torch.cat([old.means[[0, 2, 3]], added.means]))
+    assert torch.equal(trainable.adam["quaternions"].second[:3], second[[0, 2, 3]])
+    assert not trainable.adam["quaternions"].second[3:].any()
+    assert not trainable.adam["quaternions"].first[3:].any()
+
+
+def test_the_rate_of_the_means_falls_log_linearly() -> None:
+    rates = LearningRates()
+    steps = [0, 15_000, 30_000, 60_000]
+    assert [rates.position(step) for step in steps] == pytest.approx([1.6e-4, 1.6e-5, 1.6e-6, 1.6e-6])
+    assert rates.position(-10) == pytest.approx(1.6e-4)
+    assert rates.sh_rest == pytest.approx(1.25e-4)
+    trainable = TrainableGaussians(random_gaussians(2), rates, 3.0)
+    assert trainable.position_rate == pytest.approx(4.8e-4)
+    trainable.set_step(15_000)
+    assert trainable.position_rate == pytest.approx(4.8e-5)
+    trainable.set_rate("sh_dc", 0.5)
+    assert trainable.adam["sh_dc"].rate == 0.5

@@ -5,16 +5,19 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import threading
+import time
 from pathlib import Path
 
 import numba
 import numpy as np
 import pytest
 import torch
+from numba import types
 
 from gsbench.gaussians.model import Gaussians
 from gsbench.raster.base import RenderOutput
-from gsbench.raster.cpu import CpuRasterizer, binning, executor, shuffle, simd
+from gsbench.raster.cpu import CpuRasterizer, binning, executor, shuffle, simd, workspace
 from gsbench.raster.cpu.workspace import Arena, ShardRunner, TensorPool
 from gsbench.raster.reference import ReferenceRasterizer
 from tests.raster.strategies import Case, render_with_gradients
@@ -65,6 +68,39 @@ def test_depths_are_sorted_as_numpy_sorts_them() -> None:
     digits = np.empty((binning.PASSES, binning.BUCKETS), np.int64)
     binning.sort_by_depth(begins, visible, keys, order, spare, digits)
     np.testing.assert_array_equal(order, np.sort(np.concatenate([keys[:150], keys[320:]])))
+
+
+@pytest.mark.parametrize(
+    ("lengths", "shards", "bounds"),
+    [
+        ([0, 0, 32, 0, 0, 0], 2, [0, 2, 6]),  # with 16 for each tile, shares of 64: 32 + 96
+        ([0, 0, 0, 0], 2, [0, 2, 4]),  # a share is met exactly
+        ([0, 0, 0, 1000], 3, [0, 3, 3, 4]),  # one tile has more than a share
+        ([5, 5, 5, 5, 5, 5], 1, [0, 6]),
+    ],
+)
+def test_tiles_are_divided_by_their_work(lengths: list[int], shards: int, bounds: list[int]) -> None:
+    starts = np.concatenate([[0], np.cumsum(lengths)])
+    found, of_tile = np.full(shards + 1, -1), np.full(len(lengths), 99, np.uint8)
+    binning.balance_tiles(starts, shards, found, of_tile)
+    assert found.tolist() == bounds
+    assert of_tile.tolist() == np.repeat(np.arange(shards), np.diff(bounds)).tolist()
+
+
+def test_the_backward_pass_skips_entries_behind_the_one_that_stopped_a_block() -> None:
+    case = Case(40, 40, 300, sh_degree=0, log_scale=-1.5, logit=3.0)
+    output = CpuRasterizer(threads=1).render(case.gaussians().map(torch.Tensor.float), case.camera(), 0, BLACK)
+    frame = output.footprint.args[0].frame  # type: ignore[union-attr]
+    skipped = 0
+    for tile in range(9):
+        begin, end = frame.starts[tile], frame.processed[tile]
+        last = frame.last[256 * tile :][:256].reshape(16, 16).max(1)
+        assert end - begin <= frame.starts[tile + 1] - begin
+        for block in np.flatnonzero(last < end - begin):
+            behind = frame.masks[begin + int(last[block]) + 1 : end] >> block & 1
+            assert not behind.any()
+            skipped += len(behind)
+    assert skipped > 100
 
 
 def test_needles_keep_their_gradients() -> None:
@@ -179,7 +215,7 @@ def test_hosts_without_wide_vectors(cpu: str, tmp_path: Path) -> None:
     script = """
 import sys, torch
 from gsbench.raster.cpu import CpuRasterizer
-from gsbench.raster.reference import ReferenceRasterizer
+from gsbench.raster.reference import ReferenceRasterizer, project, tile_rectangles
 from tests.raster.strategies import Case, render_with_gradients
 case = Case(33, 49, 50, sh_degree=3)
 output, gradients = render_with_gradients(CpuRasterizer(threads=2), case, torch.float32)
@@ -242,6 +278,16 @@ def _logarithms(x, out):  # type: ignore[no-untyped-def]
         value = simd.load(x, i)
         simd.store(out[0], i, simd.log2(value))
         simd.store(out[1], i, simd.square_root(value) + simd.floor(value) - simd.ceil(value))
+
+
+@pytest.mark.parametrize("kind", [types.Array(types.float64, 1, "C"), types.Array(types.float32, 1, "A"), types.intp])
+@pytest.mark.parametrize("name", ["load", "load_numbers", "store", "gather", "scatter"])
+def test_only_contiguous_float32_has_vectors(name: str, kind: types.Type) -> None:
+    define = getattr(simd, name)._defn
+    others = [types.intp] * (define.__code__.co_argcount - 2)
+    define(None, types.Array(types.float32, 2, "C"), *others)
+    with pytest.raises(TypeError, match="a contiguous float32 array is needed"):
+        define(None, kind, *others)
 
 
 def test_logarithms_and_roots_over_their_range() -> None:
@@ -333,6 +379,54 @@ def test_memory_is_used_again() -> None:
     block[:] = 1
     assert arena.take("a", (4,), np.float32).all()
     assert not arena.take("a", (1000,), np.float32, zero=True).any()
+
+
+def test_memory_that_is_not_used_is_let_go(monkeypatch: pytest.MonkeyPatch) -> None:
+    pool = TensorPool()
+    del (large := [pool.empty((100_000,))])[:]
+    assert not large
+    pool.empty((3,))  # the large block would be mostly empty
+    assert [block.size for block in pool._free] == [int(12 * workspace.HEADROOM)]
+
+    arena, allocate = Arena(), workspace.aligned_bytes
+    arena.take("a", (10,), np.float32)
+    monkeypatch.setattr(workspace, "aligned_bytes", lambda size: allocate(size) if not arena._blocks else None)
+    assert arena.take("a", (100,), np.float32).shape == (100,)  # the old block was dropped before
+    assert allocate(10).size == 10
+
+
+def test_a_single_thread_is_that_of_the_caller() -> None:
+    threads = {}
+
+    def note(first: int, past: int) -> None:
+        threads[first, past] = threading.get_ident()
+
+    ShardRunner(1).run(8, note)
+    assert threads == {(0, 8): threading.get_ident()}
+    threads.clear()
+    ShardRunner(2).run(3, note)
+    assert sorted(threads) == [(0, 1), (1, 2), (2, 3)]
+    assert threading.get_ident() not in threads.values()
+
+
+def test_after_an_error_nothing_runs_any_more() -> None:
+    second_began, done = threading.Event(), []
+
+    def work(first: int, past: int) -> None:
+        if first == 0:
+            second_began.wait(10)
+            raise ZeroDivisionError
+        second_began.set()
+        time.sleep(0.05)
+        done.append(first)
+
+    with pytest.raises(ZeroDivisionError):
+        ShardRunner(2).run(12, work)
+    finished = list(done)
+    assert 1 in finished  # it was waited for
+    assert len(finished) < 11  # the others were called off
+    time.sleep(0.1)
+    assert done == finished
 
 
 def test_an_error_in_a_shard_is_raised() -> None:

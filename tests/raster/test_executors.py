@@ -8,6 +8,7 @@ import inspect
 import re
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -16,6 +17,7 @@ import torch
 from gsbench.errors import InputError
 from gsbench.pipeline.parts import locate
 from gsbench.raster import create_rasterizer, executors
+from gsbench.raster.base import Footprint, RenderOutput
 from gsbench.raster.contract import CASES, departures
 from gsbench.raster.executors import EXECUTORS, Executor, find_executor, resolve
 from gsbench.raster.reference import ReferenceRasterizer
@@ -128,3 +130,97 @@ def test_departures_are_told() -> None:
         f"{case}: RuntimeError: no kernel",
         "without Gaussians: RuntimeError: no kernel",
     ]
+
+
+TINY = CASES[-1]
+
+
+def footprint_of(out: RenderOutput, **changes: float) -> Callable[..., Footprint]:
+    """The footprint of a view with some of its fields multiplied."""
+
+    def footprint(values: torch.Tensor | None = None) -> Footprint:
+        true = out.require_footprint(values)
+        factors = {name: factor * getattr(true, name) for name, factor in changes.items()}
+        return dataclasses.replace(true, **factors)
+
+    return footprint
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (lambda out: {"image": out.image[None]}, "image has shape (1, 5, 7, 3), expected (5, 7, 3)"),
+        (lambda out: {"image": out.image + 0.5}, "image is off by up to 5.00e-01"),
+        (lambda out: {"alpha": out.alpha - 0.25}, "alpha is off by up to 2.50e-01"),
+        (lambda out: {"image": out.image + torch.nan}, "image is off by up to nan"),
+        (lambda out: {"radii": out.radii.long()}, "radii are torch.int64, expected torch.int32"),
+        (lambda out: {"radii": out.radii + (out.radii == out.radii.max())}, "radii differ for 1 of 20 Gaussians"),
+        (lambda out: {"screen_points": torch.zeros(20, 2)}, "there is no gradient of screen_points"),
+        (
+            lambda out: {"footprint": footprint_of(out, pixels=3)},
+            "the pixels of the footprint are off by 2.00e+00 of their sum",
+        ),
+        (
+            lambda out: {"footprint": footprint_of(out, values=0.5)},
+            "the values of the footprint are off by 5.00e-01 of their sum",
+        ),
+    ],
+)
+def test_each_departure_is_told(change: Callable[[RenderOutput], dict[str, object]], told: str) -> None:
+    class Wrong(ReferenceRasterizer):
+        def render(self, gaussians, *arguments, **options):  # type: ignore[no-untyped-def]
+            out = super().render(gaussians, *arguments, **options)
+            return dataclasses.replace(out, **change(out)) if len(gaussians) else out
+
+    assert departures(Wrong(), cases=(TINY,)) == [f"{TINY}: {told}"]
+
+
+@pytest.mark.parametrize("name", ["image", "alpha"])
+def test_without_gaussians_there_is_the_background(name: str) -> None:
+    class Wrong(ReferenceRasterizer):
+        def render(self, gaussians, *arguments, **options):  # type: ignore[no-untyped-def]
+            out = super().render(gaussians, *arguments, **options)
+            return dataclasses.replace(out, **{name: getattr(out, name) + (len(gaussians) == 0)})
+
+    assert departures(Wrong(), cases=(TINY,)) == ["without Gaussians: the image is not the background"]
+
+
+def test_without_gaussians_there_is_a_backward_pass() -> None:
+    class Wrong(ReferenceRasterizer):
+        def render(self, gaussians, *arguments, **options):  # type: ignore[no-untyped-def]
+            out = super().render(gaussians, *arguments, **options)
+            return dataclasses.replace(out, image=out.image.detach()) if len(gaussians) == 0 else out
+
+    (told,) = departures(Wrong(), cases=(TINY,))
+    assert told.startswith("without Gaussians: RuntimeError: ")
+
+
+def test_the_scenes_are_the_same_in_every_version() -> None:
+    """Reports of rasterizers elsewhere name them."""
+    assert [str(case) for case in CASES] == [
+        "33x49-n50-sh3",
+        "97x65-n250-sh3",
+        "64x48-n150-sh2",
+        "50x37-n120-sh1",
+        "81x50-n150-sh0",
+        "40x40-n300-sh3",
+        "7x5-n20-sh3",
+    ]
+    camera = CASES[1].camera()
+    assert (camera.width, camera.height) == (97, 65)
+    assert [camera.fx, camera.fy, camera.cx, camera.cy] == pytest.approx([106.7, 101.85, 55.8, 27.4])
+    assert camera.rotation[0].tolist() == pytest.approx([0.9800666, 0, 0.1986693])
+    assert camera.rotation[2].tolist() == pytest.approx([-0.1986693, 0, 0.9800666])
+    assert camera.translation.tolist() == [0.1, -0.2, 0.3]
+    sums = {name: tensor.sum().item() for name, tensor in CASES[-2].gaussians().tensors().items()}
+    assert sums == pytest.approx(
+        {
+            "means": 1186.380758,
+            "log_scales": -1317.554622,
+            "quaternions": -18.917049,
+            "opacity_logits": 900.250302,
+            "sh_dc": 15.529487,
+            "sh_rest": -11.050933,
+        },
+        rel=1e-6,
+    )

@@ -1,0 +1,225 @@
+"""What executors share: checks of their inputs, reads from a device that do not wait, and the node of autograd."""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from gsbench.gaussians.model import Gaussians
+from gsbench.raster import staged
+from gsbench.raster.base import Footprint
+from gsbench.raster.staged import (
+    Gradients,
+    Readback,
+    RenderRequest,
+    StagedRasterizer,
+    bad_values,
+    check_inputs,
+    check_settings,
+    raise_for_values,
+)
+from gsbench.scene.types import Camera
+from tests.gaussians.helpers import random_gaussians
+
+BLACK = torch.zeros(3, dtype=torch.float64)
+
+
+def camera(width: int = 4, height: int = 3, **others: float) -> Camera:
+    values = {"fx": float(width), "fy": float(height), "cx": width / 2, "cy": height / 2} | others
+    return Camera(width, height, **values, rotation=np.eye(3), translation=np.zeros(3))
+
+
+class Recording(StagedRasterizer[str]):
+    """Stages without a picture: an opacity of 1/4 everywhere, and gradients that are constant."""
+
+    name = "recording"
+
+    def __init__(self) -> None:
+        self.calls: list[tuple[Any, ...]] = []
+
+    def check(self, gaussians: Gaussians) -> None:
+        if len(gaussians) == 1:
+            raise ValueError("one is too few")
+
+    def forward(self, gaussians: Gaussians, request: RenderRequest) -> tuple[Tensor, Tensor, Tensor, str]:
+        alpha = torch.full((request.camera.height, request.camera.width), 0.25, dtype=torch.float64)
+        image = alpha.unsqueeze(-1).repeat(1, 1, 3)
+        return image, alpha, torch.ones(len(gaussians), dtype=torch.int32), "frame"
+
+    def backward(self, *arguments: Any) -> Gradients:
+        self.calls.append(arguments)
+        _, gaussians, *_, want_splitting = arguments
+        splitting = torch.full((len(gaussians), 3, 3), 8.0, dtype=torch.float64) if want_splitting else None
+        sixes = [torch.full_like(tensor, 6.0) for tensor in gaussians.tensors().values()]
+        return Gradients(sixes, torch.full((len(gaussians), 2), 7.0, dtype=torch.float64), splitting)
+
+    def footprint(self, *arguments: Any) -> Footprint:
+        self.calls.append(arguments)
+        return Footprint(*[torch.zeros(2)] * 4)
+
+
+def test_gradients_reach_the_stage_and_come_back() -> None:
+    rasterizer, leaves = Recording(), random_gaussians(2).map(lambda tensor: tensor.requires_grad_())
+    background = BLACK.clone().requires_grad_()
+    output = rasterizer.render(leaves, camera(), 1, background, True, splitting_matrix=True)
+    assert not output.radii.requires_grad
+    (2 * output.image).sum().backward()
+    ((frame, given, request, g_image, g_alpha, want_splitting),) = rasterizer.calls
+    assert (frame, g_alpha, want_splitting) == ("frame", None, True)
+    assert torch.equal(given.means, leaves.means)
+    assert request.degree == 1
+    assert request.absolute is output.screen_gradient_abs
+    assert g_image.is_contiguous()
+    assert (g_image == 2).all()
+    assert all((tensor.grad == 6).all() for tensor in leaves.tensors().values())
+    assert (output.screen_points.grad == 7).all()
+    assert (output.require_splitting_matrix() == 8).all()
+    assert background.grad.tolist() == [2 * 12 * 0.75] * 3
+
+
+def test_the_opacity_alone_may_be_differentiated() -> None:
+    rasterizer, leaves = Recording(), random_gaussians(2).map(lambda tensor: tensor.requires_grad_())
+    rasterizer.render(leaves, camera(), 1, BLACK).alpha.sum().backward()
+    ((_, _, request, g_image, g_alpha, want_splitting),) = rasterizer.calls
+    assert g_image.shape == (3, 4, 3)
+    assert not g_image.any()
+    assert (g_alpha == 1).all()
+    assert g_alpha.is_contiguous()
+    assert not want_splitting
+    assert request.absolute is None
+
+
+def test_a_footprint_gets_the_frame_and_values() -> None:
+    rasterizer, leaves, view = Recording(), random_gaussians(2).map(lambda tensor: tensor.requires_grad_()), camera()
+    output = rasterizer.render(leaves, view, 1, BLACK)
+    values = torch.ones(3, 4)
+    output.require_footprint(values)
+    ((frame, given, request, passed),) = rasterizer.calls
+    assert frame == "frame"
+    assert not given.means.requires_grad
+    assert request.camera is view
+    assert passed is values
+
+
+def test_a_rasterizer_may_refuse() -> None:
+    with pytest.raises(ValueError, match="one is too few"):
+        Recording().render(random_gaussians(1), camera(), 0, BLACK)
+    with pytest.raises(ValueError, match="sh_degree"):
+        Recording().render(random_gaussians(2), camera(), 4, BLACK)
+
+
+@pytest.mark.parametrize(
+    ("of", "said"),
+    [
+        (camera(16385), "camera: width is 16385 px, more than 16384"),
+        (camera(4, 16385), "camera: height is 16385 px, more than 16384"),
+        (camera(fx=0.0039), "camera: fx is 0.0039 px"),
+        (camera(fx=4.1e6), "camera: fx is 4100000.0 px"),
+        (camera(fy=0.0029), "camera: fy is 0.0029 px"),
+        (camera(fy=3.1e6), "camera: fy is 3100000.0 px"),
+        (camera(cx=400.1), "camera: cx is 400.1 px"),
+        (camera(cy=-300.1), "camera: cy is -300.1 px"),
+    ],
+)
+def test_degenerate_cameras_are_refused(of: Camera, said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        check_settings(random_gaussians(1), of, 0, BLACK)
+
+
+def test_the_largest_settings_are_accepted() -> None:
+    for degree in (0, 3):
+        check_settings(random_gaussians(1), camera(16384, 16384), degree, BLACK)
+    check_settings(random_gaussians(1), camera(cx=400.0, cy=-300.0, fx=0.004, fy=3e6), 0, BLACK)
+
+
+def test_settings_that_do_not_fit_are_named() -> None:
+    gaussians = random_gaussians(2)
+    with pytest.raises(ValueError, match="sh_degree: must be 0 to 3, got -1"):
+        check_settings(gaussians, camera(), -1, BLACK)
+    with pytest.raises(ValueError, match=r"dtype must be float32 or float64, got torch\.float16"):
+        check_settings(gaussians.map(Tensor.half), camera(), 0, BLACK.half())
+    with pytest.raises(ValueError, match=r"background: is torch\.float64 on meta, but means is torch\.float64 on cpu"):
+        check_settings(gaussians, camera(), 0, BLACK.to("meta"))
+    with pytest.raises(ValueError, match=r"background: must be three numbers, got shape \(4,\)"):
+        check_settings(gaussians, camera(), 0, torch.zeros(4, dtype=torch.float64))
+    with pytest.raises(ValueError, match="background: must be three finite numbers"):
+        check_settings(gaussians, camera(), 0, BLACK + math.inf)
+    check_settings(gaussians.map(lambda tensor: tensor.to("meta")), camera(), 0, BLACK.to("meta"))  # not looked at
+
+
+@pytest.mark.parametrize("name", ["means", "opacity_logits", "sh_rest"])
+def test_the_first_bad_value_is_named(name: str) -> None:
+    gaussians = random_gaussians(5)
+    assert not bad_values(gaussians, BLACK)
+    raise_for_values(gaussians, BLACK)
+    getattr(gaussians, name)[[2, 4]] = math.nan
+    assert bad_values(gaussians, BLACK)
+    for refuse in (lambda: raise_for_values(gaussians), lambda: check_inputs(gaussians, camera(), 0, BLACK)):
+        with pytest.raises(ValueError, match=rf"^{name}: not finite at Gaussian 2 \(2 in all\)"):
+            refuse()
+
+
+def test_a_rotation_without_length_and_a_bad_background_are_named() -> None:
+    gaussians = random_gaussians(4)
+    gaussians.quaternions[[1, 2]] = 1e-13
+    assert bad_values(gaussians, BLACK)
+    with pytest.raises(ValueError, match=r"quaternions: no length, so no rotation, at Gaussian 1 \(2 in all\)"):
+        raise_for_values(gaussians)
+    assert bad_values(random_gaussians(4), BLACK + math.nan)
+    with pytest.raises(ValueError, match="background"):
+        raise_for_values(random_gaussians(4), BLACK + math.nan)
+    nothing = random_gaussians(4).select(torch.zeros(0, dtype=torch.long))
+    assert not bad_values(nothing, BLACK)
+
+
+class Event:
+    """Stands in for an event of a GPU, which does not happen before it is waited for."""
+
+    def __init__(self) -> None:
+        self.recorded: object = None
+        self.happened = False
+
+    def record(self, stream: object) -> None:
+        self.recorded = stream
+
+    def query(self) -> bool:
+        return self.happened
+
+    def synchronize(self) -> None:
+        assert self.recorded == "stream of cuda:1"
+        self.happened = True
+
+
+def test_a_readback_waits_only_for_what_has_not_arrived(monkeypatch: pytest.MonkeyPatch) -> None:
+    host = SimpleNamespace(copied=[])
+    host.copy_ = lambda source, non_blocking: host.copied.append((source, non_blocking))
+    device = SimpleNamespace(type="cuda", index=1)
+    source = SimpleNamespace(device=device, shape=(2,), dtype=torch.float32)
+    source.detach = lambda: source
+    monkeypatch.setattr(staged.torch, "empty", lambda *_, **options: host if options["pin_memory"] else None)
+    monkeypatch.setattr(staged.torch.cuda, "Event", Event)
+    monkeypatch.setattr(staged.torch.cuda, "current_stream", lambda of: f"stream of cuda:{of.index}")
+    monkeypatch.setattr(Readback, "waits", 0)
+    early, late = Readback(source), Readback(source)  # type: ignore[arg-type]
+    assert host.copied == [(source, True)] * 2
+    assert not early.arrived
+    assert early.values() is host
+    assert early.arrived
+    assert early.values() is host
+    assert Readback.waits == 1
+    late._event.happened = True  # type: ignore[union-attr]
+    assert late.arrived
+    late.values()
+    assert Readback.waits == 1
+
+
+def test_a_readback_from_the_cpu_never_waits() -> None:
+    readback = Readback(torch.ones(2, requires_grad=True))
+    assert readback.arrived
+    assert readback.values().tolist() == [1, 1]
