@@ -143,4 +143,5 @@ def test_nearness_is_the_least_angle_and_the_least_distance() -> None:
         assert entry[DISTANCE] == pytest.approx(min(places) / 2.0)
     assert nearest_training_cameras(training, training, 2.0) == [{ANGLE: 0.0, DISTANCE: 0.0}] * 3
     assert nearest_training_cameras(test, training[:1], 0.0)[0].keys() == {ANGLE}
+    assert nearest_training_cameras(test, training, 0.5)[0][DISTANCE] == pytest.approx(4 * found[0][DISTANCE])
     assert nearest_training_cameras([], training, 1.0) == []

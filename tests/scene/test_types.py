@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gsbench.scene.types import Camera
+from gsbench.scene.types import Camera, CameraModel, to_pinhole
 from tests.scene.cameras import looking
 
 SOUND: dict[str, Any] = {
@@ -35,6 +35,14 @@ def test_numbers_of_any_type_become_float64() -> None:
     camera = Camera(**(SOUND | {"rotation": [[0, -1, 0], [1, 0, 0], [0, 0, 1]], "translation": [1, 2, 3]}))
     assert camera.rotation.dtype == camera.translation.dtype == np.float64
     assert camera.center.tolist() == [-2, 1, -3]
+
+
+def test_a_camera_of_one_focal_length_has_it_on_both_sides() -> None:
+    for model, params in (("SIMPLE_PINHOLE", (50.0, 20.0, 15.0)), ("PINHOLE", (50.0, 50.0, 20.0, 15.0))):
+        camera = to_pinhole(CameraModel(model, 40, 30, params))
+        assert (camera.fx, camera.fy, camera.cx, camera.cy) == (50.0, 50.0, 20.0, 15.0)
+        assert (camera.width, camera.height) == (40, 30)
+        assert not camera.center.any()
 
 
 def test_its_centre_is_where_it_stands() -> None:

@@ -85,3 +85,29 @@ def test_rotation_angles_are_those_of_scipy(degrees: float):
     turn = Rotation.from_rotvec(np.radians(degrees) * np.array([0.6, 0.0, 0.8])).as_matrix()
     base = Rotation.random(4, rng=np.random.default_rng(0)).as_matrix()
     np.testing.assert_allclose(rotation_angles(base, turn @ base), degrees, rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize("scale", [1e-4, 1.0, 1e4])
+def test_what_counts_as_a_line_does_not_depend_on_the_scale(scale: float):
+    """A line is aligned by orientations, other centres without them."""
+    centers, _, moved, _ = poses(9, seed=4)
+    others = Rotation.random(9, rng=np.random.default_rng(5)).as_matrix()
+    similarity = align_poses(scale * centers, others, moved, others)
+    np.testing.assert_allclose(similarity(scale * centers), moved, atol=1e-6)
+    flat = centers * [1.0, 1.0, 0.0]
+    flat_moved = TRUE_SCALE * flat @ TRUE_ROTATION.T
+    np.testing.assert_allclose(
+        align_poses(scale * flat, others, flat_moved, others)(scale * flat), flat_moved, atol=1e-6
+    )
+    bent = np.linspace(-1, 2, 9)[:, None] * [1.0, 2.0, 3.0] + 1e-3 * centers
+    similarity = align_poses(scale * bent, others, bent, others)
+    np.testing.assert_allclose(similarity.rotation, np.eye(3), atol=1e-9)
+    assert similarity.scale == pytest.approx(1 / scale)
+
+
+@pytest.mark.parametrize("count", [3, 40])
+def test_cameras_without_wrong_ones_are_fitted_by_least_squares(count: int):
+    centers, rotations, moved, moved_rotations = poses(count, seed=2)
+    moved = moved + np.random.default_rng(6).uniform(-0.01, 0.01, moved.shape)
+    similarity = align_poses(centers, rotations, moved, moved_rotations)
+    np.testing.assert_allclose(similarity(centers), fit_similarity(centers, moved)(centers), atol=1e-9)

@@ -58,8 +58,8 @@ def align_poses(
     best = _least_median_fit(source_centers, target_centers)
     residuals = np.linalg.norm(best(source_centers) - target_centers, axis=1)  # [N]
     inliers = residuals <= max(INLIER_FACTOR * float(np.median(residuals)), 1e-9 * float(spreads[1][0]))
-    if inliers.sum() < 3:
-        return best
+    # At least three cameras are inliers: residuals up to the median and, of three cameras, the third one's too, since a
+    # least-squares fit leaves residuals that add up to 0.
     return fit_similarity(source_centers[inliers], target_centers[inliers])
 
 
@@ -77,7 +77,7 @@ def transformed_rotations(similarity: Similarity, rotations: Array) -> Array:
 
 def _least_median_fit(source: Array, target: Array) -> Similarity:
     generator = np.random.default_rng(0)  # a fixed seed: the triples only guide the search
-    best, best_median = fit_similarity(source, target), np.inf
+    best = fit_similarity(source, target)
     best_median = float(np.median(np.linalg.norm(best(source) - target, axis=1)))
     for _ in range(RANSAC_TRIALS):
         triple = generator.choice(len(source), 3, replace=False)
