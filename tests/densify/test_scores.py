@@ -264,6 +264,17 @@ def test_taming_prunes_rather_those_of_low_score() -> None:
     assert refinement.event.pruned_opacity == len(gone) <= 20
 
 
+def test_taming_prunes_nobody_without_a_score() -> None:
+    """Children of the same round have none."""
+    densifier = Taming(max_gaussians=COUNT, cap="hard")
+    trainable, _ = started(densifier, 1)
+    trainable.values.opacity_logits.data[:40] = -9.0
+    densifier.statistics["score"] = torch.where(torch.arange(COUNT) < 40, 0.0, 1e-3)
+    refinement = at(600, trainable, torch.Generator().manual_seed(0))
+    densifier.prune(refinement)
+    assert (refinement.event.pruned_opacity, len(trainable)) == (0, COUNT)
+
+
 def test_taming_follows_its_curve_and_ends_at_the_budget() -> None:
     densifier = Taming(max_gaussians=150, gradient_threshold=1e-9, stop=1500, prune_opacity=0.0)
     trainable, _ = started(densifier, 2)

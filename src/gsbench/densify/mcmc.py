@@ -233,7 +233,7 @@ class MRNF(Budgeted):
 
         room = (self.allowance(refinement) or 0) + num_pruned
         opacity_scores = values.opacities.detach() * edge_factor
-        replacing = draw(seen & ~pruned & (opacity_scores > 0), opacity_scores, num_pruned, rng)
+        replacing = draw(seen & ~pruned, opacity_scores, num_pruned, rng)
         remaining = max(0, wanted - int(replacing.sum())) if step < self.grow_until else 0
         eligible = candidates & ~pruned & ~replacing
         growing = draw(eligible, weights * edge_factor, min(remaining, room - int(replacing.sum())), rng)
