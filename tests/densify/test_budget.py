@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsbench.densify import ADC, MCMC, Budgeted, DensifyContext, Refinement, Volumetric
+from gsbench.densify import ADC, MCMC, Budgeted, DensifyContext, RefineEvent, Refinement, Volumetric
 from gsbench.densify.budget import find_factor
 from gsbench.errors import InputError
 from gsbench.gaussians.paper_values import LearningRates
@@ -168,6 +168,10 @@ def test_far_over_its_target_a_round_prunes_more_of_the_faint() -> None:
     rounds_after_a_reset = range(3100, 3800, 100)
     assert [densifier.may_cull(step) for step in (3000, *rounds_after_a_reset)] == [True] + [False] * 5 + [True] * 2
     assert densifier.may_cull(6000)  # it resets after it has pruned
+    locked = Refinement(3100, trainable, generator(0), RefineEvent(3100, len(trainable)))
+    densifier.govern(locked)
+    assert locked.event.target < 60  # and yet
+    assert locked.event.cull == 1
     opacities = trainable.values.opacities.detach().clone()
     event = densifier.refine(14_900, trainable, generator(0))  # the last round
     assert event.target == 30
