@@ -295,7 +295,7 @@ def _prepare_mask(source: Path, image: ImageToPrepare, width: int, height: int) 
     mask = read_mask(source)
     if image.camera.distorted:
         levels = np.repeat(mask[..., None].astype(np.uint8) * WHITE, 3, axis=2)  # [H, W, 3]
-        mask = undistort(levels, image.camera)[0][..., 0] == WHITE
+        mask = (undistort(levels, image.camera)[0] == WHITE).all(axis=2)
     mask = resize_mask(mask, width, height)
     if not mask.any():
         raise InputError(f"{source}: no pixel is left that counts at {width}x{height} px: leave its image out")
