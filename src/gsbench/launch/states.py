@@ -70,8 +70,9 @@ def _mark_superseded(trials: Sequence[TrialState]) -> list[TrialState]:
     states = []
     for trial in trials:
         if trial.state in ("failed", "partial"):
-            later = _with_same_settings(trial.folder, further.get(_arm_and_seed(trial.folder), []))
-            if later is not None:
+            others, own = further.get(_arm_and_seed(trial.folder), []), _settings(trial.folder)
+            later = next((other for other in others if _settings(other.folder) == own), None)
+            if own is not None and later is not None:
                 note = f"{later.folder.name} is {later.state}, made by later code: {trial.note}"
                 trial = replace(trial, state="superseded", note=note)
         states.append(trial)
@@ -81,13 +82,6 @@ def _mark_superseded(trials: Sequence[TrialState]) -> list[TrialState]:
 def _arm_and_seed(folder: Path) -> tuple[Path, str]:
     """The arm's folder, and the seed in the name of a trial's folder."""
     return folder.parent, folder.name.partition("-")[2]
-
-
-def _with_same_settings(folder: Path, others: Sequence[TrialState]) -> TrialState | None:
-    """The first of ``others`` that has the settings of the trial in ``folder``."""
-    if not others or (own := _settings(folder)) is None:
-        return None
-    return next((other for other in others if _settings(other.folder) == own), None)
 
 
 def _settings(folder: Path) -> dict[str, Any] | None:

@@ -32,21 +32,8 @@ from gsbench.pipeline.steps.scene import (
     masking_step,
 )
 from gsbench.pipeline.steps.train import external_step, train_step
-from gsbench.runs import layout
+from gsbench.runs import keys, layout
 from gsbench.runs.experiments import read_declarations
-from gsbench.runs.keys import (
-    EVALUATE,
-    GROUND_TRUTH,
-    INIT,
-    STAGES,
-    TRAIN,
-    Stage,
-    Step,
-    config_hash,
-    flatten,
-    sha256_of,
-    user_modules,
-)
 from gsbench.runs.store import Store, StoredResult, read_manifest
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import (
@@ -88,7 +75,7 @@ class TrialSteps:
     def __init__(self, parts: Parts, store: Store) -> None:
         self.parts, self.store = parts, store
 
-    def steps(self) -> Iterator[Step]:
+    def steps(self) -> Iterator[keys.Step]:
         """The steps in order. A caller that wants results builds each step before it asks for the next.
 
         Keys are known without building, with one exception: the courtyard's photographs must be rendered before their
@@ -177,7 +164,7 @@ def _run(trial: Trial, folder: TrialFolder) -> TrialRecord:
         flush_denormals()
         torch.set_num_threads(parts.threads)
 
-        def announce(stage: Stage, place: Path) -> None:
+        def announce(stage: keys.Stage, place: Path) -> None:
             write_json(folder.path / layout.BUILDING, {"stage": stage.name, "folder": str(place)})
 
         store = Store(folder.runs / layout.STORE, announce)
@@ -187,16 +174,16 @@ def _run(trial: Trial, folder: TrialFolder) -> TrialRecord:
         entries: dict[str, StoredResult] = {}
         code: dict[str, str] = {}
         for step in trial_steps.steps():
-            if step.stage.name == TRAIN.name:
+            if step.stage.name == keys.TRAIN.name:
                 scene = trial_steps.views.scene
                 log.info("%s: %d training and %d test views", folder.label, len(scene.train), len(scene.test))
             entries[step.stage.name] = entry = store.get(step)
             code |= step.code
-            if step.stage is INIT:
+            if step.stage is keys.INIT:
                 link_or_copy(entry.path / REPORT_FILE, folder.path / layout.INIT_REPORT)
         results = results_of(values, trial_steps.capture, trial_steps.views.scene, parts.rasterizer.name, entries, code)
         published = _publish(folder.path, entries)
-        made_of = {stage.name: entries[stage.name].path for stage in (INIT, TRAIN, GROUND_TRUTH, EVALUATE)}
+        made_of = {name: entry.path for name, entry in entries.items() if name != keys.CAPTURE.name}
         sources = source_files(trial_steps.photographs, store)
         was_done = folder.write_finished(values, results, sources, made_of, published)
         (folder.path / layout.BUILDING).unlink(missing_ok=True)
@@ -217,11 +204,11 @@ def source_files(capture: Capture, store: Store) -> list[Path]:
 
 def _publish(folder: Path, entries: Mapping[str, StoredResult]) -> list[Path]:
     """Link the steps' files into the trial's folder, or copy them; returns the new paths."""
-    init, trained, evaluated = (entries[stage.name].path for stage in (INIT, TRAIN, EVALUATE))
+    init, trained, evaluated = (entries[stage.name].path for stage in (keys.INIT, keys.TRAIN, keys.EVALUATE))
     links = {folder / name: trained / name for name in PUBLISHED_TRAINING if (trained / name).exists()}
     links[folder / layout.PER_VIEW] = evaluated / layout.PER_VIEW
     pictures = {name: evaluated / name for name in (layout.RENDERS, layout.FIGURES)}
-    truth = entries[GROUND_TRUTH.name].path
+    truth = entries[keys.GROUND_TRUTH.name].path
     for name, source in (pictures | {layout.GROUND_TRUTH: truth, layout.MASKS: truth / layout.MASKS}).items():
         links |= {folder / name / file.name: file for file in sorted(source.glob("*.png"))}
     if (init / PICTURE_FILE).exists():
@@ -250,7 +237,7 @@ def results_of(
     ``capture`` are the photographs, ``raster`` names the executor that rendered, ``entries`` are the steps' store
     entries by stage. ``code`` maps the parts of gsbench's source that the steps used to their states.
     """
-    init, trained, evaluated = entries[INIT.name], entries[TRAIN.name], entries[EVALUATE.name]
+    init, trained, evaluated = entries[keys.INIT.name], entries[keys.TRAIN.name], entries[keys.EVALUATE.name]
     training = read_typed(trained.path / layout.TRAINING, Training)
     evaluation = read_typed(evaluated.path / layout.METRICS, Evaluation)
     manifest = read_manifest(evaluated.path)
@@ -264,7 +251,7 @@ def results_of(
     if training.peak_memory_mb is None:
         unknown["peak_memory_mb"] = "another program's memory of a GPU is not measured"
     if training.trained_by is None and not training.iterations:  # a ready-made model
-        del seconds[TRAIN.name]
+        del seconds[keys.TRAIN.name]
         evaluated_from = FROM_MODEL
         unknown |= dict.fromkeys(("train_time", "total_time"), f"{MADE_ELSEWHERE}: not trained here")
     return TrialRecord(
@@ -297,13 +284,13 @@ def results_of(
         ),
         train_views=len(scene.train),
         test_views=len(scene.test),
-        split=split_text(flatten(values)),
+        split=split_text(keys.flatten(values)),
         held_out=capture.held_out,
         resolution=sizes[0],
         events=sum_events(read_rows(trained.path / layout.EVENTS)),
         init_report=read_json(init.path / REPORT_FILE),
         hashes={
-            "config": config_hash(values),
+            "config": keys.config_hash(values),
             "data": capture.fingerprint,
             "init": init.key,
             "cloud": cloud_hash(init.path),
@@ -311,8 +298,8 @@ def results_of(
             "evaluate": evaluated.key,
         },
         code=Code(
-            sources=user_modules(values),
-            stages={stage.name: stage.version for stage in STAGES},
+            sources=keys.user_modules(values),
+            stages={stage.name: stage.version for stage in keys.STAGES},
             rooms=dict(sorted(code.items())),
             **training.checkout,
         ),
@@ -331,7 +318,7 @@ def cloud_hash(init: Path) -> str:
     files = read_manifest(init).outputs
     model = (f"{MODEL_FOLDER.as_posix()}/", GAUSSIANS_FILE)
     kept = {name: file.sha256 for name, file in files.items() if name.startswith(model)}
-    return sha256_of(kept)
+    return keys.sha256_of(kept)
 
 
 def versions() -> dict[str, str]:

@@ -173,7 +173,8 @@ class MlflowSink:
         experiment_id = ensure_experiment(self.client, self._trial.values["name"], self._trial.folder.runs)
         run = None
         if state.get("uri") in (uri, self.client.tracking_uri) and state.get("token"):
-            run = self._find_run(experiment_id, state["token"])
+            same = f"tags.`{TOKEN_TAG}` = '{state['token']}'"
+            run = next(iter(self.client.search_runs([experiment_id], same, max_results=1)), None)
         if run is not None and state["complete"] not in (None, results):
             self.client.delete_run(run.info.run_id)  # it shows results that are no longer the trial's
             run = None
@@ -182,7 +183,9 @@ class MlflowSink:
             state = {"uri": uri, "token": token, "started": int(time.time() * 1000), "complete": None, "logged": {}}
             # Written before the run is created, so that its token finds it even if the server's answer is lost.
             write_json(self._trial.folder.path / STATE, state)
-            run = self._create_run(experiment_id, token)
+            user = psutil.Process().username()
+            tags = self._trial.tags() | {TOKEN_TAG: token, "mlflow.user": user}
+            run = self.client.create_run(experiment_id, tags=tags, run_name=self._trial.label)
         self.run_id, self._started = run.info.run_id, state["started"]
         if PARAMS_TAG not in run.data.tags:
             self._log_params()
@@ -225,16 +228,6 @@ class MlflowSink:
                 if (self._trial.folder.path / name).exists():
                     self.client.log_artifact(self.run_id, str(self._trial.folder.path / name))
         self.client.set_terminated(self.run_id, status)
-
-    def _find_run(self, experiment_id: str, token: str) -> Any:
-        """The run with this token; None if there is none or it was deleted."""
-        runs = self.client.search_runs([experiment_id], f"tags.`{TOKEN_TAG}` = '{token}'", max_results=1)
-        return runs[0] if runs else None
-
-    def _create_run(self, experiment_id: str, token: str) -> Any:
-        trial, client = self._trial, self.client
-        tags = trial.tags() | {TOKEN_TAG: token, "mlflow.user": psutil.Process().username()}
-        return client.create_run(experiment_id, tags=tags, run_name=trial.label)
 
     def _log_params(self) -> None:
         from mlflow.entities import Param
