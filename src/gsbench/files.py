@@ -116,7 +116,9 @@ def require_no_links(runs: Path, place: Path, below: bool = False) -> None:
     for part in place.relative_to(runs).parts:
         path /= part
         with suppress(FileNotFoundError, NotADirectoryError):
-            _require_plain(path, os.lstat(path).st_mode)
+            mode = os.lstat(path).st_mode
+            if not stat.S_ISDIR(mode) and not stat.S_ISREG(mode):
+                raise _no_plain_file(path)
     folders = [place] if below else []
     while folders:
         with suppress(FileNotFoundError, NotADirectoryError), os.scandir(folders.pop()) as entries:
@@ -133,11 +135,6 @@ def remove_special_files(folder: Path) -> None:
         mode = os.lstat(path).st_mode
         if not stat.S_ISDIR(mode) and not stat.S_ISREG(mode):
             path.unlink()
-
-
-def _require_plain(path: Path, mode: int) -> None:
-    if not stat.S_ISDIR(mode) and not stat.S_ISREG(mode):
-        raise _no_plain_file(path)
 
 
 def _no_plain_file(path: Path) -> InputError:

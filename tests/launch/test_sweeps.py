@@ -423,8 +423,8 @@ def test_estimate_prefers_the_same_scene_and_densifier_and_scales_with_iteration
     finish(trial_values("densify=adc", "train.iterations=100"), seconds=10)
     finish(trial_values("densify=mcmc", "train.iterations=100"), seconds=30)
     finished = FinishedTrials(runs)
-    assert finished.estimate(trial_values("densify=adc", "train.iterations=1000")).seconds == pytest.approx(100)
-    assert finished.estimate(trial_values("densify=none", "train.iterations=1000")).seconds == pytest.approx(200)
+    assert finished.estimate(trial_values("densify=adc", "train.iterations=1000")) == (pytest.approx(100), 1)
+    assert finished.estimate(trial_values("densify=none", "train.iterations=1000")) == (pytest.approx(200), 2)
 
 
 def test_estimate_scales_with_pixels_and_knows_its_rasterizer_and_pictures_or_is_none(runs: Path) -> None:
@@ -434,8 +434,8 @@ def test_estimate_scales_with_pixels_and_knows_its_rasterizer_and_pictures_or_is
     finished = FinishedTrials(runs)
 
     def seconds(*words: str) -> float | None:
-        estimate = finished.estimate(trial_values("train.iterations=100", *words))
-        return estimate.seconds if estimate.learned_from else None
+        estimate, known_from = finished.estimate(trial_values("train.iterations=100", *words))
+        return estimate if known_from else None
 
     assert seconds("scene.width=800", "scene.height=600") == pytest.approx(40)
     assert seconds("scene.max_size=200") == pytest.approx(2.5)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -18,6 +19,7 @@ from gsbench.eval.evaluator import Evaluator
 from gsbench.eval.protocol import PAPER
 from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.ply import write_ply
+from gsbench.pipeline.steps import evaluate as evaluate_module
 from gsbench.pipeline.steps.evaluate import evaluate_step, measure_speed
 from gsbench.raster import create_rasterizer
 from gsbench.raster.contract import CASES
@@ -64,7 +66,7 @@ def test_an_evaluation_that_asks_for_nothing_new_has_the_key_that_it_had(monkeyp
     assert inputs(more=["gmsd", "fsim"]) == old | {"more": ["fsim", "gmsd"]} == inputs(more=["fsim", "gmsd"])
 
 
-def test_speed_is_measured_at_the_size_that_is_asked_for() -> None:
+def test_speed_is_measured_at_the_size_that_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
     case, sizes = CASES[-1], []
 
     class Watched(ReferenceRasterizer):
@@ -73,12 +75,24 @@ def test_speed_is_measured_at_the_size_that_is_asked_for() -> None:
             return super().render(gaussians, camera, *rest)
 
     scene = Scene("made", (), (View("a", case.camera(), np.zeros((case.height, case.width, 3), np.uint8)),))
+    clock = SimpleNamespace(perf_counter=iter((10.0, 12.0)).__next__)
+    monkeypatch.setattr(evaluate_module, "time", clock)
     found = measure_speed(Watched(), case.gaussians(), scene, torch.zeros(3, dtype=torch.float64), [64, 20])
-    assert set(sizes) == {(64, 20)}
-    assert found["a"] > 0
+    assert sizes == [(64, 20)] * 6  # the first is not timed
+    assert found == {"a": 2.5}
 
 
-def test_an_evaluation_measures_what_its_pictures_hold(tmp_path: Path, truth: Gaussians, tiny_scene: Scene) -> None:
+@pytest.fixture
+def told(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
+    """The progress that an evaluation reports."""
+    told: list[tuple[Any, ...]] = []
+    monkeypatch.setattr(evaluate_module, "progress", lambda title: nullcontext(lambda *counts: told.append(counts)))
+    return told
+
+
+def test_an_evaluation_measures_what_its_pictures_hold(
+    tmp_path: Path, truth: Gaussians, tiny_scene: Scene, told: list[tuple[Any, ...]]
+) -> None:
     """Metrics by the formula from the PNG files; the nearest training view by trying all; an earlier model's means."""
     store, init = Store(tmp_path), Step(INIT, {}, lambda folder: None)
     masked = replace(tiny_scene.test[1], mask=np.arange(32 * 40).reshape(32, 40) % 4 > 0)
@@ -134,10 +148,16 @@ def test_an_evaluation_measures_what_its_pictures_hold(tmp_path: Path, truth: Ga
     assert metrics["at"]["7"]["num_gaussians"] == 50
     assert metrics["at"]["7"]["metrics"]["psnr"] == pytest.approx(means["earlier"], abs=1e-3)
     assert {path.name for path in (folder / "renders").iterdir()} == {view.name for view in scene.test}
-    assert Image.open(folder / "figures" / "ellipsoids.png").size[0] == 40
+    figure = np.asarray(Image.open(folder / "figures" / "ellipsoids.png"))[:32].astype(int)
+    unlike = [np.abs(figure - np.asarray(Image.open(folder / "renders" / view.name))).mean() for view in scene.test]
+    assert figure.shape == (32, 40, 3)
+    assert unlike[0] < unlike[1]  # it is of the first view
+    assert told == [("views", 1, 2), ("views", 2, 2), ("iteration 7", 1, 2), ("iteration 7", 2, 2)]
 
 
-def test_another_programs_renders_are_measured_as_they_are(tmp_path: Path, tiny_scene: Scene) -> None:
+def test_another_programs_renders_are_measured_as_they_are(
+    tmp_path: Path, tiny_scene: Scene, told: list[tuple[Any, ...]]
+) -> None:
     store = Store(tmp_path)
     renders = store.path(TRAINED) / "renders"
     renders.mkdir(parents=True)
@@ -165,3 +185,4 @@ def test_another_programs_renders_are_measured_as_they_are(tmp_path: Path, tiny_
     metrics = json.loads((folder / "metrics.json").read_text())
     assert metrics["unavailable"]["fps"] == "another program's renders are known, not its model"
     assert len(list((folder / "renders").iterdir())) == 2
+    assert told == [("views", 1, 2), ("views", 2, 2)]

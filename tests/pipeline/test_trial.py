@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -53,6 +54,33 @@ def test_threads_are_those_that_are_set_or_what_parallel_trials_leave(monkeypatc
     monkeypatch.setattr("gsbench.pipeline.parts.available_threads", lambda parallel: 100 + parallel)
     for words, threads in ((["threads=3"], 3), (["threads=auto", "launch.parallel=2"], 102)):
         assert Parts(compose_one(["scene=courtyard", *words]).values).threads == threads
+
+
+def test_only_the_threads_that_are_left_open_are_those_of_the_trial() -> None:
+    for word, threads in (("init.threads=auto", 3), ("init.threads=2", 2)):
+        initializer: Any = Parts(compose_one(["scene=courtyard", "init=sfm", "threads=3", word]).values).initializer
+        assert initializer.threads == threads
+
+
+def test_test_views_are_measured_earlier_where_the_training_comes_by() -> None:
+    words = ["scene=courtyard", "train.iterations=9", "eval.at=[7,3,9,12]"]
+    assert Parts(compose_one(words).values).measured_earlier == [3, 7]
+
+
+def test_a_configuration_that_nobody_has_composed_may_run_no_more_than_one_that_was() -> None:
+    values = compose_one(["scene=courtyard"]).values
+    Parts(values)
+    with pytest.raises(InputError, match="allow_targets"):
+        Parts(values | {"densify": values["densify"] | {"_target_": "mine.Mine"}})
+
+
+def test_a_program_must_be_there_only_where_it_runs() -> None:
+    command = "densify.command='/nowhere/program {data} {output}'"
+    words = ["scene=courtyard", "densify=external/program", command, "densify.result=a.ply", "densify.version=1"]
+    parts = Parts(compose_one([*words, "allow_targets=[/nowhere/program]"]).values)
+    parts.check(on_this_machine=False)
+    with pytest.raises(InputError, match="program"):
+        parts.check(on_this_machine=True)
 
 
 OWN = """
@@ -143,6 +171,8 @@ def test_a_rasterizer_of_ones_own_goes_by_a_name_of_its_own(own_module: None, na
         elif sound:
             with pytest.raises(InputError, match="raster=named does not give them"):
                 parts.check(on_this_machine=False)
+            with pytest.raises(InputError, match="raster=named does not give them"):
+                _ = parts.rasterizer
     assert build_own_rasterizer({"name": "cpu"}, []) is None
     assert build_rasterizer({"name": "reference"}, [], torch.device("cpu")).name == "reference"
 

@@ -5,24 +5,34 @@ from __future__ import annotations
 import hashlib
 import importlib
 import importlib.util
+import os
 import shutil
 import sys
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
+from gsbench.errors import InputError
 from gsbench.runs import keys
 from gsbench.runs.keys import (
     AS_RELEASED,
     PACKAGE,
     ROOMS,
+    Stage,
+    UserCode,
     changed_rooms,
     changed_since_asked,
     edited,
+    flatten,
     has_changed_since_import,
     module_digest,
+    options_of,
+    rasterizer_inputs,
     states_of,
+    step_of,
     syntax_of,
     unnamed_modules,
     user_modules,
@@ -196,6 +206,7 @@ def test_a_users_class_has_all_modules_that_were_allowed(home: Path) -> None:
 
 def test_a_package_is_hashed_whole_and_its_name_does_not_matter(home: Path) -> None:
     (home / "pack" / "inner").mkdir(parents=True)
+    (home / "pack" / "folder.py").mkdir()
     files = {"mine.py": CLASS, "inner/deep.py": "X = 1\n", "inner/kernel.cu": "int x;\n", "notes.txt": "a"}
     for name, text in files.items():
         (home / "pack" / name).write_text(text)  # without __init__.py: a namespace
@@ -253,3 +264,82 @@ def test_a_module_whose_file_is_gone_has_no_digest(tmp_path: Path) -> None:
     assert keys._digest_on_disk(spec) is None
     (tmp_path / "passing.py").write_text(SOURCE)
     assert keys._digest_on_disk(spec) == hashlib.sha256(SOURCE.encode()).hexdigest()
+
+
+def test_a_file_that_has_just_come_is_found(home: Path) -> None:
+    """Python keeps the list of a folder's files as long as the folder has the same time."""
+    assert module_digest("own_code") is None
+    state = home.stat()
+    (home / "own_code.py").write_text(CLASS)
+    os.utime(home, ns=(state.st_atime_ns, state.st_mtime_ns))
+    assert module_digest("own_code") == digest(home / "own_code.py")
+
+
+# ---- what enters a key
+
+
+@pytest.mark.parametrize(("one", "other"), [("f()", "g()"), ("1", "2"), ("if a:\n 'x'", "if a:\n 'y'")])
+def test_only_docstrings_are_left_out(one: str, other: str) -> None:
+    assert syntax_of(one.encode()) != syntax_of(other.encode())
+
+
+def test_a_digest_of_a_room_is_short() -> None:
+    assert {len(state) for state in edited(states_of(ROOMS["evaluate"])).values()} <= {16}
+
+
+def test_flat_settings_keep_empty_groups_only_if_asked() -> None:
+    nested = {"a": {"b": 1, "c": {}}, "d": {"e": {"f": None}}}
+    assert flatten(nested) == {"a.b": 1, "d.e.f": None}
+    assert flatten(nested, keep_empty=True) == {"a.b": 1, "a.c": {}, "d.e.f": None}
+
+
+@dataclass(frozen=True)
+class Own:
+    """A user's class; gsbench would leave ``threads`` out."""
+
+    threads: int = 2
+    place: Path = Path("a")
+    pair: tuple[int, ...] = (1, 2)
+    hidden: int = field(default=0, init=False)
+
+
+def test_a_users_class_enters_a_key_with_its_code_and_all_its_options() -> None:
+    user = UserCode({"tests": "0abc"}, {"densify": "tests.Own", "eval.extra.own": "gsbench.X"})
+    options = {"threads": 2, "place": "a", "pair": [1, 2]}
+    named = {"class": "tests.runs.test_keys.Own", "source": {"tests": "0abc"}} | options
+    assert options_of("densify", Own(), user) == named
+    assert options_of("eval", Own(), user, "eval.extra.own") == named  # defined elsewhere, whatever it is called
+    stage = Stage("scene", 1)  # of gsbench's own
+    assert [user.is_behind(stage, place) for place in ("densify", "eval.extra.own", "init")] == [True, False, False]
+    assert options_of("init", stage, user) == {
+        "class": "gsbench.runs.keys.Stage", "name": "scene", "version": 1, "resumable": False, "scratch": []
+    }  # fmt: skip
+
+
+def test_a_rasterizer_enters_a_key_by_its_name_or_as_a_users_class() -> None:
+    rasterizer = SimpleNamespace(name="cpu")  # defined outside gsbench
+    assert rasterizer_inputs(rasterizer, UserCode({"m": "1"})) == {
+        "name": "cpu", "class": "types.SimpleNamespace", "source": {"m": "1"}
+    }  # fmt: skip
+    assert rasterizer_inputs(Stage("cpu", 1)) == "cpu"
+
+
+def test_a_step_has_the_rooms_that_differ_and_asks_for_edits_only_of_processes(
+    home: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(keys, "states_of", lambda rooms: {"scene": "released", "init": "1234"})
+    monkeypatch.setattr(keys, "changed_since_asked", lambda rooms: ["init"])
+    (home / "own_code.py").write_text(CLASS)
+    importlib.import_module("own_code")
+    user = UserCode({"own_code": str(module_digest("own_code"))})
+    step = step_of(keys.CAPTURE, {"x": 1}, lambda folder: None, user, in_processes=True)
+    assert step.inputs == {"x": 1, "code": {"init": "1234"}}
+    assert step.code == {"scene": "released", "init": "1234"}
+    with pytest.raises(InputError, match="gsbench's init changed while scene ran"):
+        step.check()
+    (home / "own_code.py").write_text(CLASS + CLASS)
+    with pytest.raises(InputError, match="gsbench's init, the code of own_code changed"):
+        step.check()
+    step_of(keys.CAPTURE, {"x": 1}, lambda folder: None, user).check()
+    monkeypatch.setattr(keys, "states_of", lambda rooms: {"scene": "released"})
+    assert step_of(keys.CAPTURE, {"x": 1}, lambda folder: None).inputs == {"x": 1}

@@ -90,6 +90,32 @@ def test_damage_is_named_and_mended(store: Store, name: str, damage: str, caplog
     assert "damaged" in message
     assert name in message
     assert store.get(Step(LETTERS, {"x": 1}, refuse)).cached
+    assert not list(store.root.glob("*/.*.removed"))
+
+
+def test_damage_is_removed_over_what_a_killed_removal_left(store: Store) -> None:
+    path = store.get(Step(LETTERS, {"x": 1}, write_letters)).path
+    left = path.with_name(f".{path.name}.removed")
+    left.mkdir()
+    (left / "file").touch()
+    (path / "a.txt").unlink()
+    assert not store.get(Step(LETTERS, {"x": 1}, write_letters)).cached
+    assert not left.exists()
+
+
+def test_a_file_of_another_size_or_kind_is_damaged_whatever_its_time(store: Store) -> None:
+    folder = store.get(Step(LETTERS, {"x": 1}, write_letters)).path
+    path = folder / "a.txt"
+    state = path.stat()
+    path.write_text("alpha beta")
+    os.utime(path, ns=(state.st_atime_ns, state.st_mtime_ns))
+    with pytest.raises(ValueError, match=r"a\.txt differs"):
+        read_manifest(folder)
+    path.unlink()
+    (folder / "copy.txt").write_text("alpha")
+    path.symlink_to("copy.txt")
+    with pytest.raises(ValueError, match=r"a\.txt differs"):
+        read_manifest(folder)
 
 
 def test_every_flipped_bit_of_a_manifest_is_noticed_or_harmless(store: Store) -> None:
@@ -135,8 +161,11 @@ def test_a_flipped_bit_is_found_before_a_result_becomes_an_input(
     assert not later.get(step).cached
     assert "is damaged" in caplog.text
     assert path.read_bytes() == bytes(range(256))
+    reader = Store(store.root)
+    reader.get(step)
     monkeypatch.setattr("gsbench.runs.store.read_manifest", compare_no_checksums)
     assert later.get(step).cached
+    assert reader.get(step).cached
 
 
 def compare_no_checksums(folder: Path, thorough: bool = False) -> Manifest:
@@ -182,6 +211,32 @@ def test_resumable_build_finds_what_was_left_without_temporaries(store: Store) -
     assert set(read_manifest(entry.path).outputs) == {"half.txt", "rest.txt"}
 
 
+def test_a_killed_build_goes_on_without_its_links_and_its_torn_manifest(store: Store) -> None:
+    stage, seen = Stage("long", 1, resumable=True), list[tuple[Stage, Path]]()
+    step = Step(stage, {}, lambda folder: None)
+    partial = store.partial(stage, step.key)
+    partial.mkdir(parents=True)
+    (partial / MANIFEST).write_text("{")
+    (partial / "half.txt").write_text("half")
+    (partial / "link").symlink_to("half.txt")
+    store.on_build = lambda stage, folder: seen.append((stage, folder))
+    entry = store.get(step)
+    assert 0 <= entry.seconds < 60
+    assert seen == [(stage, partial)]
+    assert set(read_manifest(entry.path).outputs) == {"half.txt"}
+    assert not partial.exists()
+
+
+def test_files_are_on_the_disk_before_their_manifest_and_the_folder_after_it_is_named(
+    store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    synced: list[tuple[str, bool]] = []
+    note = lambda path: synced.append((path.name, (path.parent / MANIFEST).exists()))  # noqa: E731
+    monkeypatch.setattr("gsbench.runs.store.sync_to_disk", note)
+    store.get(Step(LETTERS, {"x": 1}, write_letters))
+    assert synced == [("a.txt", False), ("b.bin", False), ("letters", False)]
+
+
 def test_killed_between_manifest_and_rename_is_only_published(store: Store) -> None:
     entry = store.get(Step(LETTERS, {"x": 1}, write_letters))
     os.replace(entry.path, store.partial(LETTERS, entry.key))
@@ -197,14 +252,19 @@ def test_sweep_removes_leftovers_and_leaves_what_serves(store: Store) -> None:
     useful = store.partial(long, "1" * 64)
     useless = store.partial(LETTERS, "2" * 64)
     half_removed = store.root / "long" / ".33.removed"
-    for folder in (stale, useful, useless, half_removed):
+    old, young = store.root / "views" / ".old", store.root / "views" / ".young"
+    for folder in (stale, useful, useless, half_removed, old, young):
         folder.mkdir(parents=True)
         (folder / "file").write_text("x")
+    (store.root / "views" / ".file").touch()
+    for path, hours in ((old, 25), (young, 23), (store.root / "views" / ".file", 25)):
+        os.utime(path, (time.time() - hours * 3600,) * 2)
     store.sweep([long, LETTERS])
     assert useful.exists()
     assert not stale.exists()
     assert not useless.exists()
     assert not half_removed.exists()
+    assert sorted(path.name for path in (store.root / "views").iterdir()) == [".file", ".young"]
     assert store.get(Step(long, {"x": 1}, refuse)).cached
 
 

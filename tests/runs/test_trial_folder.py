@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import re
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -12,6 +14,9 @@ from gsbench import cli
 from gsbench.analysis.results import load_experiment, read_views
 from gsbench.errors import InputError
 from gsbench.launch.states import states_of_experiment
+from gsbench.parsing import DamagedError
+from gsbench.runs import trial_folder
+from gsbench.runs.keys import config_hash, sha256_of
 from gsbench.runs.trial_folder import TrialFolder
 from tests.fuzz.records import EXPERIMENT, write_trial
 
@@ -99,3 +104,152 @@ def test_a_failed_trial_leaves_when_its_class_was_mended(trial: Path) -> None:
     edit(old / "config.yaml", '"volume_threshold": 0.04', '"volume_threshold": 0.03')
     (trial / "results.json").unlink()  # nothing has taken its place
     assert {one.folder: one.state for one in states_of_experiment(trial.parents[2])}[old] == "failed"
+
+
+def test_a_folder_knows_its_place(trial: Path) -> None:
+    folder = TrialFolder(trial)
+    values = folder.settings()
+    assert TrialFolder.of(values).path == trial
+    assert (folder.runs, folder.home) == (trial.parents[3], trial.parents[2])
+    hash8 = trial.name.partition("-")[0]
+    assert folder.key == f"courtyard/sfm-adc/{hash8}"
+    assert folder.label == f"courtyard/sfm-adc seed 0 ({hash8})"
+    assert folder.lock == trial / ".lock"
+
+
+def test_states_are_told_from_the_files(tmp_path: Path) -> None:
+    folder = TrialFolder(tmp_path / "x" / "s" / "a-b" / "01234567-seed0")
+    folder.path.mkdir(parents=True)
+    assert (folder.state(), folder.has_failed()) == ("missing", False)
+    (folder.path / "config.yaml").touch()
+    assert (folder.state(), folder.has_failed()) == ("partial", False)
+    assert folder.failure().message == "failed.json cannot be read"
+    (folder.path / "failed.json").write_text('{"error": "E", "message": "why"}')
+    assert (folder.state(), folder.has_failed(), folder.failure().reason) == ("failed", True, "why")
+    (folder.path / "results.json").write_text("{}")
+    assert folder.state() == "damaged"
+
+
+def test_the_stage_and_the_last_iteration_of_a_training(tmp_path: Path) -> None:
+    folder = TrialFolder(tmp_path)
+    assert folder.stage_and_step() == ("", 0)
+    (tmp_path / "building.json").write_text(json.dumps({"stage": "train", "folder": str(tmp_path / "built")}))
+    assert folder.stage_and_step() == ("train", 0)
+    (tmp_path / "built").mkdir()
+    rows = "".join(json.dumps({"step": step, "loss": 0.1}) + "\n" for step in range(1000))
+    (tmp_path / "built" / "metrics.jsonl").write_text(rows + '{"step": 10')
+    assert folder.stage_and_step() == ("train", 10)
+    (tmp_path / "built" / "metrics.jsonl").write_text('{"step": 7' + " " * 5000)  # only the end of a large file is read
+    assert folder.stage_and_step() == ("train", 0)
+
+
+def test_a_configuration_that_cannot_be_used_is_refused(trial: Path) -> None:
+    assert TrialFolder(trial).configuration()["allow_targets"] == []
+    edit(trial / "config.yaml", '"seed": 0', '"seed": "0"')
+    with pytest.raises(DamagedError, match="seed is '0'"):
+        TrialFolder(trial).configuration()
+    (trial / "config.yaml").unlink()
+    with pytest.raises(InputError, match="give the command of the trial again"):
+        TrialFolder(trial).configuration()
+
+
+def test_equal_results_keep_their_time_and_others_do_not(trial: Path) -> None:
+    folder, path = TrialFolder(trial), trial / "results.json"
+    values, record = folder.settings(), folder.record()
+    os.utime(path, ns=(1, 1))
+    assert folder.write_finished(values, record)
+    assert path.stat().st_mtime_ns == 1
+    assert not folder.write_finished(values, replace(record, iterations=record.iterations + 1))
+    assert path.stat().st_mtime_ns > 1
+    path.unlink()
+    assert not folder.write_finished(values, record, entries={"train": trial})
+    assert path.read_text().startswith('{\n "status": "complete",\n')
+    made_of = folder.made_of()
+    assert made_of is not None
+    assert made_of.entries == {"train": str(trial)}
+    assert set(made_of.published) == {"per_view.csv", "metrics.jsonl", "events.jsonl", "volume_histograms.jsonl"}
+    assert set(made_of.digests) == set(made_of.published)
+
+
+def test_only_small_files_and_what_tables_read_are_compared_by_content(
+    trial: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = TrialFolder(trial)
+    values, record = folder.settings(), folder.record()
+    for name, size in (("small.png", 4), ("large.png", 5)):
+        (trial / name).write_bytes(bytes(size))
+    monkeypatch.setattr(trial_folder, "MAX_HASHED_BYTES", 4)
+    folder.write_finished(values, record, published=[trial / "small.png", trial / "large.png"])
+    made_of = folder.made_of()
+    assert made_of is not None
+    assert made_of.published.keys() - made_of.digests.keys() == {"large.png"}
+
+
+def test_views_are_checked_and_read_without_what_is_empty(trial: Path) -> None:
+    (trial / "results.json").unlink()
+    path = trial / "per_view.csv"
+    path.write_text("view,psnr,ssim\na,1e30,\nb,-2,0.5\n")
+    assert TrialFolder(trial).views() == {"a": {"psnr": 1e30}, "b": {"psnr": -2.0, "ssim": 0.5}}
+    for value in ("1.1e30", "-1.1e30", "nan", "inf", "much"):
+        path.write_text(f"view,psnr\na,{value}\n")
+        with pytest.raises(DamagedError, match="is damaged"):
+            TrialFolder(trial).views()
+
+
+def test_a_changed_file_is_found_though_the_results_were_not_read_before(trial: Path) -> None:
+    edit(trial / "per_view.csv", "25.5", "24.5")
+    with pytest.raises(DamagedError, match=r"per_view\.csv was changed after it was written"):
+        TrialFolder(trial).views()
+
+
+def test_pictures_are_sorted_by_name(trial: Path) -> None:
+    (trial / "renders").mkdir()
+    for name in ("b.png", "a.png", "c.txt"):
+        (trial / "renders" / name).touch()
+    assert [path.name for path in TrialFolder(trial).pictures("renders")] == ["a.png", "b.png"]
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "reason"),
+    [
+        (("hashes", "config"), "0", "of another configuration"),
+        (("made_of", "config"), "0", "of another configuration"),
+        (("made_of", "stages", "train"), 1, r"by version 1 of the stage train, which is now at \d"),
+        (("made_of", "stages", "gone"), 3, "by version 3 of the stage gone, which is now at None"),
+        (("made_of", "pycolmap"), "0.1", r"with pycolmap 0\.1, and .* is installed"),
+        (("made_of", "sources"), {"/nowhere/a.png": [1, 2, 3]}, r"/nowhere/a\.png cannot be read"),
+        (("made_of", "folders"), {"/nowhere": 1}, "files have come to /nowhere, or gone"),
+        (("made_of", "published", "per_view.csv"), [1, 2], r"per_view\.csv has changed"),
+        (("made_of", "digests", "per_view.csv"), "0", r"per_view\.csv has changed"),
+        (("made_of", "entries"), {"train": "/nowhere"}, "its stage train in the store is damaged or gone"),
+    ],
+)
+def test_what_has_changed_since_is_named(trial: Path, place: tuple[str, ...], value: object, reason: str) -> None:
+    folder, path = TrialFolder(trial), trial / "results.json"
+    values = folder.settings()
+    folder.write_finished(values, replace(folder.record(), hashes={"config": config_hash(values)}))
+    assert folder.why_not_done(values) == ""
+    content = json.loads(path.read_text())
+    inner = content
+    for key in place[:-1]:
+        inner = inner[key]
+    inner[place[-1]] = value
+    content["made_of"]["results"] = sha256_of({key: own for key, own in content.items() if key != "made_of"})
+    path.write_text(json.dumps(content))
+    assert re.search(reason, folder.why_not_done(values))
+
+
+def test_a_metric_that_can_be_computed_by_now_is_a_reason(trial: Path) -> None:
+    folder = TrialFolder(trial)
+    values = folder.settings() | {"eval": {"primary": "x"}}
+    asked: list[dict[str, object]] = []
+    unavailable = lambda options: asked.append(options) or {"flip"}  # noqa: E731
+    record = replace(folder.record(), hashes={"config": config_hash(values)})
+    folder.write_finished(values, record)
+    assert (folder.why_not_done(values, unavailable), asked) == ("", [])  # asking loads torch
+    folder.write_finished(values, replace(record, awaited=["flip"]))
+    assert (folder.why_not_done(values, unavailable), asked) == ("", [values["eval"]])
+    folder.write_finished(values, replace(record, awaited=["lpips_vgg", "flip"]))
+    assert folder.why_not_done(values, unavailable) == "it lacks lpips_vgg, which can be computed now"
+    (trial / "results.json").unlink()
+    assert folder.why_not_done(values) == "results.json is not there, or not complete"

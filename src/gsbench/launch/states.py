@@ -232,14 +232,6 @@ SHARED = ((True, True, True), (True, False, True), (True, False, False), (False,
 SIZE_SETTINGS = ("name", "path", "width", "height", "downscale", "max_size")  # of a scene: they determine its pixels
 
 
-@dataclass(frozen=True)
-class Estimate:
-    """Expected seconds of work, and the number of finished trials that the estimate is from (0: no estimate)."""
-
-    seconds: float
-    learned_from: int
-
-
 @dataclass
 class _Times:
     """Sums over finished trials."""
@@ -282,18 +274,12 @@ class FinishedTrials:
         others = (folder for folder in self._folders.get(trial.path.name, ()) if folder != trial.path)
         return next((folder.relative_to(trial.runs).parts[0] for folder in others), None)
 
-    def estimate(self, values: Mapping[str, Any]) -> Estimate:
-        """Seconds for the whole trial with ``values``, from the most similar finished trials with its rasterizer.
+    def estimate(self, values: Mapping[str, Any]) -> tuple[float, int]:
+        """Seconds for the whole trial with ``values``, and the number of finished trials that this is known from.
 
-        Times are taken per iteration and pixel. There is no estimate for photographs that no trial has read, since
-        their size is unknown, and for a damaged configuration, which ``gsbench status`` may pass.
+        These are the most similar ones with its rasterizer. Times are taken per iteration and pixel. There is no
+        estimate, ``(0, 0)``, for photographs that no trial has read, since their size is unknown.
         """
-        try:
-            return self._estimate(values)
-        except (KeyError, TypeError, AttributeError, ArithmeticError):
-            return Estimate(0.0, 0)
-
-    def _estimate(self, values: Mapping[str, Any]) -> Estimate:
         names = tuple(values[group]["name"] for group in ("scene", "init", "densify"))
         scene = values["scene"]
         pixels = self._pixels.get(_size_key(scene))
@@ -305,8 +291,8 @@ class FinishedTrials:
             times = self._times.get((values["raster"]["name"], shared, *compress(names, shared)))
             if times is not None and pixels is not None:
                 seconds = pixels * (times.train * values["train"]["iterations"] + times.evaluate)
-                return Estimate(seconds / times.count, times.count)
-        return Estimate(0.0, 0)
+                return seconds / times.count, times.count
+        return 0.0, 0
 
 
 def _size_key(scene: Mapping[str, Any]) -> str:
@@ -332,11 +318,11 @@ def describe_plan(trials: Sequence[Trial], parallel: int = 1) -> list[str]:
         elif experiment := finished.elsewhere(folder):
             note = f"  as in {experiment}: nothing to compute"
         else:
-            estimate = finished.estimate(trial.values)
+            seconds, known_from = finished.estimate(trial.values)
             done = folder.stage_and_step()[1] / max(1, trial.values["train"]["iterations"])
-            remaining += estimate.seconds * (1 - min(1.0, done))
-            learned_from = max(learned_from, estimate.learned_from)
-            without_estimate += estimate.learned_from == 0
+            remaining += seconds * (1 - min(1.0, done))
+            learned_from = max(learned_from, known_from)
+            without_estimate += known_from == 0
         counts[state] += 1
         lines.append(f"{state:<8} {folder.label}{note}")
     summary = ", ".join(f"{counts[state]} {state}" for state in STATES if counts[state])

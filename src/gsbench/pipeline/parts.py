@@ -36,7 +36,7 @@ from gsbench.raster.executors import AUTO, offers, resolve
 from gsbench.runs.experiments import metric_and_question
 from gsbench.runs.keys import OWN, UserCode, module_digest, unnamed_modules, user_modules
 from gsbench.scene.options import SceneConfig
-from gsbench.settings import check_values, option_fields, unknown_setting
+from gsbench.settings import check_values, unknown_setting
 from gsbench.system.resources import available_threads
 from gsbench.train.device import select_device
 from gsbench.train.options import TrainConfig
@@ -191,16 +191,14 @@ def build(group: str, values: dict[str, Any], allow_targets: list[str]) -> Any:
     require_values(values, group)
     options = {key: value for key, value in values.items() if key not in RESERVED}
     own = target.startswith(OWN)
+    _check_names(cls, target, options, group)
     if dataclasses.is_dataclass(cls) and not own:
-        _check_fields(cls, target, options, group)
         options = check_values(cls, options, group)
-    else:
-        _check_names(cls, options, group)
-        if options and not own:
-            raise InputError(
-                f"{group}._target_={target} has options but is not a dataclass: make it one, so that results are "
-                "stored under their values"
-            )
+    elif options and not own:
+        raise InputError(
+            f"{group}._target_={target} has options but is not a dataclass: make it one, so that results are stored "
+            "under their values"
+        )
     try:
         return cls(**options)
     except InputError:
@@ -211,20 +209,6 @@ def build(group: str, values: dict[str, Any], allow_targets: list[str]) -> Any:
         if own:
             raise
         raise InputError(f"{group}: {target} cannot be made ({type(error).__name__}: {error})") from error
-
-
-def _check_fields(cls: type, target: str, options: dict[str, Any], group: str) -> None:
-    """Raise InputError for a setting that the user's class lacks.
-
-    Such a setting mostly belongs to the choice (``densify=adc``) whose class the user replaced.
-    """
-    fields = [field.name for field in option_fields(cls)]
-    if unknown := next((name for name in options if name not in fields), None):
-        key = f"{group}.{unknown}"
-        raise InputError(
-            f"{key} is not a setting{did_you_mean(unknown, fields)} ({target} has: {', '.join(fields) or 'none'}); "
-            f"remove it by ~{key}, or start from another choice, {group}=NAME"
-        )
 
 
 def build_rasterizer(
@@ -277,14 +261,22 @@ def build_metrics(values: dict[str, Any], allow_targets: list[str]) -> dict[str,
     return metrics
 
 
-def _check_names(cls: Any, options: dict[str, Any], group: str) -> None:
-    """Raise InputError for an option that the constructor of ``cls`` does not take."""
+def _check_names(cls: Any, target: str, options: dict[str, Any], group: str) -> None:
+    """Raise InputError for an option that the constructor of ``cls`` does not take.
+
+    An option that a user's class lacks mostly belongs to the choice (``densify=adc``) whose class the user replaced.
+    """
     parameters = inspect.signature(cls).parameters
-    if any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values()):
+    unknown = next((name for name in options if name not in parameters), None)
+    if unknown is None or any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values()):
         return
-    for key in options:
-        if key not in parameters:
-            raise InputError(unknown_setting(f"{group}.{key}", key, parameters))
+    key = f"{group}.{unknown}"
+    if target.startswith(OWN):
+        raise InputError(unknown_setting(key, unknown, parameters))
+    raise InputError(
+        f"{key} is not a setting{did_you_mean(unknown, parameters)} ({target} has: {', '.join(parameters) or 'none'}); "
+        f"remove it by ~{key}, or start from another choice, {group}=NAME"
+    )
 
 
 def locate(target: str, group: str, allow_targets: list[str]) -> type:

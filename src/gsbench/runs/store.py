@@ -34,7 +34,7 @@ from gsbench.system.locks import BusyError, hold
 
 log = logging.getLogger(__name__)
 
-LEFTOVER_AGE = 24 * 3600.0  # seconds after which temporary folders that no lock guards are removed
+LEFTOVER_AGE = 86_400.0  # seconds after which temporary folders that no lock guards are removed
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -135,7 +135,9 @@ class Store:
     def _build(self, step: Step) -> StoredResult:
         """Build or finish the partial folder, and publish it. The caller holds the lock of the step's key."""
         final, partial, stage = self.path(step), self.partial(step.stage, step.key), step.stage
-        seconds = _finished_seconds(partial, step.key)
+        seconds = None
+        with suppress(ValueError):  # else the build was killed between writing the manifest and publishing
+            seconds = read_manifest(partial, step.key).seconds
         if seconds is None:
             if partial.exists() and not stage.resumable:
                 _remove(partial)
@@ -163,7 +165,8 @@ class Store:
             for partial in (self.root / stage.name).glob(".*.partial"):
                 key = partial.name[1 : -len(".partial")]
                 if not stage.resumable or self.folder(stage, key).exists():
-                    with suppress(BusyError, OSError), hold(partial.with_name(f".{key}.lock"), key, wait=False):
+                    lock = partial.with_name(f".{key}.lock")
+                    with suppress(BusyError), suppress(OSError), hold(lock, key, wait=False):
                         _remove(partial)
             for removed in (self.root / stage.name).glob(".*.removed"):
                 shutil.rmtree(removed, ignore_errors=True)
@@ -228,16 +231,6 @@ def _is_sound(folder: Path, name: str, recorded: Output, thorough: bool) -> bool
         return file_sha256(path) == recorded.sha256
     except (OSError, ValueError, InputError):  # ValueError: a NUL in the name, or another folder
         return False
-
-
-def _finished_seconds(partial: Path, key: str) -> float | None:
-    """The build's time if it was killed between writing the manifest and publishing; None for any other build."""
-    if not (partial / MANIFEST).exists():
-        return None
-    try:
-        return read_manifest(partial, key).seconds
-    except ValueError:
-        return None
 
 
 def _remove(folder: Path) -> None:

@@ -318,7 +318,7 @@ def _number(text: str) -> float:
 MADE_OF = "made_of"  # the key in results.json
 READ_LATER = (layout.PER_VIEW, layout.CURVES, layout.EVENTS, layout.HISTOGRAMS)  # files that tables and reports read
 # Files up to so many bytes are compared by content, since a flipped bit changes neither size nor time.
-MAX_HASHED_BYTES = 1 << 20
+MAX_HASHED_BYTES = 1e6
 
 _digests: dict[Stamp, str] = {}  # sha256 of files that this process has read, by device, inode and stamp
 

@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import pytest
 import torch
-from PIL import Image
+from PIL import Image, ImageDraw, ImageFont
 
 from gsbench.events import Cause
 from gsbench.gaussians.model import Gaussians
+from gsbench.pipeline.steps import evaluate
 from gsbench.pipeline.steps.evaluate import _with_legend, draw_ellipsoids
 from tests.train.conftest import orbit_camera
 
@@ -41,9 +43,41 @@ def test_only_the_voluminous_is_outlined() -> None:
     assert abs(distances.mean() - radius) < 0.3
     assert abs(columns.mean() - (camera.cx - 0.5)) < 0.3
     assert abs(rows.mean() - (camera.cy - 0.5)) < 0.3
+    angles = np.sort(np.arctan2(rows - (camera.cy - 0.5), columns - (camera.cx - 0.5)))
+    assert np.diff(angles, append=angles[0] + math.tau).max() < 0.3  # closed
 
 
-def test_a_word_wider_than_the_picture_leaves_no_line_empty() -> None:
-    wide, narrow = (_with_legend(Image.new("RGB", (width, 10)), "illegible", []).height for width in (500, 5))
-    assert narrow == wide
-    assert _with_legend(Image.new("RGB", (5, 10)), "illegible too", []).height - wide == wide - 10  # a line each
+def test_of_too_many_the_most_voluminous_are_outlined(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(evaluate, "MAX_OUTLINES", 1)
+    gaussians = Gaussians(
+        means=torch.tensor([[0.0, 0.0, 4.0]] * 2),
+        log_scales=torch.tensor([[-0.5] * 3, [0.0] * 3]),
+        quaternions=torch.tensor([[1.0, 0, 0, 0]] * 2),
+        opacity_logits=torch.zeros(2),
+        sh_dc=torch.zeros(2, 3),
+        sh_rest=torch.zeros(2, 15, 3),
+    )
+    camera = orbit_camera(0.0)
+    causes = torch.tensor([int(Cause.CLONE), int(Cause.ADDED)])
+    black = np.zeros((camera.height, camera.width, 3), dtype=np.uint8)
+    drawn = np.asarray(draw_ellipsoids(black, gaussians, causes, camera, 0.03))[: camera.height]
+    assert {tuple(color) for color in drawn[drawn.any(-1)].tolist()} == {Cause.ADDED.color}
+
+
+@pytest.mark.parametrize("words_in_a_line", [3, 2, 1])
+def test_a_legend_stands_below_the_picture_word_by_word(words_in_a_line: int) -> None:
+    """Words of 11 px, each half of that after the one before, 14 px a line, 2 px from the left."""
+    font = ImageFont.load_default(11)
+    words = [("title", (255, 255, 255)), ("word", (255, 255, 255)), (Cause.CLONE.words, Cause.CLONE.color)]
+    first, second, third = (math.ceil(font.getlength(text)) + 5 for text, _ in words)
+    width, at = {
+        3: (first + second + third, [(2, 0), (2 + first, 0), (2 + first + second, 0)]),
+        2: (first + second, [(2, 0), (2 + first, 0), (2, 1)]),
+        1: (5, [(2, 0), (2, 1), (2, 2)]),
+    }[words_in_a_line]
+    image = Image.fromarray(np.full((10, width, 3), 90, dtype=np.uint8))
+    expected = Image.new("RGB", (width, 10 + 14 * (at[-1][1] + 1)))
+    expected.paste(image, (0, 0))
+    for (text, color), (left, line) in zip(words, at, strict=True):
+        ImageDraw.Draw(expected).text((left, 10 + 14 * line), text, fill=color, font=font)
+    np.testing.assert_array_equal(_with_legend(image, "title word", [Cause.CLONE]), expected)

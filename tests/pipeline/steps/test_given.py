@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shlex
 import sys
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,16 +16,22 @@ import pytest
 import torch
 from PIL import Image
 
+from gsbench.densify import ADC
 from gsbench.errors import InputError, TrainingError
 from gsbench.external.settings import External
-from gsbench.gaussians.ply import write_ply
-from gsbench.init.base import MODEL_FOLDER
+from gsbench.gaussians.ply import read_ply, write_ply
+from gsbench.init.base import GAUSSIANS_FILE, MODEL_FOLDER
+from gsbench.pipeline.steps import scene as scene_steps
+from gsbench.pipeline.steps import train as train_steps
 from gsbench.pipeline.steps.scene import init_step
-from gsbench.pipeline.steps.train import external_step
-from gsbench.runs.keys import INIT, Step
+from gsbench.pipeline.steps.train import external_step, train_step
+from gsbench.raster.reference import ReferenceRasterizer
+from gsbench.runs.keys import INIT, Step, UserCode
 from gsbench.runs.store import Store
 from gsbench.scene.colmap import write_model
 from gsbench.scene.types import Capture, Scene, View
+from gsbench.system.own_modules import SAFE_PATH
+from gsbench.train.options import WITHOUT_EFFECT_ON_MODEL, TrainConfig
 from tests.gaussians.helpers import random_gaussians
 from tests.train.conftest import orbit_camera
 
@@ -94,12 +101,77 @@ def test_a_program_is_given_the_training_views_and_the_settings(
     assert summary["trained_by"]["command"][2:4] == ["{data}", "{output}"]
     assert summary["trained_by"]["version"] == "7"
     assert summary["seconds"] > 0
+    assert summary["peak_memory_mb"] > 0
+    assert (step.stage.version, step.inputs["contract"]) == (1, 1)  # raised by hand
     assert sorted(path.name for path in folder.iterdir()) == [
         "events.jsonl", "lineage.npz", "point_cloud.ply", "trainer.log", "training.json",
     ]  # fmt: skip
     keys = {external_step(views, program, parts_of(seed)).key for seed in (5, 6)}
     assert len(keys) == 2
     assert step.key in keys
+
+
+@pytest.mark.parametrize(("minutes", "limit"), [(2.5, 150.0), (None, None)])
+def test_a_program_has_the_time_that_is_set(
+    views: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, minutes: float | None, limit: float | None
+) -> None:
+    given: list[Any] = []
+    ended = SimpleNamespace(seconds=1.0, peak_memory_mb=1.0)
+    monkeypatch.setattr(train_steps, "run_program", lambda *rest: given.append(rest) or ended)
+    step = external_step(views, trainer(tmp_path, "none", time_limit_minutes=minutes), parts_of())
+    with pytest.raises(TrainingError, match="ended well, but"):
+        step.build(tmp_path)
+    ((command, log_file, output, environment, seconds),) = given
+    assert command[:2] == [sys.executable, str(tmp_path / "program.py")]
+    assert (log_file, output) == (tmp_path / "trainer.log", tmp_path / "work" / "output")
+    assert environment["SET"] == "5"
+    assert seconds == limit
+
+
+def test_a_program_gets_the_environment_without_gsbenchs_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in (("GSBENCH_X", "1"), ("KEPT", "2"), SAFE_PATH):
+        monkeypatch.setenv(name, value)
+    found = train_steps.environment_of(trainer(tmp_path, "none"), {"seed": 5})
+    assert (found.get("GSBENCH_X"), found.get("KEPT"), found.get(SAFE_PATH[0]), found["SET"]) == (None, "2", None, "5")
+    monkeypatch.setenv(SAFE_PATH[0], "1")  # the user's own
+    assert train_steps.environment_of(trainer(tmp_path, "none"), {"seed": 5})[SAFE_PATH[0]] == "1"
+
+
+def test_a_training_leaves_its_model_its_lineage_and_its_summary(
+    views: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: list[tuple[Any, ...]] = []
+    reset: list[torch.device] = []
+    monkeypatch.setattr(train_steps, "progress", lambda title: nullcontext(lambda *counts: told.append(counts)))
+    monkeypatch.setattr(train_steps, "reset_peak_memory", reset.append)
+    cpu = torch.device("cpu")
+    parts: Any = SimpleNamespace(
+        densifier=ADC(), rasterizer=ReferenceRasterizer(), train=TrainConfig(iterations=2), seed=5, device=cpu,
+        measured_earlier=[1], user_code=UserCode(),
+    )  # fmt: skip
+    step = train_step(views, parts)
+    assert step.inputs["snapshots"] == [1]
+    assert set(WITHOUT_EFFECT_ON_MODEL).isdisjoint(step.inputs["train"])
+    folder = tmp_path / "built"
+    folder.mkdir()
+    step.build(folder)
+    summary = json.loads((folder / "training.json").read_text())
+    assert (summary["iterations"], summary["num_init_points"], summary["num_gaussians"]) == (2, 7, 7)
+    assert summary["causes"]["initial"] == 7
+    assert len(read_ply(folder / "point_cloud.ply", cpu)) == 7
+    with np.load(folder / "lineage.npz") as lineage:
+        assert len(lineage["ids"]) == 7
+    assert reset == [cpu]
+    assert told[-1][:3] == ("iteration", 2, 2)
+    parts.measured_earlier = []
+    assert "snapshots" not in train_step(views, parts).inputs
+
+
+def test_training_starts_from_gaussians_where_the_initialiser_left_some(views: Any) -> None:
+    init, cpu = views.store.path(CLOUD_STEP), torch.device("cpu")
+    assert len(train_steps.initial_gaussians(init, cpu)) == 7
+    write_ply(random_gaussians(9, dtype=torch.float32), init / GAUSSIANS_FILE)
+    assert len(train_steps.initial_gaussians(init, cpu)) == 9
 
 
 def test_a_program_without_a_result_is_named_with_its_log(views: Any, tmp_path: Path) -> None:
@@ -147,13 +219,16 @@ class Noting:
 
 @pytest.mark.parametrize("has_reference", [False, True])
 def test_an_initialiser_gets_the_cameras_that_stand_in_for_those_that_did_not_come(
-    tmp_path: Path, has_reference: bool
+    tmp_path: Path, has_reference: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    told: list[tuple[Any, ...]] = []
+    monkeypatch.setattr(scene_steps, "progress", lambda title: nullcontext(lambda *counts: told.append(counts)))
     Image.new("RGB", (4, 4)).save(tmp_path / "a.png")
     store, capture = Store(tmp_path / "store"), Capture("made", tmp_path, ("a.png",), (), None, False, "0")
     reference = CLOUD_STEP if has_reference else None
     step = init_step(store, capture, Noting(), reference)  # type: ignore[arg-type]
     step.build(tmp_path)
+    assert told == [("photographs", 1, 1)]
     assert (tmp_path / "given").read_text() == str(store.path(CLOUD_STEP) / MODEL_FOLDER if has_reference else None)
     assert step.inputs["reference"] == (CLOUD_STEP.key if has_reference else None)
     assert step.inputs["options"]["count"] == 3

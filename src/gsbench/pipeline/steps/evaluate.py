@@ -228,19 +228,19 @@ def draw_ellipsoids(
     """
     volumes = log_volume(gaussians.log_scales)  # [N]
     large = (volumes > math.log(volume_threshold)) & (gaussians.opacities > MIN_OPACITY)
-    index = large.nonzero().squeeze(-1)
+    index = large.nonzero().flatten()
     index = index[torch.argsort(volumes[index], descending=True)][:MAX_OUTLINES]
     projected = project(gaussians.select(index).map(lambda tensor: tensor.detach().double().cpu()), camera)
     image = Image.fromarray(render).convert("RGB")
     canvas = ImageDraw.Draw(image)
-    angles = np.linspace(0, 2 * math.pi, OUTLINE_POINTS)
+    angles = np.linspace(0, math.tau, OUTLINE_POINTS)
     circle = np.stack([np.cos(angles), np.sin(angles)])  # [2, K]
     for mean, conic, member in zip(projected.means, projected.conics, projected.index, strict=True):
         a, b, c = conic.tolist()
         covariance = np.linalg.inv(np.array([[a, b], [b, c]]))  # px^2
         outline = np.linalg.cholesky(covariance) @ circle + mean.numpy()[:, None]  # [2, K]
         color = Cause(int(causes[index[member]])).color
-        canvas.line([tuple(point) for point in outline.T.round().astype(int).tolist()], fill=color, width=1)
+        canvas.line([tuple(point) for point in outline.T.round().astype(int).tolist()], fill=color)
     drawn = [cause for cause in Cause if (causes[index[projected.index]] == int(cause)).any()]
     condition = f"with a volume above {volume_threshold:g}"
     title = f"Gaussians {condition}, by what made them:" if drawn else f"no Gaussian {condition} here"
@@ -255,7 +255,7 @@ def _with_legend(image: Image.Image, title: str, causes: Sequence[Cause]) -> Ima
     x, row = 0, 0
     for text, _ in words:
         width = math.ceil(font.getlength(text)) + FONT_SIZE // 2
-        if x > 0 and x + width > image.width:
+        if x and x + width > image.width:
             x, row = 0, row + 1
         places.append((x + 2, row))
         x += width

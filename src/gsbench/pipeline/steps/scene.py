@@ -241,5 +241,6 @@ def init_step(
 def check_readable(capture: Capture, report: Progress) -> None:
     """Decode every photograph once, so that a damaged file is named before hours of work. Raises InputError."""
     with ThreadPoolExecutor(max_workers=available_threads()) as pool:
-        for done, _ in enumerate(pool.map(lambda name: read_image(capture.images / name).shape, capture.image_names)):
-            report("photographs", done + 1, len(capture.image_names))
+        made = pool.map(lambda name: read_image(capture.images / name).shape, capture.image_names)
+        for done, _ in enumerate(made, 1):
+            report("photographs", done, len(capture.image_names))

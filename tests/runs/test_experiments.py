@@ -1,0 +1,134 @@
+"""The records of an experiment: which experiments there are, the search for an arm's settings, declared questions."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from gsbench.errors import InputError
+from gsbench.parsing import DamagedError
+from gsbench.runs.experiments import (
+    Declaration,
+    Question,
+    experiment_home,
+    latest_declaration,
+    list_experiments,
+    make_home,
+    merge_planned,
+    open_question,
+    read_declarations,
+    read_tuning,
+    record_text,
+    trial_folders,
+)
+from gsbench.runs.trial_record import Declared
+
+POINTS = [{"settings": {"x": 0.5}, "value": 2.0}, {"settings": {"x": 1}, "value": 4.0}]
+TUNING = {
+    "sweep": "s", "arm": "sfm-adc", "metric": "psnr", "direction": 1, "wanted": 3, "seeds": [0], "scenes": ["garden"],
+    "ranges": {"x": "0,1"}, "log": ["x"], "as_it_is": False, "points": [*POINTS, {"settings": {}, "value": None}],
+}  # fmt: skip
+
+
+def test_experiments_are_folders_that_are_not_hidden(tmp_path: Path) -> None:
+    assert list_experiments(tmp_path / "nowhere") == []
+    for name in ("b", "a/scene/arm/trial", ".hidden", "store", "a/scene/.hidden/trial"):
+        (tmp_path / name).mkdir(parents=True)
+    (tmp_path / "file").touch()
+    (tmp_path / "a" / "scene" / "file").touch()
+    assert list_experiments(tmp_path) == ["a", "b"]
+    assert list(trial_folders(tmp_path / "a")) == [str(tmp_path / "a" / "scene" / "arm" / "trial")]
+    assert experiment_home(tmp_path, "b") == tmp_path / "b"
+    with pytest.raises(InputError, match=r"no experiment 'c' in .*; there: a, b"):
+        experiment_home(tmp_path, "c")
+
+
+def test_the_folder_of_an_experiment_is_made_but_no_link(tmp_path: Path) -> None:
+    make_home(tmp_path / "runs" / "x")
+    make_home(tmp_path / "runs" / "x")
+    assert (tmp_path / "runs" / "x").is_dir()
+    (tmp_path / "runs" / "link").symlink_to(tmp_path / "runs" / "x")
+    with pytest.raises(InputError, match="follows no links"):
+        make_home(tmp_path / "runs" / "link")
+
+
+def tuning(tmp_path: Path, **changes: Any) -> Any:
+    (tmp_path / "tuning.json").write_text(json.dumps(TUNING | changes))
+    return read_tuning(tmp_path)
+
+
+def test_the_best_point_is_the_one_with_the_best_value(tmp_path: Path) -> None:
+    assert tuning(tmp_path).best.value == 4.0
+    assert tuning(tmp_path, direction=-1).best.value == 2.0
+    assert tuning(tmp_path, direction=-1, points=[*POINTS, {"settings": {"x": 2.0}, "value": 0.0}]).best.value == 0.0
+    assert tuning(tmp_path, points=[{"settings": {}, "value": None}]).best is None
+
+
+@pytest.mark.parametrize(
+    ("points", "fault"),
+    [
+        ([*POINTS, {"settings": {"y": 1.0}, "value": 1.0}], "different settings"),
+        ([{"settings": {"x": 0.0}, "value": 1.0}], "not above 0"),
+        ([{"settings": {"x": -1}, "value": 1.0}], "not above 0"),
+    ],
+)
+def test_a_search_that_cannot_be_is_damaged(tmp_path: Path, points: list[Any], fault: str) -> None:
+    with pytest.raises(DamagedError, match=fault):
+        tuning(tmp_path, points=points)
+    if "above" in fault:
+        assert tuning(tmp_path, points=points, log=[]).points
+
+
+def declared(hour: int, *metrics: str, **values: Any) -> Declaration:
+    questions = tuple(open_question(metric) for metric in metrics)
+    return Declaration(time=f"1970-01-01T{hour:02d}:00:00Z", questions=questions, **values)
+
+
+def test_a_declaration_knows_its_time_and_its_metric() -> None:
+    one = declared(2, "psnr@extrapolation", "ssim")
+    assert one.moment == 7200
+    assert one.when == "1970-01-01 02:00 UTC"
+    assert one.primary == "psnr@extrapolation"
+    assert one.summary() == Declared(metric="psnr@extrapolation", time=one.time)
+    assert [(question.metric, question.sign) for question in one.questions] == [("psnr", 0), ("ssim", 0)]
+    assert Question(metric="psnr").sign == 1
+    with pytest.raises(ValueError, match="time is not a time"):
+        Declaration(time="yesterday")
+
+
+def test_planned_trials_are_those_of_the_declaration_and_of_its_questions() -> None:
+    asked = Question(metric="psnr", scenes={"garden": ("garden/a/1", "garden/b/2")}, seeds=(1, 0))
+    both = Declaration(time=declared(1).time, questions=(asked,), trials={"garden/a/1": (2,), "room/a/1": (0,)})
+    assert both.planned == {"garden/a/1": (0, 1, 2), "garden/b/2": (0, 1), "room/a/1": (0,)}
+    assert merge_planned({}, both.planned) == both.planned
+    named = [declared(1), declared(1, trials={}), declared(1, "psnr"), Declaration(time=both.time, questions=(asked,))]
+    assert [one.names_trials for one in named] == [False, True, False, True]
+
+
+def test_a_declaration_is_in_force_since_its_first_equal(tmp_path: Path) -> None:
+    first, second, third = declared(1, "psnr"), declared(2, "psnr"), declared(3, "psnr", missing={"a": ["b"]})
+    other, last = declared(2, "ssim"), declared(4, "ssim")
+    assert latest_declaration([first]) is first
+    assert latest_declaration([first, second]) is first
+    assert latest_declaration([first, second, third]) is first  # what could not be tested asks nothing else
+    assert latest_declaration([first, other, third]) is third
+    assert latest_declaration([first, second, last]) is last
+    assert latest_declaration([other, first, second, third]) is first
+
+
+def test_declarations_are_kept_in_the_order_of_time(tmp_path: Path) -> None:
+    first, second = declared(1, "psnr"), declared(2, "ssim", looks=(2, 3))
+    assert read_declarations(tmp_path) == []
+    text = record_text([second, first])
+    assert text.endswith("}\n")
+    (tmp_path / "declared.jsonl").write_text(text + '{"time": "1970-01-01T03:00:00Z"}\n')  # one that asks nothing
+    assert read_declarations(tmp_path) == [first, second]
+    repeated = [first.summary(), None, Declared(metric="lpips_vgg", time="1970-01-01T00:00:00Z")]
+    assert read_declarations(tmp_path, [*repeated, Declared(metric="psnr", time="?")]) == [
+        declared(0, "lpips_vgg"),
+        first,
+        second,
+    ]

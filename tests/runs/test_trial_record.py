@@ -1,0 +1,123 @@
+"""The types of a trial's files: what is left out has its default, and what cannot be is damaged."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from gsbench.parsing import DamagedError, parse_typed
+from gsbench.runs.trial_record import (
+    Failure,
+    Histogram,
+    MetricRecord,
+    UnfinishedError,
+    read_rows,
+    record_from,
+    split_text,
+    whole_lines,
+)
+
+RESULTS = {
+    "status": "complete", "experiment": "x", "scene": "s", "init": "a", "densify": "b", "seed": 0, "raster": "cpu",
+    "protocol": "paper-1", "iterations": 7, "metrics": {}, "unavailable": {}, "seconds": {}, "num_init_points": 1,
+    "num_gaussians": 2, "peak_memory_mb": 3.0, "hashes": {}, "versions": {},
+}  # fmt: skip
+PATH = Path("results.json")
+
+
+def record(**changes: Any) -> Any:
+    return record_from(json.dumps(RESULTS | changes).encode(), PATH)
+
+
+def test_results_without_a_count_are_those_of_renders_alone() -> None:
+    assert record().num_gaussians == 2
+    assert record(evaluated_from="renders").num_gaussians == 2
+    assert record(evaluated_from="renders", num_gaussians=None).num_gaussians is None
+    for evaluated_from in (None, "model"):
+        with pytest.raises(DamagedError, match="num_gaussians is not there"):
+            record(evaluated_from=evaluated_from, num_gaussians=None)
+
+
+def test_unfinished_results_are_told_from_damaged_ones() -> None:
+    with pytest.raises(UnfinishedError, match="is unfinished, its status is 'running'"):
+        record(status="running", seed="0")
+    with pytest.raises(UnfinishedError, match="is unfinished, its status is missing"):
+        record_from(b"{}", PATH)
+    with pytest.raises(DamagedError, match="seed is '0'") as caught:
+        record(seed="0")
+    assert not isinstance(caught.value, UnfinishedError)
+
+
+def test_what_is_not_told_of_a_metric_or_a_failure_has_its_default() -> None:
+    assert parse_typed(b'{"label": "a"}', MetricRecord, PATH) == MetricRecord(
+        label="a", direction=0, decimals=3, unit=""
+    )
+    empty = parse_typed(b"{}", Failure, PATH)
+    assert (empty.seed, empty.reason) == (0, "no reason was given")
+    assert Failure(error="E").reason == "E"
+    assert Failure(error="E", message=" first \nsecond").reason == "first"
+
+
+@pytest.mark.parametrize(
+    ("settings", "text"),
+    [
+        ({"split": "every_nth", "sectors": 8}, "every_nth"),
+        ({"split": "every_nth", "sectors": 8, "match_views": True}, "every_nth, matched with 8"),
+        ({"split": "sector", "sector": 0, "sectors": 8}, "sector 0 of 8"),
+        ({"split": "sector", "sector": 0, "sectors": 8, "match_views": True}, "sector 0 of 8, matched"),
+        ({"split": "every_nth", "train_list": "a.txt"}, "list"),
+        ({"split": "every_nth", "test_list": "a.txt", "match_views": True}, "list"),
+        ({"split": "every_nth", "validation": True}, "every_nth, validation"),
+    ],
+)
+def test_the_rule_of_a_split_in_words(settings: dict[str, Any], text: str) -> None:
+    assert split_text({f"scene.{name}": value for name, value in settings.items()}) == text
+
+
+@pytest.mark.parametrize(
+    ("row", "sound"),
+    [
+        ({"step": 0, "loss": 0.5}, True),
+        ({"step": 7, "loss": -1e30, "reset": True, "count": 2**62}, True),
+        ({"step": -1}, False),
+        ({"step": True}, False),
+        ({"step": 1.5}, False),
+        ({"loss": 0.5}, False),
+        ({"step": 1, "loss": 1e31}, False),
+        ({"step": 1, "loss": "x"}, False),
+    ],
+)
+def test_a_row_has_an_iteration_and_numbers(row: dict[str, Any], sound: bool, tmp_path: Path) -> None:
+    assert read_rows(tmp_path / "absent.jsonl") == []
+    path = tmp_path / "metrics.jsonl"
+    path.write_text(json.dumps({"step": 1}) + "\n" + json.dumps(row) + "\n")
+    assert read_rows(path) == [{"step": 1}, row][: 1 + sound]
+
+
+@pytest.mark.parametrize(
+    ("edges", "counts", "sound"),
+    [
+        ([-300, 300], [1], True),
+        ([-300.5, 300], [1], False),
+        ([-300, 300.5], [1], False),
+        ([0, 1, 2], [1, 0], True),
+        ([0, 1], [1, 0], False),
+        ([0, 1, 2, 3], [1, 0], False),
+    ],
+)
+def test_a_histogram_has_an_edge_more_than_counts(
+    edges: list[float], counts: list[float], sound: bool, tmp_path: Path
+) -> None:
+    path = tmp_path / "volume_histograms.jsonl"
+    path.write_text(json.dumps({"step": 3, "log10_edges": edges, "counts": counts}) + "\n")
+    assert len(read_rows(path, Histogram)) == sound
+
+
+def test_whole_lines_end_before_the_first_torn_one(tmp_path: Path) -> None:
+    path = tmp_path / "metrics.jsonl"
+    assert whole_lines(path) == []
+    path.write_text('{"step": 1, "x": "kept as it is"}\n{"step": 2}\n{"st')
+    assert whole_lines(path) == [('{"step": 1, "x": "kept as it is"}', 1), ('{"step": 2}', 2)]
