@@ -38,6 +38,9 @@ def test_shares_are_about_equal_and_parts_hold_few_images():
     pairs = list(itertools.combinations(range(1, 101), 2))
     parts = divide_pairs(pairs, 10)
     assert max(len({image for pair in part for image in pair}) for part in parts) <= 2 * 10
+    assert divide_pairs(list(itertools.combinations(range(1, 5), 2)), 2) == [
+        [(1, 2)], [(1, 3), (1, 4), (2, 3), (2, 4)], [(3, 4)],
+    ]  # fmt: skip
     sizes = [sum(map(len, share)) for share in distribute_parts(parts, 4)]
     assert max(sizes) - min(sizes) <= 10 * 10
 
