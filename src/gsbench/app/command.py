@@ -30,6 +30,7 @@ from gsbench.claims.stopping import KeyAndSeed, headline, plan_sweep, run_looks
 from gsbench.config import compose
 from gsbench.config.command_words import (
     bare_key,
+    check_removal,
     check_words,
     grid_points,
     is_interval,
@@ -272,8 +273,9 @@ class Sweep:
 
     def parse(self, words: Sequence[str]) -> list[Override]:
         """The words as Hydra reads them, with the choices of ``glob(*)``."""
-        for word in words:
-            parse_word(word)  # for its errors: words from a file were not checked before
+        for word in words:  # those from a file were not checked before
+            if (override := parse_word(word)).is_delete():
+                check_removal(override)
         with compose.explained(words):
             return OverridesParser.create(self.context.config_loader).parse_overrides(list(words))
 

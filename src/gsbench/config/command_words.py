@@ -82,11 +82,16 @@ def check_words(words: Sequence[str]) -> None:
         elif "@" in key:
             raise InputError(f"{word!r}: a group has one place, so leave out the @ and what follows it")
         elif override.is_delete():
-            group, dot, _ = key.partition(".")
-            if not dot or group not in (*COMPONENTS, "raster"):
-                raise InputError(f"{word!r}: a setting cannot be removed: give it another value")
+            check_removal(override)
         elif key in GROUPS and not _is_choice(override):
             raise InputError(f"{word!r}: choose one by its name: {key}={', '.join(options(key))}")
+
+
+def check_removal(override: Override) -> None:
+    """Raise InputError for a word that removes anything but an option of a class, which may have other options."""
+    group, dot, _ = bare_key(override.get_key_element()).partition(".")
+    if not dot or group not in (*COMPONENTS, "raster"):
+        raise InputError(f"{override.input_line!r}: a setting cannot be removed: give it another value")
 
 
 def typed_permissions(words: Sequence[str]) -> tuple[str, ...]:

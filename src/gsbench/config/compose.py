@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, redirect_stderr, suppress
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,7 @@ from gsbench.config.command_words import GROUPS, options, parse_word
 from gsbench.config.schema import Config, checked_values, register_schemas
 from gsbench.config.trust import HYDRAS_CALLBACKS, PERMISSIONS, check_composed, check_permissions
 from gsbench.errors import GsbenchError, InputError
-from gsbench.parsing import LOADER, MAX_VALUES
+from gsbench.parsing import MAX_VALUES
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.settings import check_values
 from gsbench.system.install import conf_dir
@@ -102,37 +103,22 @@ def check_files(folders: Sequence[Path]) -> None:
     for file in (file for folder in folders for depth in ("", "*/", "*/*/") for file in folder.glob(f"{depth}*.yaml")):
         try:
             text = file.read_text(encoding="utf-8") if file.is_file() else ""
-            count = _expanded_size(text)
-        except (OSError, ValueError, yaml.YAMLError):  # Hydra reports it if it reads the file
+            # The loader in Python raises RecursionError for deep nesting; that in C would crash.
+            count = _expanded_size(yaml.compose(text, Loader=yaml.SafeLoader), {}) if "*" in text else 0
+        except (OSError, ValueError, RecursionError, yaml.YAMLError):  # Hydra reports it if it reads the file
             continue
         if count > MAX_VALUES:
             raise InputError(f"{file}: its aliases stand for more than {MAX_VALUES:,} values")
 
 
-def _expanded_size(text: str) -> int:
-    """The number of values in a YAML text after each alias is replaced by what it names; 0 for a text without aliases.
-
-    Counts in the parser's events, so that nothing is expanded.
-    """
-    if "*" not in text:
-        return 0
-    sizes: dict[str, int] = {}
-    opened: list[tuple[str | None, int]] = [(None, 0)]
-    for event in yaml.parse(text, Loader=LOADER):
-        anchor, size = getattr(event, "anchor", None), 0
-        if isinstance(event, yaml.CollectionStartEvent):
-            opened.append((anchor, 1))
-            continue
-        if isinstance(event, yaml.AliasEvent):
-            size = sizes.get(event.anchor, 0)
-        elif isinstance(event, yaml.ScalarEvent):
-            size = 1
-        elif isinstance(event, yaml.CollectionEndEvent):
-            anchor, size = opened.pop()
-        if anchor is not None:
-            sizes[anchor] = size
-        opened[-1] = (opened[-1][0], opened[-1][1] + size)
-    return opened[0][1]
+def _expanded_size(node: yaml.Node | None, sizes: dict[int, int]) -> int:
+    """The number of values in a YAML node after each alias is replaced by what it names. ``sizes`` are those known."""
+    if id(node) not in sizes:
+        sizes[id(node)] = 1  # counts where an alias stands for a mapping or list that contains it
+        children = node.value if isinstance(node, yaml.CollectionNode) else []
+        parts = chain.from_iterable(child if isinstance(child, tuple) else [child] for child in children)
+        sizes[id(node)] = 1 + sum(_expanded_size(part, sizes) for part in parts)
+    return sizes[id(node)]
 
 
 def enforce_permissions(config: DictConfig, allowed: Sequence[str]) -> DictConfig:

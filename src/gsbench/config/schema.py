@@ -170,14 +170,11 @@ def checked_values(config: DictConfig) -> dict[str, Any]:
             raise InputError(f"{group} must be chosen, as {group}=NAME (see gsbench --help), got {values.get(group)!r}")
     for group, schema in GROUP_SCHEMAS.items():
         given = values[group]
-        require_values(given, group)
         if given.get("_target_") is not None:  # the other keys are options of the user's class
             given = {key: given.get(key) for key in ("name", "_target_")}
-        _require_all(schema, given, f"{group}.")
         settings = schema(**check_values(schema, given, group))
         values[group] |= plain({key: getattr(settings, key) for key in given})
     root = {key: value for key, value in values.items() if key not in (*GROUP_SCHEMAS, *COMPONENTS)}
-    _require_all(Config, values, "")
     values |= check_values(Config, root, "")
     for group in COMPONENTS:
         check_values(ComponentConfig, {key: values[group].get(key) for key in ("name", "_target_")}, group)
@@ -197,27 +194,8 @@ def checked_values(config: DictConfig) -> dict[str, Any]:
     return values
 
 
-def _require_all(schema: type, given: Mapping[str, Any], prefix: str) -> None:
-    """Raise InputError for the first setting of ``schema`` that was removed (``~train.iterations``)."""
-    for name in (entry.name for entry in dataclasses.fields(schema)):
-        if name not in given and name != "_target_":
-            raise InputError(f"{prefix}{name} was removed: give it a value instead")
-
-
-def require_values(values: Mapping[str, Any], group: str) -> None:
-    """Raise InputError for the first mandatory setting of ``group``, or of its ``options``, that has no value."""
-    name = values.get("name")
-    choice = f" ({group}={name})" if name not in (None, MISSING) else ""
-    options = values.get("options")
-    nested = options if isinstance(options, Mapping) else {}
-    for key, value in [*values.items(), *((f"options.{key}", value) for key, value in nested.items())]:
-        if value == MISSING:
-            raise InputError(f"{group}.{key} is not set: give it a value{choice}")
-
-
 def check_external(values: Mapping[str, Any]) -> None:
     """Raise InputError for settings that another program cannot follow."""
-    require_values(values["densify"], "densify")
     if values["eval"]["at"]:
         raise InputError("eval.at: another program shows its model only at the end: leave eval.at empty")
     if values["train"]["max_seconds"] is not None:
@@ -234,7 +212,7 @@ def plain(values: Any) -> Any:
     if isinstance(values, DictConfig):
         own = OmegaConf.masked_copy(values, [str(key) for key in values if key != "hydra"])
         OmegaConf.copy_cache(values, own)  # keeps ${now:…} the same for all trials of a sweep
-        return plain(OmegaConf.to_container(own, resolve=True, enum_to_str=True))
+        return plain(OmegaConf.to_container(own, resolve=True, throw_on_missing=True, enum_to_str=True))
     if isinstance(values, dict):
         return {key: plain(value) for key, value in values.items()}
     return [plain(value) for value in values] if isinstance(values, list | tuple) else values

@@ -12,7 +12,6 @@ from typing import Any
 
 import torch
 
-from gsbench.config.schema import require_values
 from gsbench.config.trust import (
     check_permissions,
     check_program,
@@ -188,7 +187,6 @@ def build(group: str, values: dict[str, Any], allow_targets: list[str]) -> Any:
     if external:
         check_program(values, allow_targets)
     cls = External if external else locate(target, group, allow_targets)
-    require_values(values, group)
     options = {key: value for key, value in values.items() if key not in RESERVED}
     own = target.startswith(OWN)
     _check_names(cls, target, options, group)
