@@ -4,7 +4,6 @@ import json
 import os
 import re
 import subprocess
-from collections.abc import Sequence
 from functools import cache
 from importlib.metadata import PackageNotFoundError, distribution, version
 from pathlib import Path
@@ -147,35 +146,33 @@ class WorkTrees:
         return path
 
 
-def run_git(folder: Path, *words: str) -> str:
-    """Run git safely (`SAFE_SETTINGS`) and return its output. Raises InputError with git's message if it fails."""
+def run_git(folder: Path, *words: str, seconds: float = SECONDS_FOR_A_TREE) -> str:
+    """Run git in ``folder``, with `SAFE_SETTINGS` and without `REPOSITORY_VARIABLES`, and return its output.
+
+    Raises InputError with git's message if it fails.
+    """
+    environment = {key: value for key, value in os.environ.items() if key not in REPOSITORY_VARIABLES}
     try:
-        return _call_git(folder, words, SECONDS_FOR_A_TREE).stdout.strip()
+        return subprocess.run(
+            ["git", *(word for setting in SAFE_SETTINGS for word in ("-c", setting)), "-C", str(folder), *words],
+            env=environment | {"GIT_OPTIONAL_LOCKS": "0", "GIT_NO_LAZY_FETCH": "1"},  # read only: no locks, no network
+            capture_output=True,
+            encoding="utf-8",
+            errors="replace",  # subjects of commits may have any encoding
+            timeout=seconds,
+            check=True,
+        ).stdout.strip()
     except OSError as error:
         raise InputError(f"git cannot be started ({error.strerror or error}): install it") from None
     except subprocess.TimeoutExpired:
-        raise InputError(f"git {words[0]} took more than {SECONDS_FOR_A_TREE} s in {folder}") from None
+        raise InputError(f"git {words[0]} took more than {seconds:g} s in {folder}") from None
     except subprocess.CalledProcessError as error:
         raise InputError(f"git {words[0]}: {(error.stderr or error.stdout).strip() or 'it failed'}") from None
 
 
 def _git(folder: Path, *words: str) -> str | None:
-    """Run git safely and return its output; None if there is no git or no repository, or if it fails."""
+    """The output of `run_git`; None if there is no git or no repository, or if it fails."""
     try:
-        return _call_git(folder, words, SECONDS_FOR_GIT).stdout.strip()
-    except (OSError, subprocess.SubprocessError):
+        return run_git(folder, *words, seconds=SECONDS_FOR_GIT)
+    except InputError:
         return None
-
-
-def _call_git(folder: Path, words: Sequence[str], seconds: float) -> subprocess.CompletedProcess[str]:
-    """Run git in ``folder``, with `SAFE_SETTINGS` and without `REPOSITORY_VARIABLES`."""
-    environment = {key: value for key, value in os.environ.items() if key not in REPOSITORY_VARIABLES}
-    return subprocess.run(
-        ["git", *(word for setting in SAFE_SETTINGS for word in ("-c", setting)), "-C", str(folder), *words],
-        env=environment | {"GIT_OPTIONAL_LOCKS": "0", "GIT_NO_LAZY_FETCH": "1"},  # read only: no locks, no network
-        capture_output=True,
-        encoding="utf-8",
-        errors="replace",  # subjects of commits may have any encoding
-        timeout=seconds,
-        check=True,
-    )

@@ -84,8 +84,10 @@ def end_descendants() -> None:
 def _end_with_parent() -> None:
     while os.read(0, 1):
         pass
-    end_descendants()
-    os.killpg(0, signal.SIGKILL)  # also this process, which leads the group
+    if hasattr(os, "fork"):
+        end_descendants()
+        os.killpg(0, signal.SIGKILL)  # also this process, which leads the group
+    os._exit(1)
 
 
 def _exit_as(code: int) -> None:
@@ -248,7 +250,7 @@ def _child() -> None:
     """The main function of the child. Its arguments are the paths of the pickled call and of the result to write."""
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     if not continue_in_child():
-        threading.Thread(target=_exit_with_parent, daemon=True).start()
+        threading.Thread(target=_end_with_parent, daemon=True).start()
     call, result = Path(sys.argv[2]), Path(sys.argv[3])
     function, args, kwargs = pickle.loads(call.read_bytes())
     try:
@@ -259,12 +261,6 @@ def _child() -> None:
     sys.stdout.flush()
     sys.stderr.flush()
     os._exit(0)  # without unloading native libraries, which may crash then; the result is already written
-
-
-def _exit_with_parent() -> None:
-    while os.read(0, 1):
-        pass
-    os._exit(1)
 
 
 def _portable(error: Exception) -> Exception:
