@@ -151,8 +151,6 @@ PARAMS_TAG = "gsbench"  # set once all settings are logged
 ERROR_TAG = "error"
 MAX_TAG = 5000  # characters of a tag (MLflow's limit)
 MAX_VALUE = 6000  # characters of a parameter (MLflow's limit)
-MAX_PARAMS = 100  # parameters in a batch
-MAX_METRICS = 1000  # metrics in a batch
 NOT_IN_A_KEY = re.compile(r"[^a-zA-Z0-9_\-./ ]")  # characters that MLflow refuses in a picture's name
 
 
@@ -195,12 +193,11 @@ class MlflowSink:
         return state
 
     def log(self, scalars: Sequence[Scalar]) -> None:
-        """Log numbers in batches."""
+        """Log numbers, which MLflow sends in batches."""
         from mlflow.entities import Metric
 
         metrics = [Metric(scalar.key, scalar.value, self._time_of(scalar.seconds), scalar.step) for scalar in scalars]
-        for start in range(0, len(metrics), MAX_METRICS):
-            self.client.log_batch(self.run_id, metrics=metrics[start : start + MAX_METRICS])
+        self.client.log_batch(self.run_id, metrics=metrics)
 
     def complete(self, summary: Summary) -> None:
         """Log the final metrics, pictures and files, and close the run."""
@@ -233,8 +230,7 @@ class MlflowSink:
         from mlflow.entities import Param
 
         params = [Param(key, value[:MAX_VALUE]) for key, value in self._trial.params().items()]
-        for start in range(0, len(params), MAX_PARAMS):
-            self.client.log_batch(self.run_id, params=params[start : start + MAX_PARAMS])
+        self.client.log_batch(self.run_id, params=params)
         self.client.set_tag(self.run_id, PARAMS_TAG, "1")
 
     def _time_of(self, seconds: float) -> int:
