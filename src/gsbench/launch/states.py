@@ -14,6 +14,7 @@ from itertools import compress
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import numpy as np
 import psutil
 from pydantic import Field
 
@@ -232,21 +233,14 @@ SHARED = ((True, True, True), (True, False, True), (True, False, False), (False,
 SIZE_SETTINGS = ("name", "path", "width", "height", "downscale", "max_size")  # of a scene: they determine its pixels
 
 
-@dataclass
-class _Times:
-    """Sums over finished trials."""
-
-    count: int = 0
-    train: float = 0.0  # s per iteration and pixel
-    evaluate: float = 0.0  # s per pixel
-
-
 class FinishedTrials:
     """The finished trials below the folder ``runs``."""
 
     def __init__(self, runs: Path) -> None:
         self._folders: dict[str, list[Path]] = defaultdict(list)
-        self._times: dict[tuple[object, ...], _Times] = defaultdict(_Times)  # by rasterizer, SHARED, and shared names
+        # By rasterizer, SHARED and shared names: the number of trials, and the sums of their times for training (s per
+        # iteration and pixel) and evaluation (s per pixel).
+        self._times: dict[tuple[object, ...], Any] = defaultdict(lambda: np.zeros(3))
         self._pixels: dict[str, int] = {}  # pixels of a view by `_size_key`
         for path in runs.glob(f"*/{TRIAL_GLOB}/{RESULTS}"):
             files = TrialFolder(path.parent)
@@ -263,11 +257,10 @@ class FinishedTrials:
             if not record.iterations or record.resolution is None:
                 continue
             self._pixels[size] = pixels = max(1, record.resolution[0] * record.resolution[1])
+            train, evaluate = (record.seconds.get(step, 0.0) / pixels for step in ("train", "evaluate"))
             for shared in SHARED:
-                times = self._times[raster, shared, *compress((record.scene, record.init, record.densify), shared)]
-                times.count += 1
-                times.train += record.seconds.get("train", 0.0) / record.iterations / pixels
-                times.evaluate += record.seconds.get("evaluate", 0.0) / pixels
+                names = compress((record.scene, record.init, record.densify), shared)
+                self._times[raster, shared, *names] += (1, train / record.iterations, evaluate)
 
     def elsewhere(self, trial: TrialFolder) -> str | None:
         """Another experiment that has finished the same trial, so that its stages are reused; None if there is none."""
@@ -290,8 +283,9 @@ class FinishedTrials:
         for shared in SHARED:
             times = self._times.get((values["raster"]["name"], shared, *compress(names, shared)))
             if times is not None and pixels is not None:
-                seconds = pixels * (times.train * values["train"]["iterations"] + times.evaluate)
-                return seconds / times.count, times.count
+                count, train, evaluate = map(float, times)
+                seconds = pixels * (train * values["train"]["iterations"] + evaluate)
+                return seconds / count, int(count)
         return 0.0, 0
 
 
