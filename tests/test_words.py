@@ -94,7 +94,7 @@ REFUSED = {  # command line: a part of the line that refuses it
     "-m hydra.sweeper.tune.seed=-1 densify.volume_threshold=interval(0,1)": "seed must be a whole number in [0,",
     "-m hydra.sweeper.tune.at_onec=2 seed=0,1": "did you mean at_once?",
     "-m hydra/sweeper=optuna seed=0,1": "a search is an interval and hydra.sweeper.tune.points",
-    "-m hydra.sweeper.params=x seed=0,1": "must map settings to their values",
+    "-m hydra.sweeper.params=x seed=0,1": "must map settings to values",
     "hydra.sweeper.params.seed=1": "type seed=… itself, with -m",
     "-m hydra.sweep.subdir=/proc/nosuch seed=0,1": "hydra.sweep: gsbench runs the trials itself",
     "-m seed=0,-1": "seed must be a whole number",
