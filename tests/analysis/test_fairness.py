@@ -73,6 +73,14 @@ def test_only_trials_that_are_compared_count(tmp_path: Path, paths: list[Path]) 
     assert "Compared: 2 pairs of trials of one scene and seed." in table.notes
 
 
+def test_arms_without_a_common_seed_have_a_sheet_of_all_their_trials(tmp_path: Path) -> None:
+    write_arms(tmp_path, {"adc": densifier("adc")}, seeds=(0, 1))
+    write_arms(tmp_path, {"longaxis": densifier("longaxis")}, seeds=(2,))
+    table = sheet(tmp_path)
+    assert shown(table)["trials"] == ("2", "1", UNLIKE)
+    assert "Compared: 0 pairs of trials of one scene and seed." in table.notes
+
+
 def test_the_notes_say_the_ingredients_and_the_tuning(tmp_path: Path, paths: list[Path]) -> None:
     notes = sheet(tmp_path).notes
     assert notes[0] == "sfm-longaxis differs from sfm-adc by split, gradient and threshold."
@@ -108,6 +116,9 @@ def test_values_that_were_tried_here_are_said(tmp_path: Path) -> None:
     arms = {f"volumetric-{v}": densifier("volumetric", volume_threshold=v) for v in (0.01, 0.03, 0.1)}
     write_arms(tmp_path, {"adc": densifier("adc"), **arms, "absgrad": densifier("absgrad")})
     notes = sheet(tmp_path, "volumetric-0.01").notes
+    two = tmp_path / "two"
+    write_arms(two, {"adc": densifier("adc"), **dict([*arms.items()][:2])})
+    assert any("sfm-volumetric-0.01: 2 choices of its settings" in note for note in sheet(two, "volumetric-0.01").notes)
     (line,) = [note for note in notes if "sfm-volumetric-0.01: 3 choices of its settings" in note]
     assert "They differ in densify.volume_threshold, and all were measured on the test views" in line
 

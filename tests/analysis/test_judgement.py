@@ -10,9 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gsbench.analysis.judgement import find_outlying, judge
+from gsbench.analysis.judgement import _contradicts, find_outlying, judge
 from gsbench.analysis.pairing import Pairs, choose_pairs, pair
 from gsbench.analysis.results import Experiment, TrialResult
+from gsbench.analysis.statistics import answer_family
 from gsbench.runs.experiments import Arm, Declaration, Question
 from tests.analysis.untruths import scene_pairs
 
@@ -121,6 +122,8 @@ def test_a_scene_has_the_mean_and_the_deviation_of_its_differences(
     trials = make_experiment(seeds=range(seeds)).trials
     (verdict,) = judge(trials, Declaration(time=EARLY, questions=(PSNR,)))
     assert [scene.scene for scene in verdict.scenes] == ["courtyard", "garden"]
+    spread = np.sqrt(verdict.pairs.differences.var(axis=1, ddof=1).mean()) if seeds > 1 else None
+    assert verdict.deviation == (pytest.approx(spread) if seeds > 1 else None)
     values = {(trial.scene, trial.densify, trial.seed): trial.metrics["psnr"] for trial in trials}
     for found in verdict.scenes:
         own = [values[found.scene, "volumetric", seed] - values[found.scene, "adc", seed] for seed in range(seeds)]
@@ -166,6 +169,34 @@ def test_a_verdict_that_hangs_on_one_training_is_undecided(make_experiment: Call
     assert {trial.seed for trial in verdict.outlying} == {5}
     assert verdict.outcome == "undecided"
     assert verdict.outcome_without is not None
+
+
+@pytest.mark.parametrize(
+    ("rest", "outcome", "least", "expected"),
+    [
+        (0.1, "supported", None, False),
+        (0.0, "supported", None, True),
+        (-0.1, "refuted", 0.5, True),
+        (-0.1, "undecided", None, False),
+        (0.4, "too small to matter", 0.5, False),
+        (-0.5, "too small to matter", 0.5, True),
+    ],
+)
+def test_a_mean_without_outlying_trials_may_contradict_the_outcome(
+    rest: float, outcome: str, least: float | None, expected: bool
+) -> None:
+    assert _contradicts(rest, 0.2, outcome, least) == expected  # type: ignore[arg-type]
+
+
+def test_scenes_of_all_questions_are_one_family_and_a_single_scene_has_the_questions_answer(
+    make_experiment: Callable[..., Experiment],
+) -> None:
+    trials = make_experiment(scenes=("a", "b", "c"), effect={"psnr": 0.5}).trials
+    questions = [named(tuple(t for t in trials if t.scene in scenes)) for scenes in (("a",), ("b", "c"))]
+    single, several = judge(trials, Declaration(time=EARLY, questions=tuple(questions)))
+    assert [scene.interval for scene in single.scenes] == [single.interval]
+    expected = answer_family([row[None] for row in several.pairs.differences])
+    assert [(scene.interval, scene.p) for scene in several.scenes] == [(one.interval, one.p) for one in expected]
 
 
 # --- which arms are held against which

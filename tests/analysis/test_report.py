@@ -172,6 +172,17 @@ def test_whole_views_are_the_worst_the_median_and_the_best(experiment: Experimen
     assert len(both) == 3
 
 
+def test_of_one_or_two_views_each_is_shown_once(tmp_path: Path) -> None:
+    for count, named in (
+        (1, ["the only view"]),
+        (2, ["the view with the least gain", "the view with the largest gain"]),
+    ):
+        write_runs(tmp_path / str(count), Plan(scenes=("a",), seeds=(0,), views=count, pictures=True))
+        views, _ = choose_views(pair_trials(load_experiment(tmp_path / str(count), "exp").trials, ADC, VOLUMETRIC))
+        assert [view.which for view in views] == named
+        assert sorted(view.view for view in views) == [f"view00{k}" for k in range(count)]
+
+
 def test_missing_or_damaged_pictures_are_named(tmp_path: Path) -> None:
     paths = write_runs(tmp_path, Plan(views=2, pictures=True))
     (paths[0] / "renders" / "view001.png").write_bytes(b"\x89PNG\r\n\x1a\nhalf")
@@ -356,6 +367,8 @@ def test_the_verb_writes_the_file(runs: Path, tmp_path: Path, capsys: pytest.Cap
 def test_one_trial_of_each_arm_is_no_verdict(tmp_path: Path) -> None:
     write_runs(tmp_path, Plan(seeds=(0,), scenes=("garden",), effect={"psnr": 9.0}))
     page = build_report(load_experiment(tmp_path, "exp"))
+    assert ">garden</text>" in page
+    assert "mean of scenes" not in page
     assert "no verdict, one trial of each on this scene; run more seeds" in page
     assert "▲ better" not in page
 

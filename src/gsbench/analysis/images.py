@@ -117,7 +117,7 @@ def choose_views(pairs: Sequence[TrialPair]) -> tuple[list[ViewComparison], list
         try:
             for view in view_names(one):
                 first, second, truth = _read(one, other, view)
-                gain = absolute_error(first, truth).mean() - absolute_error(second, truth).mean()
+                gain = absolute_error(first, truth=truth).mean() - absolute_error(second, truth=truth).mean()
                 views.append((float(gain), (one, other), view))
             scenes_read.add(one.scene)
         except InputError as error:
@@ -138,7 +138,7 @@ def _worst_median_best(views: Sequence[tuple[float, TrialPair, str]]) -> list[tu
 
 def _compare_view(which: str, pair: TrialPair, view: str) -> ViewComparison:
     first, second, truth = _read(*pair, view)
-    errors = [absolute_error(image, truth) for image in (first, second)]  # [H, W] each
+    errors = [absolute_error(image, truth=truth) for image in (first, second)]  # [H, W] each
     gain = np.clip((errors[0] - errors[1]) / FULL_COLOUR, -1, 1)[..., None]  # [H, W, 1], 1 where the second is nearer
     white, blue, red = (np.array(colour) for colour in ((255, 255, 255), (33, 102, 172), (178, 24, 43)))
     colours = white + np.abs(gain) * (np.where(gain > 0.0, blue, red) - white)
