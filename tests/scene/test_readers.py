@@ -43,6 +43,7 @@ def test_photos_in_images_or_directly_or_nested(make_scene):
         capture = read_photos("toy", path)
         assert capture.image_names == ("cam1/01.PNG", "cam1/02.png", "cam2/01.JPEG", "x.bmp", "y.webp", "z.tif")
         assert capture.model is None
+    assert read_photos("toy", root, images="images/cam1/..").images == root / "images/cam1/.."
 
 
 def test_files_with_another_extension_and_missing_ones(make_scene, caplog):

@@ -158,6 +158,7 @@ def test_blenders_angle_its_missing_extension_its_parts_and_its_alpha(tmp_path: 
     assert capture.train_names == tuple(f"train/r_{k}.png" for k in range(5))
     camera = read_transforms(tmp_path).images["train/r_0.png"][0]
     assert camera.params == pytest.approx((0.5 * 40 / math.tan(0.5 * angle),) * 2 + (20, 20))
+    assert capture_of(tmp_path, tmp_path / "every").test_names == ("test/r_0.png",)  # the rule, not the files
     assert not any(name.startswith("val/") for name in read_transforms(tmp_path).images)
     (tmp_path / "transforms_test.json").unlink()
     assert read_transforms(tmp_path).split == ([f"train/r_{k}.png" for k in range(5)], ["val/r_0.png", "val/r_1.png"])

@@ -123,8 +123,11 @@ def test_colmaps_matcher_never_gets_a_second_thread(
         match(path, **options)
 
     monkeypatch.setattr(pycolmap, "match_image_pairs", noting)
-    match_sift(tmp_path / "database.db", pairs, Sfm(), 1, no_progress)
+    told: list[tuple[str, int, int]] = []
+    match_sift(tmp_path / "database.db", pairs, Sfm(), 1, lambda *state: told.append(state))
     assert set(threads) == {1}
+    assert (told[0], told[-1]) == (("match", 0, len(pairs)), ("match", len(pairs), len(pairs)))
+    assert sum(map(bool, read_matches(tmp_path / "database.db")[0].values())) > 10
 
 
 @pytest.mark.slow
