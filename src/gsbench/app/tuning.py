@@ -16,7 +16,7 @@ import logging
 import math
 import statistics
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -73,32 +73,19 @@ class TuneSettings:
 
 
 @dataclass(frozen=True)
-class Goal:
-    """Quantity that a search maximises: the mean of ``metric`` over a point's trials with ``seeds``, times ``sign``."""
-
-    metric: str
-    sign: Literal[-1, 1]
-    seeds: tuple[int, ...]
-
-
-@dataclass(frozen=True)
 class ArmSearch:
-    """The search for the values of ``arm`` (INIT-DENSIFY), in the experiment whose folder is ``home``.
+    """The search for the values of an arm, in the experiment whose folder is ``home``.
 
-    ``jobs`` are the arm's jobs in the sweep without the settings `REPLACED`. ``first`` are the arm's own values, None
-    if they lie outside the ranges. ``points`` are the judged points.
+    ``record`` says what is searched and by which metric, and gets the judged points. ``jobs`` are the arm's jobs in the
+    sweep without the settings `REPLACED`. ``first`` are the arm's own values, None if they lie outside the ranges.
     """
 
-    arm: str
+    record: TuningRecord
     home: Path
-    settings: TuneSettings
-    goal: Goal
-    intervals: Mapping[str, Override]
+    at_once: int
     ranges: Mapping[str, BaseDistribution]
     jobs: Sequence[Sequence[str]]
-    scenes: Sequence[str]
     first: Mapping[str, Any] | None
-    points: list[SearchPoint] = field(default_factory=list)
 
     @cached_property
     def study(self) -> Study:
@@ -106,27 +93,27 @@ class ArmSearch:
         import optuna
 
         optuna.logging.set_verbosity(optuna.logging.WARNING)
-        sampler = optuna.samplers.TPESampler(seed=0, constant_liar=self.settings.at_once > 1)
-        direction: Literal["maximize", "minimize"] = "maximize" if self.goal.sign > 0 else "minimize"
+        sampler = optuna.samplers.TPESampler(seed=0, constant_liar=self.at_once > 1)
+        direction: Literal["maximize", "minimize"] = "maximize" if self.record.direction > 0 else "minimize"
         study = optuna.create_study(direction=direction, sampler=sampler)
         if self.first is not None:
             study.enqueue_trial(dict(self.first))
         return study
 
     def propose(self) -> list[Proposal]:
-        """The next points, ``settings.at_once`` at most; none once all are judged."""
-        count = min(self.settings.at_once, self.settings.points - len(self.points))
+        """The next points, ``at_once`` at most; none once all are judged."""
+        count = min(self.at_once, self.record.wanted - len(self.record.points))
         return [self.study.ask(dict(self.ranges)) for _ in range(count)]
 
     def jobs_of(self, values: Mapping[str, Any]) -> list[list[str]]:
         """The words of a point's trials."""
         own = [f"name={self.home.name}", "scene.validation=true", "eval.primary=null", *words_of_values(values)]
-        return [[*job, *own, f"{SEED}={seed}"] for job in self.jobs for seed in self.goal.seeds]
+        return [[*job, *own, f"{SEED}={seed}"] for job in self.jobs for seed in self.record.seeds]
 
     def value_of(self, trial: Trial) -> float | None:
         """The metric of a trial, read from its files; None if it has none."""
         record = trial.files.sound_record()
-        return None if record is None else record.metrics.get(self.goal.metric)
+        return None if record is None else record.metrics.get(self.record.metric)
 
     def judge(self, proposal: Proposal, trials: Sequence[Trial]) -> SearchPoint:
         """Judge a point by the mean of its trials. It has failed if one of them lacks the metric."""
@@ -136,24 +123,8 @@ class ArmSearch:
         mean = statistics.fmean(values) if len(values) == len(trials) else None
         self.study.tell(proposal, mean, state=TrialState.FAIL if mean is None else TrialState.COMPLETE)
         point = SearchPoint(settings={key: _rounded(value) for key, value in proposal.params.items()}, value=mean)
-        self.points.append(point)
+        self.record.points.append(point)
         return point
-
-    def record(self) -> TuningRecord:
-        """The record of the search: its ranges, and the points so far."""
-        return TuningRecord(
-            sweep=self.home.name.removesuffix(f"-tune-{self.arm}"),
-            arm=self.arm,
-            metric=self.goal.metric,
-            direction=self.goal.sign,
-            wanted=self.settings.points,
-            seeds=list(self.goal.seeds),
-            scenes=list(self.scenes),
-            ranges={key: str(interval.input_line).partition("=")[2] for key, interval in self.intervals.items()},
-            log=[key for key, values in self.ranges.items() if getattr(values, "log", False)],
-            as_it_is=self.first is not None,
-            points=self.points,
-        )
 
 
 def tuned_jobs(
@@ -172,7 +143,7 @@ def tuned_jobs(
         raise InputError(f"{PLACE} learns from results, so launch.wait must be true")
     trials = sweep.trials(jobs)
     searches = _plan(tune, jobs, intervals, trials)
-    tuned = {search.arm: search for search in searches if search.ranges}
+    tuned = {search.record.arm: search for search in searches if search.ranges}
     if sweep.task.look_only:
         print(_describe(searches))
     if not _search(sweep, list(tuned.values())):
@@ -205,9 +176,9 @@ def _search(sweep: Sweep, searches: Sequence[ArmSearch]) -> bool:
             point = search.judge(proposal, own)
             if missing:
                 value = "failed" if point.value is None else f"{point.value:.5g}"
-                settings, number = ", ".join(words_of_values(point.settings)), len(search.points)
-                title = f"{search.home.name}: point {number} of {search.settings.points}"
-                log.info("%s: %s: %s %s", title, settings, search.goal.metric, value)
+                settings, number = ", ".join(words_of_values(point.settings)), len(search.record.points)
+                title = f"{search.home.name}: point {number} of {search.record.wanted}"
+                log.info("%s: %s: %s %s", title, settings, search.record.metric, value)
     if not sweep.task.look_only:
         _write(searches)
     return True
@@ -218,34 +189,31 @@ def _write(searches: Sequence[ArmSearch]) -> None:
     for search in searches:
         make_runs_folder(checked_runs_folder(str(search.home.parent)))
         make_home(search.home)
-        write_json(search.home / TUNING, search.record().to_json())
+        write_json(search.home / TUNING, search.record.to_json())
 
 
 def _best_words(search: ArmSearch) -> list[str]:
     """The words of the best point of an arm. Raises GsbenchError if no point has the metric."""
-    best, name = search.record().best, search.home.name
+    record, best, name = search.record, search.record.best, search.home.name
     if best is None:
-        raise GsbenchError(
-            f"{PLACE}: no point of {search.arm} has a {search.goal.metric} (gsbench status {name} says why)"
-        )
+        raise GsbenchError(f"{PLACE}: no point of {record.arm} has a {record.metric} (gsbench status {name} says why)")
     words = words_of_values(best.settings)
-    failed = sum(point.value is None for point in search.points)
-    count = counted(len(search.points), "point") + (f", {failed} failed" if failed else "")
+    failed = sum(point.value is None for point in record.points)
+    count = counted(len(record.points), "point") + (f", {failed} failed" if failed else "")
     where = " ".join(words)
-    log.info("search: best %s %.5g at %s (%s); gsbench report %s", search.goal.metric, best.value, where, count, name)
+    log.info("search: best %s %.5g at %s (%s); gsbench report %s", record.metric, best.value, where, count, name)
     return words
 
 
 def _describe(searches: Sequence[ArmSearch]) -> str:
     """The line in which a dry run describes the searches."""
-    first = searches[0]
-    goal, points = first.goal, first.settings.points
-    trials = {search.arm: len(search.jobs) * len(goal.seeds) for search in searches if search.ranges}
-    untuned = [search.arm for search in searches if not search.ranges]
+    first = searches[0].record
+    trials = {search.record.arm: len(search.jobs) * len(first.seeds) for search in searches if search.ranges}
+    untuned = [search.record.arm for search in searches if not search.ranges]
     return (
-        f"tunes first: {counted(points, 'point')} each for {listed(list(trials))}, by {goal.metric} "
-        f"of validation views on {listed(first.scenes)} with {counted(len(goal.seeds), 'seed')}, "
-        f"{sum(trials.values()) * points} trainings" + (f"; not tuned: {listed(untuned)}" if untuned else "")
+        f"tunes first: {counted(first.wanted, 'point')} each for {listed(list(trials))}, by {first.metric} "
+        f"of validation views on {listed(first.scenes)} with {counted(len(first.seeds), 'seed')}, "
+        f"{sum(trials.values()) * first.wanted} trainings" + (f"; not tuned: {listed(untuned)}" if untuned else "")
     )
 
 
@@ -269,7 +237,7 @@ def _plan(
         raise InputError(f"{PLACE}: all trials of the sweep need one name, got {listed(sorted(h.name for h in homes))}")
     if any(trial.values["scene"]["validation"] for trial in trials):
         raise InputError(f"{PLACE} searches on validation views by itself: leave scene.validation out")
-    goal = _goal(tune, trials)
+    metric, direction, seeds = _goal(tune, trials)
     (home,) = homes
     arms = [trial.folder.parent.name for trial in trials]
     searches = []
@@ -281,24 +249,29 @@ def _plan(
         if both := next((key for key in arm_intervals if bare_key(key) in fixed), None):
             raise InputError(f"{both} of {arm} is searched in one grid and given in another: leave one of them out")
         ranges = {key: distribution(interval) for key, interval in arm_intervals.items()}
-        searches.append(
-            ArmSearch(
-                arm=arm,
-                home=home.with_name(f"{home.name}-tune-{arm}"),
-                settings=tune,
-                goal=goal,
-                intervals=arm_intervals,
-                ranges=ranges,
-                jobs=list(dict.fromkeys(arm_jobs)),
-                scenes=list(dict.fromkeys(trial.values["scene"]["name"] for trial in trials)),
-                first=_own_values(trials[indices[0]].values, ranges),
-            )
+        first = _own_values(trials[indices[0]].values, ranges)
+        record = TuningRecord(
+            sweep=home.name,
+            arm=arm,
+            metric=metric,
+            direction=direction,
+            wanted=tune.points,
+            seeds=seeds,
+            scenes=list(dict.fromkeys(trial.values["scene"]["name"] for trial in trials)),
+            ranges={key: str(interval.input_line).partition("=")[2] for key, interval in arm_intervals.items()},
+            log=[key for key, values in ranges.items() if getattr(values, "log", False)],
+            as_it_is=first is not None,
+            points=[],
         )
+        own_home = home.with_name(f"{home.name}-tune-{arm}")
+        searches.append(ArmSearch(record, own_home, tune.at_once, ranges, list(dict.fromkeys(arm_jobs)), first))
     return searches
 
 
-def _goal(tune: TuneSettings, trials: Sequence[Trial]) -> Goal:
-    """The goal of all searches. Raises InputError for an unknown metric, and for one without a better direction."""
+def _goal(tune: TuneSettings, trials: Sequence[Trial]) -> tuple[str, Literal[-1, 1], list[int]]:
+    """The metric of all searches, its better direction, and the seeds of a point's trials.
+
+    Raises InputError for an unknown metric, and for one without a better direction."""
     values = trials[0].values
     declared = {str(trial.values["eval"].get("primary") or "") for trial in trials}
     primary = metric_and_question(declared.pop())[0] if len(declared) == 1 else ""
@@ -310,12 +283,12 @@ def _goal(tune: TuneSettings, trials: Sequence[Trial]) -> Goal:
     if not sign:
         raise InputError(f"{PLACE}.metric={metric}: whether more or less of it is better is not known")
     try:
-        seeds = tuple(int(word.partition("=")[2]) for (word,) in grid_points([parse_word(f"{SEED}={tune.seed}")]))
+        seeds = [int(word.partition("=")[2]) for (word,) in grid_points([parse_word(f"{SEED}={tune.seed}")])]
     except ValueError:
         raise InputError(f"{PLACE}.seed must list whole numbers, as 100,101, got {tune.seed!r}") from None
     if both := sorted(set(seeds) & {trial.values["seed"] for trial in trials}):
         raise InputError(f"{PLACE}.seed: {listed(list(map(str, both)))} is a seed of the sweep, too: tune with others")
-    return Goal(metric, 1 if sign > 0 else -1, seeds)
+    return metric, 1 if sign > 0 else -1, seeds
 
 
 # ---- ranges
