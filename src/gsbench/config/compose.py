@@ -348,9 +348,9 @@ def explain(error: BaseException, overrides: Sequence[str]) -> str:
         word = wanted.rpartition("/")[2]
         near = did_you_mean(word, choices) or HINTS.get(name, "")
         return f"{name}={word} does not exist{near} (choose: {', '.join(choices)})"
-    absent = re.search(r"[Mm]issing mandatory value: ([\w.]+)", text)
+    absent = re.search(r"[Mm]issing mandatory value: ([\w.]+)(?:\s+full_key: ([\w.]+))?", text)
     if absent:
-        return f"{absent.group(1)} is not set: give it a value"
+        return f"{absent.group(2) or absent.group(1)} is not set: give it a value"
     folder = re.search(r"provider=.* path=(.*) is not available", text)
     if folder:
         return f"hydra.searchpath names {folder.group(1)}: no such folder"
