@@ -63,6 +63,20 @@ def sentence(trials: list[TrialResult], first: str, second: str) -> str:
 # --- ingredients
 
 
+def test_a_sentence_names_six_ingredients_and_counts_the_rest() -> None:
+    first, second = Arm("sfm", "adc"), Arm("sfm", "mine")
+    said = "sfm-mine differs from sfm-adc by 0, 1, 2, 3, 4"
+    assert ingredients_sentence("012345", first, second) == f"{said} and 5."
+    assert ingredients_sentence("01234567", first, second) == f"{said}, 5 and 2 more."
+    assert ingredients_sentence("0", first, second) == "sfm-mine differs from sfm-adc by 0 alone."
+
+
+def test_settings_of_the_first_configuration_come_first() -> None:
+    one, other = {"densify._target_": "t", "densify.a": 1}, {"densify._target_": "t", "densify.b": 2}
+    assert ingredients(one, other) == ("a", "b")
+    assert ingredients(other, one) == ("b", "a")
+
+
 @pytest.mark.parametrize(
     ("first", "second", "expected"),
     [

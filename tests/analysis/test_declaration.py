@@ -18,7 +18,7 @@ from gsbench.analysis.report.build import build_report
 from gsbench.analysis.results import Experiment, load_experiment
 from gsbench.analysis.statistics import answer_family
 from gsbench.analysis.tables import build_table
-from gsbench.analysis.verdicts import PairVerdicts, families, in_words, judge_pairs
+from gsbench.analysis.verdicts import PairVerdicts, families, in_words, judge_pairs, p_text
 from gsbench.runs.experiments import (
     STAMP,
     Arm,
@@ -50,6 +50,29 @@ def judged(experiment: Experiment) -> list[PairVerdicts]:
     trials = experiment.trials
     pairs = choose_pairs(sorted({trial.arm for trial in trials}))
     return judge_pairs(trials, pairs, active_declaration(experiment.folder, trials))
+
+
+def test_a_declaration_about_one_question_says_so(tmp_path: Path) -> None:
+    experiment = declared_experiment(tmp_path, ("psnr@extrapolation", EARLY))
+    declared = active_declaration(experiment.folder, experiment.trials)
+    assert declared is not None
+    assert declared.sentences("PSNR")[0].startswith("PSNR at extrapolation was declared beforehand")
+
+
+def test_a_verdict_in_words_has_its_numbers(tmp_path: Path) -> None:
+    (one,) = judged(declared_experiment(tmp_path, ("lpips_vgg_raw", EARLY), effect=CLEAR))
+    first, second = one.verdicts[0], one.verdicts[1]
+    for verdict, adjusted in ((first, ""), (second, ", adjusted for 3 tests")):
+        assert verdict.interval is not None
+        assert verdict.p is not None
+        p = "below 0.001" if verdict.p < 0.001 else f"{verdict.p:.3f}"
+        numbers = f"{verdict.shown(verdict.mean or 0.0)} (interval {verdict.shown_interval(verdict.interval)}, p {p}"
+        assert f"on these scenes: {numbers}{adjusted})" in in_words(verdict)
+    assert (p_text(0.001), p_text(0.0009), p_text(0.0126)) == ("0.001", "below 0.001", "0.013")
+    assert families([one]) == [
+        "The declared metric is not adjusted: it is one test.",
+        "All other metrics are secondary and do not decide the verdict; Holm adjusts them for 3 tests.",
+    ]
 
 
 # --- families

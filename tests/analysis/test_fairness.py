@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from gsbench.analysis.cells import with_variants
-from gsbench.analysis.fairness import NOTHING, UNLIKE, fairness_table
+from gsbench.analysis.fairness import NOTHING, UNLIKE, _shown, fairness_table
 from gsbench.analysis.report.build import build_report
 from gsbench.analysis.results import load_experiment
 from gsbench.analysis.table_formats import Table, to_latex
@@ -79,6 +79,10 @@ def test_arms_without_a_common_seed_have_a_sheet_of_all_their_trials(tmp_path: P
     table = sheet(tmp_path)
     assert shown(table)["trials"] == ("2", "1", UNLIKE)
     assert "Compared: 0 pairs of trials of one scene and seed." in table.notes
+
+
+def test_long_values_are_cut() -> None:
+    assert [_shown("x" * 60), _shown("x" * 61), _shown(3), _shown(None)] == ["x" * 60, "x" * 59 + "…", "3", "null"]
 
 
 def test_the_notes_say_the_ingredients_and_the_tuning(tmp_path: Path, paths: list[Path]) -> None:

@@ -15,6 +15,7 @@ from gsbench.analysis.pairing import Pairs, choose_pairs, pair
 from gsbench.analysis.results import Experiment, TrialResult
 from gsbench.analysis.statistics import answer_family
 from gsbench.runs.experiments import Arm, Declaration, Question
+from gsbench.runs.trial_record import Budget
 from tests.analysis.untruths import scene_pairs
 
 ADC, VOLUMETRIC = Arm("sfm", "adc"), Arm("sfm", "volumetric")
@@ -64,7 +65,24 @@ def test_arms_under_different_conditions_are_not_compared(make_experiment: Calla
             object.__setattr__(trial.record, "iterations", 7000)
     found = pair(trials, PSNR)
     assert not found.rows
-    assert all("the arms differ in iterations, so they are not compared" in line for line in found.left_out)
+    reason = "the arms differ in iterations, so they are not compared"
+    assert found.left_out == (f"courtyard: {reason}", f"garden: {reason}")
+
+
+def test_a_seed_that_an_arm_has_twice_is_not_compared(make_experiment: Callable[..., Experiment]) -> None:
+    trials = make_experiment(scenes=("garden",)).trials
+    found = pair([*trials, trials[0]], PSNR)
+    assert not found.rows
+    assert "scene=garden sfm-adc has seed 0 twice" in found.left_out[0]
+
+
+def test_budgets_may_differ_if_the_question_names_its_trials(make_experiment: Callable[..., Experiment]) -> None:
+    trials = make_experiment().trials
+    for trial in trials:
+        if trial.densify == "adc":
+            object.__setattr__(trial.record, "budget", Budget(max_gaussians=7, cap="hard"))
+    assert pair(trials, named(trials)).seeds == 3
+    assert not pair(trials, PSNR).rows
 
 
 def test_ratios_are_taken_of_logarithms(make_experiment: Callable[..., Experiment]) -> None:

@@ -125,6 +125,12 @@ def test_table1_has_the_papers_rows_and_marks_what_was_not_run(make_experiment: 
     assert shown.split()[0].replace("−", "-") == f"{psnr.mean - 27.06:+.2f}"
 
 
+def test_scenes_that_the_paper_lacks_come_last(make_experiment: Callable[..., Experiment]) -> None:
+    experiment = make_experiment(experiment="table1", inits=("dim",), scenes=("courtyard", "garden"))
+    measured, _ = paper_tables(experiment, "table1")
+    assert [row.labels[0] for row in measured.rows[:-1]] == [*load_paper().scenes("table1"), "courtyard"]
+
+
 def test_table1_names_a_stand_in_for_the_papers_initialiser(make_experiment: Callable[..., Experiment]) -> None:
     experiment = make_experiment(experiment="table1", inits=("sfm",), scenes=("garden",))
     _, difference = paper_tables(experiment, "table1")
@@ -227,6 +233,9 @@ def test_ours_stand_beside_the_printed_numbers(tmp_path: Path, capsys: pytest.Ca
     table = published_table(load_experiment(tmp_path, "exp").trials, "3dgs")
     assert texts(table) == [["garden", "sfm", "adc", "27.410", "+0.000 =", "0.868", "+0.032 ≠", "0.103", "+0.097 ≠"]]
     assert any(note.startswith("Read from github.com/nerfbaselines") for note in table.notes)
+    assert (
+        "Of 3 cells 1 are within rounding (=), 0 within our 95% t interval of the mean (≈), 2 differ" in table.notes[0]
+    )
     assert tables(["exp", "--paper", "3dgs"], tmp_path) == 0
     assert "### Difference from 3dgs" in capsys.readouterr().out
 
@@ -235,5 +244,9 @@ def test_what_cannot_be_compared_is_said(tmp_path: Path) -> None:
     one_trial(tmp_path, 0, psnr=1.0, _scene="nowhere")
     with pytest.raises(InputError, match="no trial here is of one of them"):
         published_table(load_experiment(tmp_path, "exp").trials, "3dgs-mcmc")
+    one_trial(tmp_path, 0, psnr=1.0)
+    one_trial(tmp_path, 1, psnr=1.0, _iterations=7)
+    with pytest.raises(InputError, match=r"scene=garden init=sfm densify=adc would average trials that differ in iter"):
+        published_table(load_experiment(tmp_path, "exp").trials, "3dgs")
     with pytest.raises(InputError, match=r"no published numbers '3dsg'.*did you mean 3dgs"):
         load_published("3dsg")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import io
 import json
 import math
 import re
@@ -15,7 +17,7 @@ import pytest
 from PIL import Image
 from plyfile import PlyData
 
-from gsbench.analysis.images import choose_views, texture_energy
+from gsbench.analysis.images import _jpeg_uri, choose_views, texture_energy
 from gsbench.analysis.pairing import pair_trials
 from gsbench.analysis.report.build import (
     _logged_histograms,
@@ -270,6 +272,25 @@ def test_a_line_chart_puts_values_where_they_belong() -> None:
     assert y0 == y2 > y1  # up is smaller in SVG
 
 
+def test_charts_have_their_margins() -> None:
+    figure = ElementTree.fromstring(line_chart("t", [("a", [(0, 0), (10, 10)])], "x", "y"))
+    assert next(figure.iter("svg")).attrib["viewBox"] == "0 0 380 250"
+    x, y = 58 + 304 * 10 / 10.4, 206 - 180 * 10 / 10.4
+    assert next(figure.iter("polyline")).attrib["points"] == f"58.0,206.0 {x:.1f},{y:.1f}"
+    rows = [ForestRow("s", -1.0), ForestRow("t", 1.0)]
+    figure = ElementTree.fromstring(forest_plot("t", rows, "difference", 1))
+    assert next(figure.iter("svg")).attrib["viewBox"] == "0 0 380 108"
+    places = [(float(dot.attrib["cx"]), float(dot.attrib["cy"])) for dot in figure.iter("circle")]
+    assert places == [(pytest.approx(247 - 115 / 1.08, abs=0.05), 25), (pytest.approx(247 + 115 / 1.08, abs=0.05), 51)]
+
+
+def test_each_line_has_a_colour_and_dashes_of_its_own() -> None:
+    figure = ElementTree.fromstring(line_chart("t", [(str(k), [(0, k), (1, k)]) for k in range(7)], "x", "y"))
+    strokes = [(line.attrib["stroke"], line.attrib["stroke-dasharray"]) for line in figure.iter("polyline")]
+    assert len(set(strokes)) == 6
+    assert strokes[6] == strokes[0]
+
+
 @pytest.mark.parametrize("log", [False, True])
 @pytest.mark.parametrize(
     "values", [(2, 5), (3, 3), (0.3, 40), (1e-9, 1e9), (0.011, 0.012), (7000, 30000), (99.5, 101), (1, 1e6)]
@@ -371,6 +392,28 @@ def test_one_trial_of_each_arm_is_no_verdict(tmp_path: Path) -> None:
     assert "mean of scenes" not in page
     assert "no verdict, one trial of each on this scene; run more seeds" in page
     assert "▲ better" not in page
+
+
+def test_a_report_on_a_table_of_the_paper_has_its_numbers_beside(tmp_path: Path) -> None:
+    write_runs(tmp_path, Plan(experiment="table1", inits=("dim",), scenes=("garden",)))
+    page = build_report(load_experiment(tmp_path, "table1"))
+    assert "Table 1, difference from the printed values" in page
+    assert "What the paper&#39;s own numbers say" in page or "What the paper's own numbers say" in page
+
+
+def test_costs_stand_under_the_verdict(page: str) -> None:
+    """20,010 and 26,010 Gaussians on the average, 51.025 and 66.025 s; seeds 0 to 2 add as many seconds."""
+    costs = page.split('aria-label="Cost">')[1].split("</ul>")[0]
+    assert "<li>Gaussians +30.0% as a ratio of totals, +30.0% as the mean of 2 scenes</li>" in costs
+    assert "<li>Training time +29.4% as a ratio of totals, +29.4% as the mean of 2 scenes; times of equal" in costs
+    assert "trials differ by up to 4%</li>" in costs
+    assert "mean of scenes</text>" in page
+
+
+def test_a_wide_picture_is_shown_smaller() -> None:
+    uri = _jpeg_uri(np.zeros((10, 2400, 3), dtype=np.uint8))
+    with Image.open(io.BytesIO(base64.b64decode(uri.partition(",")[2]))) as shown:
+        assert shown.size == (1200, 5)
 
 
 def test_a_single_arm_and_bare_results_still_make_a_report(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from gsbench.analysis.results import load_experiment, read_views
 from gsbench.errors import InputError
 from gsbench.runs.experiments import list_experiments
 from gsbench.runs.trial_record import read_rows
-from tests.analysis.synthetic import Plan, write_runs
+from tests.analysis.synthetic import Plan, write_arms, write_runs
 
 
 def rewrite(path: Path, **changes: object) -> None:
@@ -27,6 +27,14 @@ def test_every_complete_trial_is_read(tmp_path: Path) -> None:
     assert {trial.path for trial in experiment.trials} == set(paths)
     assert experiment.warnings == ()
     assert experiment.seeds == (0, 1, 2)
+
+
+def test_trials_are_in_the_order_of_seeds_then_of_configurations(tmp_path: Path) -> None:
+    for cap in (1, 2):
+        write_arms(tmp_path, {"adc": {"cap": cap}}, seeds=(1, 0))
+    trials = load_experiment(tmp_path, "exp").trials
+    assert [trial.seed for trial in trials] == [0, 0, 1, 1]
+    assert [trial.config_hash for trial in trials] == sorted({trial.config_hash for trial in trials}) * 2
 
 
 def test_hydra_and_report_files_beside_the_trials_do_not_disturb(tmp_path: Path) -> None:

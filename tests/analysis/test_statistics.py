@@ -252,6 +252,9 @@ def test_seeds_needed_give_the_promised_power() -> None:
     assert power(seeds - 1) < 0.82
     assert seeds_needed(0.0, 1, 0.1) == 2
     assert seeds_needed(100.0, 1, 0.001) is None
+    needed = [seeds_needed(deviation, 1, 1.0) for deviation in np.linspace(1.5, 3, 200)]
+    assert max(count for count in needed if count is not None) == 40
+    assert needed[-1] is None
 
 
 KNOWN = Components(between=0.3, within=0.5, scenes=4, trials=12)

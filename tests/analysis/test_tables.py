@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gsbench.analysis.quantities import Change, choose_quantities, quantity, relative_change
+from gsbench.analysis.quantities import Change, asked_quantity, choose_quantities, quantity, relative_change
 from gsbench.analysis.results import Experiment, load_experiment
 from gsbench.analysis.table_formats import Table, escape_latex, to_csv, to_html_page, to_latex, to_markdown
 from gsbench.analysis.tables import build_table
@@ -227,6 +227,29 @@ def test_unknown_names_are_refused(make_experiment: Make) -> None:
         build_table(experiment, rows=["scene", "densify.grad_tresh"])
 
 
+def test_the_notes_say_how_to_read_the_table_and_what_is_left_out(tmp_path: Path) -> None:
+    paths = write_runs(tmp_path, Plan(experiment="exp"))
+    (paths[-1] / "results.json").write_text("{")
+    notes = build_table(load_experiment(tmp_path, "exp"), metrics=["psnr", "lpips_alex"]).notes
+    assert notes[:4] == (
+        "Mean over 3 trials; ± is the deviation (n − 1) over trials.",
+        "Bold: best mean of a scene after rounding; this is not a test.",
+        "(k/3): only k of 3 trials have a value; —: none.",
+        "Protocol paper-1.",
+    )
+    assert any(note.endswith("n/a, weights file alexnet.pth not found.") for note in notes)
+    assert notes[-1].startswith("Left out (1): exp/garden/sfm-volumetric/c0ffee00-seed2: damaged")
+    complete = build_table(load_experiment(tmp_path, "exp"), rows=["densify"], metrics=["psnr"])
+    assert complete.notes[0] == "Mean over 3 trials; ± is the deviation (n − 1) over the trials' means of scenes."
+
+
+def test_rows_are_in_the_order_of_numbers_then_of_text(tmp_path: Path) -> None:
+    for cap in (9, 10, 100, None):
+        one_trial(tmp_path, 0, f"{cap or 0:08x}", {"densify__cap": cap}, psnr=20.0)
+    table = build_table(load_experiment(tmp_path, "exp"), rows=["densify.cap"], metrics=["psnr"])
+    assert [row.labels for row in table.rows] == [("9",), ("10",), ("100",), ("None",)]
+
+
 def test_markdown(make_experiment: Make) -> None:
     text = to_markdown(build_table(make_experiment(), rows=["scene"], columns=["densify"]))
     lines = [line for line in text.splitlines() if line.startswith("|")]
@@ -340,6 +363,8 @@ def test_counts_from_a_million_and_times_from_ten_minutes_have_the_larger_unit(
     assert values == pytest.approx([value / scale for value, scale in zip(own, scales, strict=True)])
     decimals = [{"(s)": 1, "(min)": 1, "(k)": 1, "(M)": 2}[name.split()[-1]] for name in headings]
     assert [one.format(1.23456) for one in found] == [f"{1.23456:.{places}f}" for places in decimals]
+    asked = asked_quantity("gaussians")
+    assert (asked.key, asked.name, asked.read(trials[0])) == ("gaussians", "Gaussians", gaussians)
     fixed = [quantity(name, trials[:1]) for name in ("gaussians_millions", "train_minutes", "peak_memory_mb")]
     assert [one.format(1.26) for one in fixed] == ["1.26", "1.3", "1"]
     assert [one.read(trials[0]) for one in fixed] == pytest.approx([gaussians / 1e6, seconds / 60, 900])

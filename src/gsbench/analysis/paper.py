@@ -76,7 +76,6 @@ class Paper:
 class Published:
     """Another paper's numbers; ``printed`` maps (scene, quantity) to the number of its method."""
 
-    name: str
     title: str
     source: str  # where the numbers were read
     conventions: str  # of the measurement, as far as the source states them
@@ -122,7 +121,7 @@ def load_published(name: str) -> Published:
         for key, text in zip(quantities, texts, strict=True)
     }
     title, source, conventions = (" ".join(content[key].split()) for key in ("title", "source", "conventions"))
-    return Published(name, title, source, conventions, content["densify"], quantities, printed, content["setup"])
+    return Published(title, source, conventions, content["densify"], quantities, printed, content["setup"])
 
 
 def _read(name: str) -> Any:

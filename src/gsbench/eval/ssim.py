@@ -41,10 +41,9 @@ def ssim(image: Tensor, target: Tensor, padding: SsimPadding = "zero") -> Tensor
     check_pair(image, target)
     if padding not in get_args(SsimPadding):
         raise ValueError(f"ssim padding is {padding!r}; choose {', '.join(get_args(SsimPadding))}")
-    x, y = as_batch(image), as_batch(target)  # [B, 3, H, W] each
     if padding == "valid":
-        check_size(x, WINDOW_SIZE, "ssim without padding")
-    luminance, structure = ssim_parts(x, y, padding)
+        check_size(as_batch(image), WINDOW_SIZE, "ssim without padding")
+    luminance, structure = ssim_parts(as_batch(image), as_batch(target), padding)
     values = (luminance * structure).flatten(1).mean(dim=1)  # [B]
     return values[0] if image.ndim == 3 else values
 
@@ -55,11 +54,10 @@ def masked_ssim(image: Tensor, target: Tensor, mask: Tensor, padding: SsimPaddin
     The value is NaN if no pixel counts.
     """
     check_pair(image, target)
-    x, y = as_batch(image), as_batch(target)
     if padding == "valid":
-        check_size(x, WINDOW_SIZE, "ssim without padding")
+        check_size(as_batch(image), WINDOW_SIZE, "ssim without padding")
         mask = mask[WINDOW_RADIUS:-WINDOW_RADIUS, WINDOW_RADIUS:-WINDOW_RADIUS]
-    luminance, structure = ssim_parts(x, y, padding)
+    luminance, structure = ssim_parts(as_batch(image), as_batch(target), padding)
     return (luminance * structure)[0][:, mask].mean()
 
 
