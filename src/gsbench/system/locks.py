@@ -71,17 +71,12 @@ def is_held(path: Path) -> bool:
         lock.release()
         return False
     try:
-        descriptor = open_plain(path)
-    except (OSError, InputError):
-        return False
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        with os.fdopen(open_plain(path)) as file:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
     except BlockingIOError:
         return True
-    except OSError:
-        return False
-    finally:
-        os.close(descriptor)
+    except (OSError, InputError):
+        pass
     return False
 
 

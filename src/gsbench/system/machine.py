@@ -60,7 +60,7 @@ def kind_of_machine(record: Mapping[str, Any]) -> str:
 @functools.cache
 def cpu_name() -> str:
     """The name of the processor from the operating system, else its architecture."""
-    name = {"linux": _linux_name, "darwin": _mac_name, "win32": _windows_name}.get(sys.platform, str)()
+    name = {"linux": _linux_name, "darwin": _mac_name}.get(sys.platform, str)()
     return " ".join((name or platform.processor() or platform.machine() or "unknown").split())
 
 
@@ -91,10 +91,6 @@ def _mac_name() -> str:
     except (OSError, subprocess.SubprocessError):
         return ""
     return answer.stdout
-
-
-def _windows_name() -> str:
-    return os.environ.get("PROCESSOR_IDENTIFIER", "")
 
 
 def load_numba() -> Any:

@@ -33,13 +33,19 @@ from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.isolate import describe_exit, error_lines, python_command
 from gsbench.system.locks import BusyError, hold
 from gsbench.tracking.mlflow_sink import MlflowSink, untyped_address
-from gsbench.tracking.sinks import Sink, TensorBoardSink, TrackedTrial, WandbSink, name_of, read_state
+from gsbench.tracking.sinks import Sink, TensorBoardSink, TrackedTrial, WandbSink, read_state
 from gsbench.words import counted
 
 log = logging.getLogger(__name__)
 
 TRACKER_FAILED = 3  # exit code if the tracker, or a file, is at fault: the last line on stderr says why
 SECONDS_TO_STOP = 3.0  # patience after a signal that asks to end
+SINKS: dict[str, Any] = {"mlflow": MlflowSink, "tensorboard": TensorBoardSink, "wandb": WandbSink}
+
+
+def sink_of(options: dict[str, Any]) -> Any:
+    """The class of the tracker that the settings ``tracking`` name."""
+    return SINKS[options.get("sink", "mlflow")]
 
 
 class MirrorError(Exception):
@@ -101,7 +107,7 @@ class Mirror:
         try:
             process.communicate(timeout=seconds)
         except subprocess.TimeoutExpired:
-            log.warning("tracking: %s is slow; `gsbench sync` mirrors the rest later", name_of(self._options))
+            log.warning("tracking: %s is slow; `gsbench sync` mirrors the rest later", sink_of(self._options).name)
             return
         finally:  # also where a signal interrupts the wait
             process.kill()
@@ -140,7 +146,7 @@ class TrackerRun:
         self._options, self._trial = options, TrackedTrial(folder, values)
         with ExitStack() as held:
             held.enter_context(hold(folder.path / LOCK, "mirroring", wait=False))
-            self._sink = make_sink(options, self._trial)
+            self._sink: Sink = sink_of(options)(options, self._trial)
             self._file = folder.path / self._sink.state_file
             self._open()
             self._held = held.pop_all()
@@ -184,14 +190,6 @@ class TrackerRun:
     def _open(self) -> None:
         self._state = self._sink.open(read_state(self._file), self._trial.results_hash())
         write_json(self._file, self._state)
-
-
-def make_sink(options: dict[str, Any], trial: TrackedTrial) -> Sink:
-    """The sink of a trial for the tracker that ``tracking.sink`` names."""
-    sink = options.get("sink")
-    if sink == "tensorboard":
-        return TensorBoardSink(trial)
-    return WandbSink(options, trial) if sink == "wandb" else MlflowSink(options, trial)
 
 
 # ---- once, after the end
@@ -248,7 +246,7 @@ def refusal(folder: TrialFolder, options: dict[str, Any], error: Exception) -> M
     """A MirrorError, in one line, for an ``error`` of the tracker's client about a trial."""
     lines = str(error).strip().splitlines()
     reason = f"{type(error).__name__}: {lines[0][:200] if lines else ''}"
-    return MirrorError(f"{name_of(options)} does not take {folder.label} ({reason})")
+    return MirrorError(f"{sink_of(options).name} does not take {folder.label} ({reason})")
 
 
 # ---- beside a sweep

@@ -157,7 +157,7 @@ NOT_IN_A_KEY = re.compile(r"[^a-zA-Z0-9_\-./ ]")  # characters that MLflow refus
 class MlflowSink:
     """The MLflow run of one trial."""
 
-    state_file = STATE
+    name, state_file = "MLflow", STATE
 
     def __init__(self, options: dict[str, Any], trial: TrackedTrial) -> None:
         self._trial = trial

@@ -18,7 +18,6 @@ from gsbench.runs.trial_record import TrialRecord, read_rows
 
 FILES = (layout.CONFIG, layout.RESULTS, layout.INIT_REPORT, layout.PER_VIEW, layout.EVENTS)
 CURVES = {layout.CURVES: "train", layout.EVENTS: "events"}  # file: prefix of its scalars' names
-NAMES = {"mlflow": "MLflow", "tensorboard": "TensorBoard", "wandb": "Weights & Biases"}
 
 
 @dataclass(frozen=True)
@@ -52,7 +51,7 @@ class Sink(Protocol):
         A sink that prints:
 
         >>> class Printed:
-        ...     state_file = "printed.json"
+        ...     name, state_file = "a printer", "printed.json"
         ...
         ...     def open(self, state, results):
         ...         return state
@@ -72,6 +71,7 @@ class Sink(Protocol):
         100: loss 0.5
     """
 
+    name: str  # the tracker's, in messages
     state_file: str  # in the trial's folder, for the state that `open` returns; see `MirrorState`
 
     def open(self, state: dict[str, Any], results: str | None) -> dict[str, Any]:
@@ -89,11 +89,6 @@ class Sink(Protocol):
 
     def stop(self, status: str, reason: str | None) -> None:
         """Show that the trial ended without results: ``status`` KILLED, or FAILED for a ``reason``."""
-
-
-def name_of(options: dict[str, Any]) -> str:
-    """The tracker's name in messages."""
-    return NAMES[options.get("sink", "mlflow")]
 
 
 @dataclass(frozen=True)
@@ -216,9 +211,9 @@ def read_state(file: Path) -> dict[str, Any]:
 class TensorBoardSink:
     """The event files of one trial. They cannot be edited, so a continued trial is written anew."""
 
-    state_file = "tensorboard.json"
+    name, state_file = "TensorBoard", "tensorboard.json"
 
-    def __init__(self, trial: TrackedTrial) -> None:
+    def __init__(self, options: dict[str, Any], trial: TrackedTrial) -> None:
         self._trial = trial
         self._folder = trial.folder.runs / layout.TENSORBOARD / trial.path
         self._started = time.time()
@@ -270,7 +265,7 @@ STEP = "iteration"  # our own axis: W&B's step must only grow, and the two files
 class WandbSink:
     """The W&B run of one trial; the project is the experiment, the group is scene and arm."""
 
-    state_file = "wandb.json"
+    name, state_file = "Weights & Biases", "wandb.json"
 
     def __init__(self, options: dict[str, Any], trial: TrackedTrial) -> None:
         self._trial = trial
