@@ -180,6 +180,17 @@ def test_a_promise_counts_the_bytes_of_each_type(tmp_path: Path, kind: str) -> N
     check_ply(path)
 
 
+def test_a_header_without_end_is_not_searched_for_long(tmp_path: Path) -> None:
+    path = tmp_path / "a.ply"
+    for length, fits in ((60_000, True), (66_000, False)):
+        path.write_text(f"ply\nformat ascii 1.0\ncomment {'x' * length}\nelement vertex 0\nend_header\n")
+        if fits:
+            check_ply(path)
+        else:
+            with pytest.raises(InputError, match="it has no header"):
+                check_ply(path)
+
+
 @pytest.mark.parametrize(
     ("name", "value", "said"),
     [

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import os
 import subprocess
 import sys
 import threading
 import time
 from pathlib import Path
+from typing import Any
 
 import numba
 import numpy as np
@@ -17,9 +19,9 @@ from numba import types
 
 from gsbench.gaussians.model import Gaussians
 from gsbench.raster.base import RenderOutput
-from gsbench.raster.cpu import CpuRasterizer, binning, executor, shuffle, simd, workspace
+from gsbench.raster.cpu import CpuRasterizer, binning, composite, executor, layout, shuffle, simd, workspace
 from gsbench.raster.cpu.workspace import Arena, ShardRunner, TensorPool
-from gsbench.raster.reference import ReferenceRasterizer
+from gsbench.raster.reference import ReferenceRasterizer, project, tile_rectangles
 from tests.raster.strategies import Case, render_with_gradients
 
 BLACK = torch.zeros(3)
@@ -85,6 +87,82 @@ def test_tiles_are_divided_by_their_work(lengths: list[int], shards: int, bounds
     binning.balance_tiles(starts, shards, found, of_tile)
     assert found.tolist() == bounds
     assert of_tile.tolist() == np.repeat(np.arange(shards), np.diff(bounds)).tolist()
+
+
+def highest(records: np.ndarray, low_x: Any, low_y: Any, size: float) -> np.ndarray:
+    """The largest log2(alpha) of records [R, 16] in squares of side ``size``: at the mean, or else on an edge."""
+    mean_x, mean_y, shear, curve_t, curve_y, top = (records[:, k, None].astype(np.float64) for k in range(6))
+
+    def at(dx: np.ndarray, dy: np.ndarray) -> np.ndarray:
+        return top + curve_t * (dx + shear * dy) ** 2 + curve_y * dy**2
+
+    left, upper = low_x - mean_x, low_y - mean_y  # [R, S]
+    right, lower = left + size, upper + size
+    best = at(np.clip(0, left, right), np.clip(0, upper, lower))
+    for dx in (left, right):
+        best = np.maximum(best, at(dx, np.clip(-curve_t * shear * dx / (curve_t * shear**2 + curve_y), upper, lower)))
+    for dy in (upper, lower):
+        best = np.maximum(best, at(np.clip(-shear * dy, left, right), dy))
+    return best
+
+
+def test_tiles_and_blocks_are_those_that_a_contour_reaches() -> None:
+    """All that have a pixel with alpha >= 1/255, and no others, up to a margin for rounding."""
+    case = Case(96, 64, 150, sh_degree=0, log_scale=-2.5, logit=-3.0)  # faint: no pixel stops
+    output = CpuRasterizer(threads=1).render(case.gaussians().map(torch.Tensor.float), case.camera(), 0, BLACK)
+    passed = output.footprint.args[0]  # type: ignore[union-attr]
+    frame, edges = passed.frame, executor._edges(case.count)
+    assert (frame.last == composite.NEVER_STOPPED).all()
+    numbers = np.concatenate(
+        [np.arange(edge, edge + seen) for edge, seen in zip(edges[:-1], passed.visible, strict=True)]
+    )
+    records, integers = (array.reshape(-1, 16)[numbers] for array in (frame.records, frame.record_ints))
+    place = {number: k for k, number in enumerate(numbers.tolist())}
+    listed, masks = np.zeros((len(numbers), 24), bool), np.zeros((len(numbers), 24), int)
+    for tile in range(24):
+        for entry in range(frame.starts[tile], frame.starts[tile + 1]):
+            k = place[int(frame.entries[entry])]
+            assert not listed[k, tile]
+            listed[k, tile], masks[k, tile] = True, frame.masks[entry]
+
+    projected = project(case.gaussians(), case.camera())
+    first, past = tile_rectangles(projected, case.camera(), 16)
+    rows = {int(index): row for row, index in enumerate(projected.index)}
+    own = [rows[int(index)] for index in integers[:, layout.INDEX]]
+    first, past = first[own].numpy(), past[own].numpy()  # [R, 2]
+    y, x = np.divmod(np.arange(24), 6)
+    in_square = (x >= first[:, :1]) & (x < past[:, :1]) & (y >= first[:, 1:]) & (y < past[:, 1:])
+
+    least = math.log2(1 / 255)
+    pixel_y, pixel_x = np.divmod(np.arange(96 * 64), 96)
+    reached = highest(records, pixel_x, pixel_y, 0.0) >= least
+    needed, needed_blocks = np.zeros((len(numbers), 24), bool), np.zeros((len(numbers), 24, 16), bool)
+    np.logical_or.at(needed, (slice(None), pixel_y // 16 * 6 + pixel_x // 16), reached)
+    block = pixel_y % 16 // 4 * 4 + pixel_x % 16 // 4
+    np.logical_or.at(needed_blocks, (slice(None), pixel_y // 16 * 6 + pixel_x // 16, block), reached)
+    assert (listed >= (needed & in_square)).all()
+    allowed = in_square & (highest(records, 16 * x - 0.1, 16 * y - 0.1, 15.2) >= least - 0.1)
+    spans = integers[:, [layout.TILES_X, layout.TILES_Y]]
+    low, high = spans & 0xFFFF, spans >> 16
+    in_span = (x >= low[:, :1]) & (x < high[:, :1]) & (y >= low[:, 1:]) & (y < high[:, 1:])
+    narrow = high[:, :1] - low[:, :1] == 1  # not looked at closer
+    assert (listed <= np.where(narrow, in_span, allowed)).all()
+    assert (listed >= (narrow & in_span)).all()
+    assert 0.3 < listed.sum() / in_square.sum() < 0.6
+
+    bits = (masks[..., None] >> np.arange(16) & 1).astype(bool)
+    assert (bits >= (needed_blocks & listed[..., None])).all()
+    for k in range(16):
+        near = highest(records, 16 * x + k % 4 * 4, 16 * y + k // 4 * 4, 3.0) >= least - 0.02
+        assert (bits[..., k] <= near).all()
+
+    whole = ((low > 0) & (high < (6, 4))).all(1)  # the contour lies within the image
+    for k in np.flatnonzero(whole):
+        for axis, tiles in ((0, x), (1, y)):
+            assert tiles[allowed[k]].min() - 1 <= low[k, axis] <= tiles[listed[k]].min()
+            assert tiles[listed[k]].max() < high[k, axis] <= tiles[allowed[k]].max() + 2
+    assert whole.sum() > 10
+    assert (high - low < past - first).any()
 
 
 def test_the_backward_pass_skips_entries_behind_the_one_that_stopped_a_block() -> None:

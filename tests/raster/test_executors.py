@@ -19,7 +19,7 @@ from gsbench.pipeline.parts import locate
 from gsbench.raster import create_rasterizer, executors
 from gsbench.raster.base import Footprint, RenderOutput
 from gsbench.raster.contract import CASES, departures
-from gsbench.raster.executors import EXECUTORS, Executor, find_executor, resolve
+from gsbench.raster.executors import EXECUTORS, Executor, RasterConfig, find_executor, resolve
 from gsbench.raster.reference import ReferenceRasterizer
 from gsbench.system.install import conf_dir, install_command
 
@@ -130,6 +130,27 @@ def test_departures_are_told() -> None:
         f"{case}: RuntimeError: no kernel",
         "without Gaussians: RuntimeError: no kernel",
     ]
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without a GPU")
+def test_a_gpu_that_cannot_be_used_is_explained(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("triton")
+    monkeypatch.setattr(executors, "missing_tools", list)
+    with pytest.raises(InputError, match=r"^Triton cannot start: "):
+        executors.load_driver()
+    monkeypatch.setattr(executors, "missing_tools", lambda: ["a C compiler", "Python.h"])
+    with pytest.raises(InputError, match=r"^Triton needs a C compiler and Python.h$"):
+        executors.load_driver()
+    monkeypatch.setattr(importlib.metadata, "version", lambda package: "3.3.1")
+    with pytest.raises(InputError, match=r"^raster=triton needs triton 3.4 or newer, and 3.3.1 is installed"):
+        executors.load_driver()
+
+
+def test_settings_are_checked() -> None:
+    assert RasterConfig(name="cpu").name == "cpu"
+    with pytest.raises(InputError, match=r"raster must be one of auto, reference, .*, got 'cpuu'.*cpu"):
+        RasterConfig(name="cpuu")
+    assert RasterConfig(name="mine", _target_="mine.Mine")._target_ == "mine.Mine"
 
 
 TINY = CASES[-1]

@@ -163,6 +163,13 @@ def test_reach_agrees_with_the_tiles_of_the_reference() -> None:
     assert (ours | ~reached).all()  # whatever reaches a tile there reaches the image here
 
 
+def test_a_square_that_only_touches_the_image_does_not_reach_it() -> None:
+    means = torch.tensor([[-3.0, 5], [-2.9, 5], [67, 5], [66.9, 5], [5, -3], [5, -2.9], [5, 51], [5, 50.9], [5, 5]])
+    radii = torch.tensor([3, 3, 3, 3, 3, 3, 3, 3, 0])
+    expected = [False, True, False, True, False, True, False, True, False]
+    assert _reaches_image(means, radii, 64, 48).tolist() == expected
+
+
 def test_the_camera_takes_the_world_to_pixels() -> None:
     camera = front_camera(64, 48, (3.0, -2.0))
     point = torch.tensor([0.3, -0.2, 4.0], dtype=torch.float64)
