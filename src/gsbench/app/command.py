@@ -190,7 +190,7 @@ def check_sweep_settings(config: DictConfig, multirun: bool) -> None:
     if not multirun and config.hydra.mode is None and (params or sweeper.get("grids")):
         raise InputError("hydra.sweeper lists values: add -m to run a trial for each, or hydra.mode=RUN for one")
     if params is not None and not OmegaConf.is_dict(params):
-        raise InputError(f"hydra.sweeper.params={params} must map settings to their values; seed=0,1 can be typed")
+        raise InputError(f"hydra.sweeper.params={params} must map settings to values; seed=0,1 can be typed itself")
     if config.launch.stop_when_decided and not multirun:
         raise InputError("launch.stop_when_decided adds seeds to a sweep: add -m, two densifiers and seed=0,1,2,3")
 
