@@ -22,7 +22,7 @@ from gsbench.analysis.results import Arm, TrialResult, canonical, group_by, read
 from gsbench.analysis.table_formats import Column, Row, Table, TableEntry
 from gsbench.parsing import read_if_sound
 from gsbench.runs.experiments import SearchPoint, TuningRecord
-from gsbench.runs.layout import TUNING
+from gsbench.runs.layout import EVENTS, TUNING
 from gsbench.words import counted, listed
 
 LONGEST = 60  # shown characters of a value
@@ -139,7 +139,7 @@ MEASURED: dict[str, Callable[[Sequence[TrialResult]], str]] = {
     "initial points": _span(lambda trial: trial.record.num_init_points),
     "initial cloud (hash)": _distinct(lambda trial: trial.cloud[:12]),
     "iterations": _span(lambda trial: trial.record.iterations),
-    "rounds of the densifier": _span(lambda trial: len(trial.folder.events()) or None),
+    "rounds of the densifier": _span(lambda trial: len(trial.folder.rows(EVENTS)) or None),
     "budget": _distinct(budget_words),
     "Gaussians in the end": _span(lambda trial: trial.record.num_gaussians),
     "seconds of training": _span(lambda trial: trial.record.seconds.get("train")),

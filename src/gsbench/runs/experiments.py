@@ -18,18 +18,15 @@ from gsbench.parsing import (
     STRICT,
     Amount,
     Count,
-    DamagedError,
     Number,
     Record,
     Text,
     Whole,
-    iterate_rows,
-    read_bytes,
     read_typed,
 )
 from gsbench.runs.keys import sha256_of
 from gsbench.runs.layout import DECLARED, IN_RUNS, TUNING
-from gsbench.runs.trial_record import Declared
+from gsbench.runs.trial_record import Declared, read_rows
 
 log = logging.getLogger(__name__)
 
@@ -294,15 +291,7 @@ def read_declarations(folder: Path, repeated: Iterable[Declared | None] = ()) ->
 
     ``repeated`` are the declarations in its trials' results. They are added if the file lacks them.
     """
-    path = folder / DECLARED
-    try:
-        content = read_bytes(path)
-    except FileNotFoundError:
-        content = b""
-    except DamagedError as error:
-        log.warning("left out: %s", error)
-        content = b""
-    declarations = [one for _, one in iterate_rows(content, Declaration, path) if one.questions]
+    declarations: list[Declaration] = [one for one in read_rows(folder / DECLARED, Declaration) if one.questions]
     in_file = {(one.primary, one.time) for one in declarations}
     for metric, when in dict.fromkeys((one.metric, one.time) for one in repeated if one is not None):
         if (metric, when) not in in_file and unix_time(when) is not None:

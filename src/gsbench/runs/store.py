@@ -28,7 +28,7 @@ from gsbench.files import (
     write_json,
 )
 from gsbench.parsing import Amount, Count, DamagedError, Record, fault_of, read_typed
-from gsbench.runs.keys import Stage, Step, sha256_of
+from gsbench.runs.keys import Stage, Step
 from gsbench.runs.layout import MANIFEST, VIEWS
 from gsbench.system.locks import BusyError, hold
 
@@ -211,7 +211,7 @@ def read_manifest(folder: Path, key: str | None = None, thorough: bool = False) 
         raise ValueError(f"{MANIFEST} is missing or unreadable") from error
     if manifest.key != (key or folder.name):
         raise ValueError(f"{MANIFEST} belongs to another key")
-    if manifest.key != sha256_of({"stage": manifest.stage, "version": manifest.version, "inputs": manifest.inputs}):
+    if manifest.key != Stage(manifest.stage, manifest.version).key(manifest.inputs):
         raise ValueError(f"{MANIFEST} does not match its key")
     for name, recorded in manifest.outputs.items():
         if not _is_sound(folder, name, recorded, thorough):

@@ -37,7 +37,6 @@ from gsbench.runs.trial_record import (
     Building,
     Configuration,
     Failure,
-    Histogram,
     MadeOf,
     ResultsFile,
     Row,
@@ -51,7 +50,6 @@ from gsbench.system.install import version_of
 from gsbench.system.locks import is_held
 
 State = Literal["done", "running", "failed", "partial", "damaged", "missing"]
-Rows = list[dict[str, bool | int | float]]
 
 TAIL_BYTES = 4096  # of a growing log, enough for its last rows
 
@@ -119,7 +117,7 @@ class TrialFolder:
             pass
         except DamagedError:
             return "damaged"
-        if (self.path / layout.FAILED).exists():
+        if self.has_failed():
             return "failed"
         return "partial" if (self.path / layout.CONFIG).exists() else "missing"
 
@@ -169,8 +167,12 @@ class TrialFolder:
         content = read_bytes(path)
         record = record_from(content, path)
         made_of = parse_typed(content, ResultsFile, path).made_of
-        if made_of is not None and made_of.results != content_hash(content):
-            raise DamagedError(path, f"was changed after it was written: `gsbench retry {self.home.name}` repairs it")
+        if made_of is not None:
+            values = from_json(content)  # compared as values: white space does not matter
+            del values[MADE_OF]
+            if made_of.results != sha256_of(values):
+                reason = f"was changed after it was written: `gsbench retry {self.home.name}` repairs it"
+                raise DamagedError(path, reason)
         self._digests = {} if made_of is None else made_of.digests
         return record
 
@@ -213,7 +215,25 @@ class TrialFolder:
         present = self.sound_record()
         before = path.stat() if present is not None and present.to_json() == content else None
         files = sorted({*published, *(self.path / name for name in READ_LATER if (self.path / name).is_file())})
-        made_of = describe_inputs(self.path, values, content, sources, entries or {}, files)
+        names = {file.relative_to(self.path).as_posix(): file for file in files}
+        sources = sorted(sources)
+        made_of = MadeOf(
+            results=sha256_of(content),
+            config=config_hash(dict(values)),
+            stages={stage.name: stage.version for stage in STAGES},
+            pycolmap=version_of("pycolmap"),
+            sources={str(source): source_stamp_of(source) for source in sources},
+            # Adding or removing a file changes its folder's time.
+            folders={str(folder): _changed_at(folder) for folder in sorted({source.parent for source in sources})},
+            entries={name: str(entry) for name, entry in (entries or {}).items()},
+            published={name: stamp_of(file) for name, file in names.items()},
+            digests={
+                name: file_sha256(file)
+                for name, file in names.items()
+                if name in READ_LATER or file.stat().st_size <= MAX_HASHED_BYTES
+            },
+            settings=dict(values),
+        )
         with atomic(path) as temporary:
             temporary.write_text(json.dumps(content | {MADE_OF: made_of.to_json()}, indent=1, allow_nan=False) + "\n")
             # Verdicts count results from before their declaration by this time, so equal results must not look newer.
@@ -239,29 +259,21 @@ class TrialFolder:
             return f"{error.path.name} {error.reason}"
         if made_of is None:
             return f"{layout.RESULTS} does not say what it was made of"
-        change = next(find_changes(self.path, values, record, made_of), "")
-        return change or _now_available(record, unavailable_now, values["eval"])
+        if change := next(find_changes(self.path, values, record, made_of), ""):
+            return change
+        if not record.awaited:  # asking loads torch
+            return ""
+        available = sorted(set(record.awaited) - set(unavailable_now(values["eval"])))
+        return f"it lacks {', '.join(available)}, which can be computed now" if available else ""
 
     # ---- files beside the results
 
-    def curves(self) -> Rows:
-        """The rows of ``metrics.jsonl``, each with an integer ``step``; [] if there is no such file.
+    def rows(self, name: str, kind: Any = Row) -> list[Any]:
+        """The rows of a file of JSON lines, such as ``metrics.jsonl``; [] if there is no such file.
 
         With a warning, a finished trial's file that was changed after it was written is left out, and so are all rows
         from a damaged one on.
         """
-        return self.rows(layout.CURVES)
-
-    def events(self) -> Rows:
-        """The rows of ``events.jsonl`` with the counts of every refinement; read as `curves`."""
-        return self.rows(layout.EVENTS)
-
-    def histograms(self) -> list[Histogram]:
-        """The rows of ``volume_histograms.jsonl``; read as `curves`."""
-        return self.rows(layout.HISTOGRAMS, Histogram)
-
-    def rows(self, name: str, kind: Any = Row) -> list[Any]:
-        """The rows of a file of JSON lines; see `gsbench.runs.trial_record`."""
         return read_rows(self.path / name, kind, lambda path: self._unchanged(path.name))
 
     def views(self) -> dict[str, dict[str, float]]:
@@ -296,16 +308,6 @@ class TrialFolder:
         return content
 
 
-def _now_available(
-    record: TrialRecord, unavailable_now: Callable[[dict[str, Any]], Collection[str]], options: dict[str, Any]
-) -> str:
-    """Name the awaited metrics that can be computed by now; "" if there are none."""
-    if not record.awaited:  # asking loads torch
-        return ""
-    available = sorted(set(record.awaited) - set(unavailable_now(options)))
-    return f"it lacks {', '.join(available)}, which can be computed now" if available else ""
-
-
 def _number(text: str) -> float:
     value = float(text)
     if not abs(value) <= MAX_NUMBER:
@@ -321,35 +323,6 @@ READ_LATER = (layout.PER_VIEW, layout.CURVES, layout.EVENTS, layout.HISTOGRAMS) 
 MAX_HASHED_BYTES = 1e6
 
 _digests: dict[Stamp, str] = {}  # sha256 of files that this process has read, by device, inode and stamp
-
-
-def describe_inputs(
-    folder: Path,
-    values: Mapping[str, Any],
-    content: Mapping[str, Any],
-    sources: Iterable[Path],
-    entries: Mapping[str, Path],
-    published: Iterable[Path],
-) -> MadeOf:
-    """The inputs of the results ``content`` of the trial in ``folder``, with the present state of files.
-
-    ``sources`` are the user's files, ``entries`` results of stages by name, ``published`` files in the trial's folder.
-    """
-    sources = sorted(sources)
-    names = {path.relative_to(folder).as_posix(): path for path in published}
-    return MadeOf(
-        results=sha256_of(content),
-        config=config_hash(dict(values)),
-        stages={stage.name: stage.version for stage in STAGES},
-        pycolmap=version_of("pycolmap"),
-        sources={str(path): source_stamp_of(path) for path in sources},
-        # Adding or removing a file changes its folder's time.
-        folders={str(path): path.stat().st_mtime_ns for path in sorted({path.parent for path in sources})},
-        entries={name: str(path) for name, path in entries.items()},
-        published={name: stamp_of(path) for name, path in names.items()},
-        digests={name: file_sha256(path) for name, path in names.items() if _is_hashed(name, path)},
-        settings=dict(values),
-    )
 
 
 def find_changes(folder: Path, values: dict[str, Any], record: TrialRecord, made_of: MadeOf) -> Iterator[str]:
@@ -385,13 +358,6 @@ def find_changes(folder: Path, values: dict[str, Any], record: TrialRecord, made
             yield f"the result of its stage {name} in the store is damaged or gone ({error})"
 
 
-def content_hash(content: bytes) -> str:
-    """The hash of the values in ``results.json`` without ``made_of``; white space does not matter."""
-    values = from_json(content)
-    values.pop(MADE_OF, None)
-    return sha256_of(values)
-
-
 def stamp_of(path: Path) -> Stamp:
     """Size and time of change; raises OSError."""
     state = os.stat(path)
@@ -421,10 +387,6 @@ def _changed_at(folder: Path) -> int | None:
         return folder.stat().st_mtime_ns
     except (OSError, ValueError):
         return None
-
-
-def _is_hashed(name: str, path: Path) -> bool:
-    return name in READ_LATER or path.stat().st_size <= MAX_HASHED_BYTES
 
 
 def _digest(path: Path) -> str | None:

@@ -31,6 +31,7 @@ from gsbench.events import RefineEvent
 from gsbench.parsing import DamagedError
 from gsbench.runs import layout
 from gsbench.runs.experiments import read_tuning
+from gsbench.runs.trial_record import Histogram
 from gsbench.scene.images import read_image
 from gsbench.words import counted, signed
 
@@ -260,7 +261,7 @@ def _logged_histograms(trials: Sequence[TrialResult]) -> dict[int, Curve]:
     """The logged histograms by iteration, pooled over trials, as (volume at the bin's centre, share)."""
     pooled: dict[int, dict[float, float]] = {}
     for trial in trials:
-        for row in trial.folder.histograms():
+        for row in trial.folder.rows(layout.HISTOGRAMS, Histogram):
             for low, high, count in zip(row.log10_edges, row.log10_edges[1:], row.counts, strict=False):
                 bins, volume = pooled.setdefault(row.step, {}), 10 ** ((low + high) / 2)
                 bins[volume] = bins.get(volume, 0.0) + count

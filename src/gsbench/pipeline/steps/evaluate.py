@@ -29,7 +29,7 @@ from gsbench.logs import progress
 from gsbench.pipeline.steps.scene import Views
 from gsbench.raster import Rasterizer
 from gsbench.raster.reference import project
-from gsbench.runs.keys import EVALUATE, Step, UserCode, options_of, rasterizer_inputs, step_of
+from gsbench.runs.keys import EVALUATE, Step, options_of, rasterizer_inputs, step_of
 from gsbench.runs.layout import ELLIPSOIDS, FIGURES, LINEAGE, METRICS, PER_VIEW, POINT_CLOUD, RENDERS
 from gsbench.runs.trial_record import Earlier, Evaluation
 from gsbench.scene.images import png_name, read_image
@@ -49,12 +49,14 @@ def evaluate_step(views: Views, trained: Step, parts: Parts) -> Step:
     Where another program left renders instead of a model, the step measures those. ``eval.maps`` adds a picture of the
     large Gaussians; ``eval.fps`` is the image size at which the speed of rendering is measured.
     """
-    evaluator, size, user = parts.evaluator, parts.eval.fps, parts.user_code
+    evaluator, user = parts.evaluator, parts.user_code
     inputs: dict[str, Any] = {
         "protocol": evaluator.protocol.id,
         "unavailable": sorted(evaluator.unavailable),  # part of the key: weights that arrive later give a new result
-        **_further_metrics(evaluator, user, size),
     }
+    own = {name: options_of("eval", metric, user, f"{EXTRA}.{name}") for name, metric in evaluator.extra.items()}
+    further = {"extra": own, "more": list(evaluator.more), "fps": parts.eval.fps}
+    inputs |= {name: value for name, value in further.items() if value}
     if parts.program is not None and not parts.program.leaves_model:
         return step_of(EVALUATE, {"renders": trained.key} | inputs, _build_from_renders(views, trained, parts), user)
     inputs |= {"train": trained.key, "maps": parts.eval.maps}
@@ -97,7 +99,14 @@ def _build_from_model(views: Views, trained: Step, parts: Parts) -> Callable[[Pa
                     means = summarize(measure(model, f"iteration {step}", None), evaluator.unavailable)
                     at[str(step)] = Earlier(metrics=means, num_gaussians=len(model))
         if parts.eval.maps:
-            draw_figures(folder / FIGURES, folder / RENDERS, scene, training, gaussians)
+            with np.load(training / LINEAGE) as lineage:
+                causes = torch.from_numpy(lineage["causes"][lineage["ids"]])  # [N]
+            first = scene.test[0]
+            picture = draw_ellipsoids(
+                read_image(folder / RENDERS / png_name(first.name)), gaussians, causes, first.camera, VOLUME_THRESHOLD
+            )
+            (folder / FIGURES).mkdir(exist_ok=True)
+            picture.save(folder / FIGURES / ELLIPSOIDS)
         if parts.eval.fps is not None:
             for view, speed in measure_speed(rasterizer, gaussians, scene, color, parts.eval.fps).items():
                 per_view[view]["fps"] = speed
@@ -122,13 +131,6 @@ def _build_from_renders(views: Views, trained: Step, parts: Parts) -> Callable[[
         _write_metrics(folder, evaluator, per_view, scene, unknown)
 
     return build
-
-
-def _further_metrics(evaluator: Evaluator, user: UserCode, size: Sequence[int] | None) -> dict[str, Any]:
-    """The user's own metrics, ``eval.more`` and ``eval.fps`` as they enter a key; unset ones are left out."""
-    own = {name: options_of("eval", metric, user, f"{EXTRA}.{name}") for name, metric in evaluator.extra.items()}
-    further: dict[str, Any] = {"extra": own, "more": list(evaluator.more), "fps": size}
-    return {name: value for name, value in further.items() if value}
 
 
 def measure_speed(
@@ -186,17 +188,6 @@ def summary_of(evaluator: Evaluator, per_view: Mapping[str, Mapping[str, float]]
         awaited=sorted(evaluator.awaited),
         facts={name: to_record(facts) for name, facts in evaluator.own.items()},
     )
-
-
-def draw_figures(folder: Path, renders: Path, scene: Scene, training: Path, gaussians: Gaussians) -> None:
-    """Draw the voluminous Gaussians of the model over its first test view."""
-    folder.mkdir(exist_ok=True)
-    with np.load(training / LINEAGE) as lineage:
-        causes = torch.from_numpy(lineage["causes"][lineage["ids"]])  # [N]
-    for view in scene.test[:1]:
-        render = np.asarray(Image.open(renders / png_name(view.name)))
-        picture = draw_ellipsoids(render, gaussians, causes, view.camera, VOLUME_THRESHOLD)
-        picture.save(folder / ELLIPSOIDS)
 
 
 def write_per_view(path: Path, per_view: Mapping[str, Mapping[str, float]]) -> None:

@@ -155,19 +155,15 @@ class Views:
     """The views of a trial, loaded at their first use, and what they depend on."""
 
     def __init__(self, store: Store, capture: Capture, init: Step, options: SceneConfig) -> None:
-        self.store, self.capture, self.init, self.options = store, capture, init, options
+        self.store, self.capture, self.init = store, capture, init
+        names = ("downscale", "max_size", "resample", "principal_point")
+        self.preparation: dict[str, Any] = {name: getattr(options, name) for name in names}
 
     @property
     def inputs(self) -> dict[str, Any]:
         """The inputs on which the views depend, besides the cameras, which come from ``init``."""
-        return {
-            "capture": self.capture.fingerprint,
-            "test": sha256_of(list(self.capture.test_names)),
-            "downscale": self.options.downscale,
-            "max_size": self.options.max_size,
-            "resample": self.options.resample,
-            "principal_point": self.options.principal_point,
-        }
+        names = sha256_of(list(self.capture.test_names))
+        return {"capture": self.capture.fingerprint, "test": names, **self.preparation}
 
     @cached_property
     def scene(self) -> Scene:
@@ -177,12 +173,9 @@ class Views:
                 self.capture,
                 self.store.path(self.init) / MODEL_FOLDER,
                 self.store.root / VIEWS,
-                downscale=self.options.downscale,
-                max_size=self.options.max_size,
-                resample=self.options.resample,
-                principal_point=self.options.principal_point,
                 progress=report,
                 made_by=view_versions(),
+                **self.preparation,
             )
 
 

@@ -80,22 +80,28 @@ def train_step(views: Views, parts: Parts) -> Step:
 
             gaussians = trainer.run(folder, show)
         write_ply(gaussians, folder / POINT_CLOUD)
-        lineage: dict[str, Any] = {name: tensor.numpy() for name, tensor in densifier.lineage.state_dict().items()}
-        np.savez_compressed(folder / LINEAGE, **lineage)
         summary = {
             "iterations": trainer.step,
             "num_init_points": len(initial),
             "num_gaussians": len(gaussians),
-            "causes": densifier.lineage.causes_of_living(),
             "scene_extent": scene.extent,
             "seconds": trainer.seconds,
             "peak_memory_mb": peak_memory_mb(device),
-            "machine": describe_machine(device),
-            "checkout": own_checkout(),
         }
-        write_json(folder / TRAINING, summary)
+        _write_training(folder, summary, densifier.lineage, device)
 
     return step_of(TRAIN, inputs, build, user)
+
+
+def _write_training(folder: Path, summary: Mapping[str, Any], lineage: Lineage | None, device: torch.device) -> None:
+    """Write the lineage of a trained model, and the ``summary`` of the training with further facts."""
+    causes: dict[str, int] = {}
+    if lineage is not None:
+        causes = lineage.causes_of_living()
+        arrays: dict[str, Any] = {name: tensor.numpy() for name, tensor in lineage.state_dict().items()}
+        np.savez_compressed(folder / LINEAGE, **arrays)
+    machine = {"machine": describe_machine(device), "checkout": own_checkout()}
+    write_json(folder / TRAINING, {**summary, "causes": causes, **machine})
 
 
 def initial_gaussians(init: Path, device: torch.device) -> Gaussians:
@@ -158,21 +164,26 @@ def external_step(views: Views, trainer: External, parts: Parts) -> Step:
                 shutil.rmtree(places[place], ignore_errors=True)
         log.info("train: %s ended after %s", trainer.program, readable_time(ended.seconds))
         pattern = fill_placeholders(trainer.result, values, "densify.result")
+        count, lineage = None, None
         try:
-            summary = take_result(trainer, pattern, views, places[OUTPUT], folder)
+            if trainer.leaves_model:
+                count = len(collect_model(places[OUTPUT], pattern, folder / POINT_CLOUD))
+                lineage = Lineage(count)  # without causes: which rule made a Gaussian is unknown here
+            else:
+                collect_renders(places[OUTPUT], pattern, trainer.by_order, scene.test, folder / RENDERS)
         except TrainingError as error:
             raise TrainingError(f"{Path(trainer.program).name} ended well, but {error}; log: {log_file}") from error
         shutil.rmtree(work)
         (folder / EVENTS).write_text("")
-        summary |= {
+        summary = {
+            "evaluated_from": FROM_MODEL if trainer.leaves_model else FROM_RENDERS,
+            "num_gaussians": count,
             "iterations": iterations,
             "num_init_points": len(cloud),
             "scene_extent": scene.extent,
             "seconds": ended.seconds,
             # Only the program itself could measure its memory on a GPU.
             "peak_memory_mb": ended.peak_memory_mb if device.type == "cpu" else None,
-            "machine": describe_machine(device),
-            "checkout": own_checkout(),
             "trained_by": {
                 "program": trainer.program,
                 "version": trainer.version,
@@ -182,23 +193,11 @@ def external_step(views: Views, trainer: External, parts: Parts) -> Step:
                 ],
             },
         }
-        write_json(folder / TRAINING, summary)
+        _write_training(folder, summary, lineage, device)
 
     # Its own version: changes of gsbench's trainer do not concern it. A stopped program starts from the beginning.
     stage = replace(TRAIN, version=1, resumable=False)
     return step_of(stage, inputs, build)
-
-
-def take_result(trainer: External, pattern: str, views: Views, output: Path, folder: Path) -> dict[str, Any]:
-    """Keep in ``folder`` what the program left in ``output``; returns facts for the training's summary."""
-    if not trainer.leaves_model:
-        collect_renders(output, pattern, trainer.by_order, views.scene.test, folder / RENDERS)
-        return {"evaluated_from": FROM_RENDERS, "num_gaussians": None, "causes": {}}
-    gaussians = collect_model(output, pattern, folder / POINT_CLOUD)
-    lineage = Lineage(len(gaussians))  # without causes: which rule made a Gaussian is unknown here
-    state: dict[str, Any] = {name: tensor.numpy() for name, tensor in lineage.state_dict().items()}
-    np.savez_compressed(folder / LINEAGE, **state)
-    return {"evaluated_from": FROM_MODEL, "num_gaussians": len(gaussians), "causes": lineage.causes_of_living()}
 
 
 def environment_of(trainer: External, values: Mapping[str, object]) -> dict[str, str]:
