@@ -135,7 +135,7 @@ BAD: list[tuple[str, Callable[[], Any], str]] = [
     ("no claims", lambda: changed("claims", to=[]), "at least one claim"),
     ("claims that are missing", lambda: without("claims"), "at least one claim|claims is not given"),
     ("a claim that is text", lambda: changed("claims", 0, to="it is better"), "must be a mapping"),
-    ("an empty sentence", lambda: changed("claims", 0, "says", to="  "), "says is empty"),
+    ("an empty sentence", lambda: changed("claims", 0, "says", to="  "), "says must be a text that is not empty"),
     ("no scenes", lambda: changed("scenes", to={}), "at least one"),
     ("a scene that is text", lambda: changed("scenes", "own", to="photos"), "must be a mapping of settings"),
     ("nested settings", lambda: changed("settings", to={"scene": {"max_size": 160}}), "with dots"),

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from gsbench.analysis.results import TrialResult
-from gsbench.runs.experiments import Declaration, Question, read_declarations
+from gsbench.runs.experiments import Declaration, read_declarations
 from gsbench.words import counted
 
 
@@ -27,16 +27,12 @@ class ActiveDeclaration:
 
     @property
     def metric(self) -> str:
-        return self._first.metric
+        return self.declaration.questions[0].metric
 
     @property
     def question(self) -> str:
         """The question of the verdict, interpolation or extrapolation; "" if it is about both."""
-        return self._first.about
-
-    @property
-    def _first(self) -> Question:
-        return self.declaration.questions[0]
+        return self.declaration.questions[0].about
 
     @property
     def beforehand(self) -> bool:

@@ -130,10 +130,10 @@ def _worst_median_best(views: Sequence[tuple[float, TrialPair, str]]) -> list[tu
     ordered = sorted(views, key=lambda view: (view[0], view[1][0].label, view[2]))
     if len(ordered) < 2:
         return [("the only view", pair, view) for _, pair, view in ordered]
-    chosen = [("the view with the least gain", ordered[0]), ("the view with the largest gain", ordered[-1])]
-    if len(ordered) > 2:
-        chosen.insert(1, ("the view with the median gain", ordered[len(ordered) // 2]))
-    return [(which, pair, view) for which, (_, pair, view) in chosen]
+    places = {"least": 0, "median": len(ordered) // 2, "largest": -1}
+    if len(ordered) == 2:
+        del places["median"]
+    return [(f"the view with the {word} gain", *ordered[place][1:]) for word, place in places.items()]
 
 
 def _compare_view(which: str, pair: TrialPair, view: str) -> ViewComparison:

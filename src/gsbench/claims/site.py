@@ -7,9 +7,10 @@ import base64
 import hashlib
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
+from typing import Any
 
 from gsbench.analysis.cells import swept_settings
 from gsbench.analysis.declaration import active_declaration
@@ -26,31 +27,18 @@ from gsbench.runs.experiments import latest_declaration, read_declarations
 INDEX, REPORTS = "index.html", "reports"
 
 
-@dataclass(frozen=True)
-class ExperimentSection:
-    """An experiment's section of the first page."""
-
-    name: str
-    key: str  # for names of files and anchors: letters, digits, - and _
-    facts: tuple[tuple[str, str], ...]
-    claims: tuple[Verdict, ...]  # verdicts on declared claims
-    lines: tuple[str, ...]  # verdicts on compared pairs of arms
-    tables: tuple[Table, ...]  # arms × scenes, one for each quantity
-    notes: tuple[str, ...] = ()
-
-
 def write_site(archives: Sequence[Path], out: Path, title: str, scratch: Path) -> list[str]:
     """Write the site into the folder ``out``; return a line for each archive that is left out, with the reason.
 
     Archives are unpacked into the empty folder ``scratch``. Raises InputError if no archive can be shown.
     """
-    sections: list[ExperimentSection] = []
+    sections: list[dict[str, Any]] = []
     left_out: list[str] = []
     (out / REPORTS).mkdir(parents=True, exist_ok=True)
     for number, archive in enumerate(archives):
         try:
             experiment = unpack_archive(archive, scratch / str(number))
-            key = _unique_key(experiment.name, {section.key for section in sections})
+            key = _unique_key(experiment.name, {section["key"] for section in sections})
             report, section = build_report(experiment), _section(experiment, key)
         except InputError as error:
             left_out.append(str(error))
@@ -68,17 +56,22 @@ def write_site(archives: Sequence[Path], out: Path, title: str, scratch: Path) -
     return left_out
 
 
-def _section(experiment: Experiment, key: str) -> ExperimentSection:
+def _section(experiment: Experiment, key: str) -> dict[str, Any]:
+    """An experiment's section of the first page; ``key`` is for names of files and anchors.
+
+    It has the verdicts on declared claims, a line on each compared pair of arms, and a table of arms × scenes for each
+    quantity.
+    """
     trials, notes = experiment.trials, list[str]()
-    claims: tuple[Verdict, ...] = ()
-    tables: tuple[Table, ...] = ()
+    claims: list[Verdict] = []
+    tables: list[Table] = []
     try:
         claims = _claims(experiment)
     except InputError as error:
         notes.append(f"Its declared claims cannot be judged: {error}")
     try:
         rows = ("init", "densify", *swept_settings(trials))
-        tables = tuple(_by_quantity(build_table(experiment, rows=rows, columns=("scene",))))
+        tables = list(_by_quantity(build_table(experiment, rows=rows, columns=("scene",))))
     except InputError as error:
         notes.append(f"No table: {error}")
     arms, pairs = compared_pairs(experiment)
@@ -92,18 +85,19 @@ def _section(experiment: Experiment, key: str) -> ExperimentSection:
         "machine": ", ".join(sorted({trial.machine or "not recorded" for trial in trials})),
         "gsbench": ", ".join(sorted({trial.record.versions.get("gsbench", "unknown") for trial in trials})),
     }
-    lines = tuple(map(headline, judged))
-    return ExperimentSection(experiment.name, key, tuple(facts.items()), claims, lines, tables, tuple(notes))
+    lines = [headline(one) for one in judged]
+    shown = {"facts": list(facts.items()), "claims": claims, "lines": lines, "tables": tables, "notes": notes}
+    return {"name": experiment.name, "key": key} | shown
 
 
-def _claims(experiment: Experiment) -> tuple[Verdict, ...]:
+def _claims(experiment: Experiment) -> list[Verdict]:
     """The verdicts on declared claims, as `gsbench check --from` gives them, without those of gates."""
     declared = [one for one in read_declarations(experiment.folder) if one.of_claims]
     if not declared:
-        return ()
+        return []
     judged = judge(experiment.trials, latest_declaration(declared))
     # A gate's baseline trials are not in this archive.
-    return tuple(verdict for verdict in judged if not verdict.question.versions)
+    return [verdict for verdict in judged if not verdict.question.versions]
 
 
 def _by_quantity(table: Table) -> Iterator[Table]:
