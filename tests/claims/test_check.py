@@ -12,7 +12,19 @@ from typing import Any
 import pytest
 import yaml
 
-from gsbench.claims.check import Check, ClaimVerdict, make_page, prepare, to_html
+from gsbench.analysis.judgement import Verdict
+from gsbench.analysis.pairing import Pairs
+from gsbench.analysis.quantities import asked_quantity
+from gsbench.analysis.statistics import Answer, StudentT
+from gsbench.claims.check import (
+    Check,
+    ClaimVerdict,
+    _late_words,
+    _number,
+    make_page,
+    prepare,
+    to_html,
+)
 from gsbench.claims.file import parse_claims
 from gsbench.claims.stopping import KeyAndSeed, run_looks
 from gsbench.cli import run
@@ -154,6 +166,92 @@ def test_the_page_says_all(tmp_path: Path) -> None:
     assert "<better>" not in to_html(page)
     assert "<svg" in to_html(page)
     assert "http" not in to_html(page).replace("http://www.w3.org", "")  # one file, no network
+
+
+def judged(outcome: Any, mean: float = 0.0, error: float = 0.0, direction: str = "higher", **more: Any) -> ClaimVerdict:
+    """A verdict on a claim with a least effect of 0.3, whose interval is the mean if the error is 0."""
+    file = parse_claims(content(direction=direction))
+    answer = Answer(mean, StudentT(mean, error, 1e6), 0.05, 0.05, 0.05)
+    question = file.question(file.claims[0], {})
+    verdict = Verdict(question, asked_quantity("psnr"), Pairs(()), outcome=outcome, answer=answer, **more)
+    return ClaimVerdict(file.claims[0], verdict)
+
+
+@pytest.mark.parametrize(
+    ("one", "reason"),
+    [
+        (judged("supported", 1.0), "it is higher"),
+        (judged("supported", 0.3), "it is higher"),
+        (judged("supported", 0.29), "it is higher; by 0.3 or more is not shown"),
+        (judged("supported", 0.5, 0.15), "it is higher; by 0.3 or more is not shown"),
+        (judged("supported", -0.3, direction="lower"), "it is lower"),
+        (judged("supported", -0.29, direction="lower"), "it is lower; by 0.3 or more is not shown"),
+        (judged("supported", 0.0, direction="same"), "any effect is smaller than the least that matters (0.3)"),
+        (judged("too small to matter", 0.1), "any effect is smaller than the least that matters (0.3); it is higher"),
+        (judged("too small to matter", -0.1), "any effect is smaller than the least that matters (0.3); it is lower"),
+        (judged("too small to matter", 0.1, 0.1), "any effect is smaller than the least that matters (0.3)"),
+        (judged("refuted", -1.0), "it is the opposite of higher"),
+        (judged("refuted", 1.0, direction="same"), "it differs by more than 0.3"),
+        (judged("undecided"), "all 0 seeds show neither a difference nor that it is below 0.3"),
+        (judged("undecided", rests_on_outlying=True), "it depends on trials far outside the others"),
+        (judged("undecided", rests_on_outlying=True, final=False), "trials are missing: the next look waits for them"),
+        (judged("undecided", untestable="no data"), "no data"),
+    ],
+)
+def test_each_verdict_has_its_reason(one: ClaimVerdict, reason: str) -> None:
+    assert one.reason == reason
+    assert one.word == ("not testable here" if reason == "no data" else one.verdict.outcome)
+
+
+def test_numbers_and_late_trials_on_the_page() -> None:
+    assert [_number(value) for value in (1000.0, -1000.0, 999.94, 0.5)] == ["1,000", "-1,000", "999.9", "0.5"]
+    assert _late_words(judged("undecided")) == ""
+    assert _late_words(judged("undecided", late=2)).startswith("2 trials had been measured before")
+
+
+def test_the_verb_on_made_up_trials_and_on_their_archive(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs"))
+    runner = FakeRunner(noise=0.001)
+    monkeypatch.setattr("gsbench.verbs.claims.run_batch", runner)
+    path, archive, page = tmp_path / "claims.yaml", tmp_path / "a.zip", tmp_path / "page.html"
+    path.write_text(json.dumps(content()))
+    assert run(["check", str(path), "--dry-run"]) == 0
+    out = capsys.readouterr().out
+    assert "1 claim to be tested" in out
+    assert "4 trials until the first look, 8 at most; each test may err in 5 % of such sweeps" in out
+    assert run(["check", str(path)]) == 0
+    assert runner.batches == [4]
+    home = tmp_path / "runs" / "check_it"
+    assert capsys.readouterr().out == f"supported            lpips: it is higher\n{home / 'claims.html'}\n"
+    assert "supported" in (home / "claims.html").read_text()
+    assert run(["export", "--results", "check_it", "--out", str(archive)]) == 0
+    capsys.readouterr()
+    assert run(["check", str(path), "--from", str(archive)]) == 0
+    out = capsys.readouterr().out
+    assert "supported            lpips: PSNR (dB) of volumetric against adc: +1.0" in out
+    assert "judged on 4 trials: 1 scene, 2 seeds, two arms; looks planned at 2, 3, 4 seeds" in out
+    assert run(["check", str(path), "--from", str(archive), "--out", str(page)]) == 0
+    assert page.read_text().count("supported") == (home / "claims.html").read_text().count("supported")
+    for changes, message in (
+        ({"least": 0.2}, "its least was 0.3 when it was declared"),
+        ({"direction": "lower"}, "its sign was 1"),
+        ({"metric": "ssim"}, "its metric was psnr"),
+        ({"baseline": "volumetric", "arm": "adc"}, "other arms were declared"),
+        ({"id": "other"}, "the file lacks claims that were declared: lpips"),
+    ):
+        path.write_text(json.dumps(content(**changes)))
+        assert run(["check", str(path), "--from", str(archive)]) == 2
+        assert message in capsys.readouterr().err
+    for words, message in (
+        (["--from", str(archive), "--dry-run"], "runs nothing"),
+        (["--from", str(archive), "--out", "page.txt"], "a page ends in .html"),
+        (["--out", "page.html"], "--out goes with --from"),
+        (["train.iterations=5"], "settings of a check are in its file of claims"),
+    ):
+        assert run(["check", str(path), *words]) == 2
+        assert message in capsys.readouterr().err
 
 
 @pytest.mark.slow

@@ -11,7 +11,10 @@ import numpy as np
 import pytest
 
 from gsbench.analysis.judgement import Verdict
+from gsbench.analysis.pairing import Pairs
+from gsbench.analysis.quantities import asked_quantity
 from gsbench.analysis.results import TrialResult, load_experiment
+from gsbench.analysis.statistics import Answer, StudentT
 from gsbench.claims.archive import write_archive
 from gsbench.claims.gate import (
     NOT_DECIDED,
@@ -86,6 +89,17 @@ def test_what_is_shown_not_to_be_worse_passes_though_it_may_be_better(tmp_path: 
     assert "not worse by 0.35 in PSNR" in describe(verdict)
     assert most < 4
     assert result_of(replace(verdict, rests_on_outlying=True)) == NOT_DECIDED
+
+
+@pytest.mark.parametrize(
+    ("sign", "mean", "result"),
+    [(1, -0.1, NOT_DECIDED), (1, -0.09, PASSED), (-1, 0.1, NOT_DECIDED), (-1, 0.09, PASSED), (1, -0.2, NOT_DECIDED)],
+)
+def test_a_loss_of_the_least_that_matters_is_not_excluded_by_itself(sign: int, mean: float, result: str) -> None:
+    question = replace(asked().questions[0], sign=sign)
+    answer = Answer(mean, StudentT(mean, 0.0, 3.0), 0.05, 0.05, 0.05)
+    undecided = Verdict(question, asked_quantity("psnr"), Pairs(()), answer=answer)
+    assert result_of(undecided) == result
 
 
 def test_a_look_waits_for_every_scene_also_where_the_first_is_equal(tmp_path: Path) -> None:
@@ -170,6 +184,38 @@ def test_bad_input_of_the_verb(
     given = any(word.startswith(("scene=", "densify=")) for word in words)
     assert run(["gate", *words, *([] if given or not words else ["densify=adc", "init=sfm"])]) == 2
     assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("effect", "code", "words"), [(-1.0, 1, "worse in PSNR"), (1.0, 0, "passed, better in PSNR")])
+def test_the_verb_ends_with_the_result_of_its_gate(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    effect: float,
+    code: int,
+    words: str,
+) -> None:
+    trained: list[Any] = []
+
+    def train(planned: Sequence[Any]) -> int:
+        for trial in planned:
+            seed, folder = trial.values["seed"], trial.folder
+            trained.append(seed)
+            views = {"psnr": 26 + effect + 0.001 * seed + np.zeros(3)}
+            data = trial_data(Plan(experiment="gate"), "courtyard", "sfm", "adc", seed, views)
+            write_trial(trial.files.runs, data, views, folder.name.partition("-")[0])
+        return 0
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("GSBENCH_RUNS", raising=False)
+    monkeypatch.setattr("gsbench.verbs.versions.run_trials", train)
+    monkeypatch.setattr("gsbench.runs.trial_folder.TrialFolder.why_not_done", lambda files, values: "")
+    old = trials(tmp_path / "old", 0, 0.01, scenes=("courtyard",))
+    write_archive(load_experiment(tmp_path / "old", "gate"), tmp_path / "exp.zip")
+    assert run(["gate", "exp.zip", "scene=courtyard", "init=sfm", "densify=adc", "--seeds", "3"]) == code
+    assert words in capsys.readouterr().out
+    assert trained == [0, 1]  # the first look decides
+    assert len(old) == 4
 
 
 @pytest.mark.parametrize("worse", range(1, 13))

@@ -14,7 +14,7 @@ from scipy import stats
 from gsbench.analysis.results import load_experiment
 from gsbench.analysis.statistics import Interval, t_test
 from gsbench.claims.archive import write_archive
-from gsbench.claims.pooling import PooledQuestion, Study, describe, pool, read_studies
+from gsbench.claims.pooling import PooledQuestion, Study, describe, markdown_table, pool, read_studies
 from gsbench.cli import run
 from gsbench.errors import InputError
 from tests.analysis.synthetic import Plan, write_runs
@@ -68,7 +68,21 @@ def test_one_study_is_no_pool_and_two_of_one_name_are_refused() -> None:
 
 
 def test_a_mean_says_where_a_further_study_would_lie() -> None:
-    assert any("a further one" in line for line in describe(pool(STUDIES)))
+    pooled, expected = pool(STUDIES), stats.ttest_1samp(EFFECTS, 0)
+    mean, spread = np.mean(EFFECTS), np.std(EFFECTS, ddof=1)
+    own, reach = expected.confidence_interval(), stats.t.ppf(0.975, 3) * spread * 1.25**0.5
+    assert describe(pooled) == [
+        f"mean {mean:+.4g} (95 % interval {own.low:+.4g} to {own.high:+.4g}, p {expected.pvalue:.3g}) of 4 studies, "
+        "each with the same weight",
+        f"studies differ by a deviation of {spread:.3g}; a further one would lie between {mean - reach:+.4g} and "
+        f"{mean + reach:+.4g}",
+    ]
+
+
+def test_studies_are_rows_of_a_table() -> None:
+    _, _, first, second = markdown_table(pool([Study("a", 1.0, Interval(0.9, 1.25), "paper-1"), Study("b", -0.5)]))
+    assert first == "| a | +1 | +0.9 to +1.25 | paper-1 |"
+    assert second == "| b | -0.5 | unknown |  |"
 
 
 def archive(

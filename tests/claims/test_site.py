@@ -10,7 +10,9 @@ from pathlib import Path
 import pytest
 
 from gsbench.analysis.results import load_experiment
+from gsbench.analysis.tables import build_table
 from gsbench.claims.archive import unpack_archive, write_archive
+from gsbench.claims.site import _by_quantity, _unique_key
 from gsbench.cli import run
 from gsbench.errors import InputError
 from gsbench.runs.experiments import Question, declared_now, record_text
@@ -72,6 +74,24 @@ def test_the_first_page_has_arms_scenes_claims_and_links_that_lead_somewhere(tmp
     assert found.elements.count(("table", {"class": "sorts"})) > 8
     assert "http://" not in page
     assert "https://" not in page
+
+
+def test_a_table_of_many_metrics_becomes_one_of_each(tmp_path: Path) -> None:
+    write_runs(tmp_path, Plan())
+    table = build_table(load_experiment(tmp_path, "exp"), columns=("scene",), metrics=("psnr", "ssim", "flip"))
+    parts = list(_by_quantity(table))
+    assert [part.title for part in parts] == [name for name, _ in table.groups]
+    for place, part in enumerate(parts):
+        assert [row.entries for row in part.rows] == [row.entries[2 * place : 2 * place + 2] for row in table.rows]
+        assert not any(row.rule_above for row in part.rows)
+
+
+@pytest.mark.parametrize(
+    ("name", "taken", "key"),
+    [("A b!", set(), "a-b"), ("exp", {"exp"}, "exp-2"), ("exp", {"exp", "exp-2"}, "exp-3"), ("…", set(), "experiment")],
+)
+def test_a_key_is_plain_and_not_taken(name: str, taken: set[str], key: str) -> None:
+    assert _unique_key(name, taken) == key
 
 
 def test_pictures_are_there_where_the_archive_has_them(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from plyfile import PlyData, PlyElement
 from gsbench.errors import InputError
 from gsbench.init import MODEL_FOLDER, Points, read_cloud
 from gsbench.init.base import PointCloud
-from gsbench.init.placed import GREY, read_points, seen_colors
+from gsbench.init.placed import GREY, points_in_view, read_points, seen_colors
 from gsbench.scene.images import read_image
 from gsbench.scene.types import Capture
 from tests.init.test_report import CENTERS, model_of
@@ -170,3 +170,27 @@ def test_a_file_that_is_not_there_and_photos_without_cameras(bare_photos: Captur
 def test_a_cloud_takes_rows_of_three_coordinates_alone(shape: tuple[int, ...], kind: str) -> None:
     with pytest.raises(ValueError, match="points must be"):
         PointCloud(np.zeros(shape, kind), np.zeros(shape, np.uint8))
+
+
+def test_a_picture_has_its_upper_and_left_border_and_nothing_behind_the_camera() -> None:
+    model = pycolmap.Reconstruction()
+    model.add_camera_with_trivial_rig(
+        pycolmap.Camera(model="PINHOLE", width=100, height=80, params=[50, 50, 50, 40], camera_id=1)
+    )
+    pose = pycolmap.Rigid3d(np.column_stack([np.eye(3), [0, 0, 0]]))
+    model.add_image_with_trivial_frame(pycolmap.Image(name="a", camera_id=1, image_id=1), pose)
+    points = np.array(
+        [
+            [-1.0, 0, 1],  # at column 0
+            [1.0, 0, 1],  # at column 100, the first one outside
+            [0, -0.8, 1],  # at row 0
+            [0, 0.8, 1],  # at row 80, the first one outside
+            [0.0, 0, 0],
+            [0.0, 0, -1],
+            [0.3, 0.2, 0.5],
+        ]
+    )
+    seen, pixels, distances = points_in_view(points, "a", model)
+    assert seen.tolist() == [0, 2, 6]
+    np.testing.assert_allclose(pixels, [[0, 40], [50, 0], [80, 60]])
+    np.testing.assert_allclose(distances, [2**0.5, 1.64**0.5, 0.38**0.5])

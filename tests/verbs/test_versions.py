@@ -1,0 +1,93 @@
+"""The search of ``gsbench bisect`` over commits whose trainings are made up."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gsbench.claims.gate import PASSED, WORSE, declare_gate, first_worse
+from gsbench.errors import TrainingError
+from gsbench.verbs import versions
+from gsbench.verbs.versions import CommitSearch
+from tests.analysis.synthetic import Plan, trial_data, write_trial
+
+COMMITS = [(letter * 40, f"2026-01-0{day}", f"change {letter}") for day, letter in enumerate("abc", 1)]
+QUALITY = {"a": 26.0, "b": 26.001, "c": 25.0}  # PSNR, dB
+
+
+class Trainings:
+    """Writes a commit's results where its training would; ``fails`` names a commit that does not train."""
+
+    def __init__(self, fails: str = "") -> None:
+        self.fails = fails
+        self.done: list[tuple[str, str]] = []
+        self.environments: list[Mapping[str, str]] = []
+
+    def __call__(self, command: Sequence[str], log: Path, folder: Path, environment: Mapping[str, str], _: Any) -> None:
+        commit = folder.parent.name[0]
+        if commit == self.fails:
+            raise TrainingError("it broke")
+        name, seeds = (word.partition("=")[2] for word in command[-2:])
+        self.done.append((commit, seeds))
+        self.environments.append(environment)
+        assert command[-4:-2] == ["-m", "scene=courtyard"]
+        assert log == Path(environment["GSBENCH_RUNS"], name, "bisect.log")
+        for seed in map(int, seeds.split(",")):
+            views = {"psnr": QUALITY[commit] + 0.001 * seed + np.zeros(3)}
+            data = trial_data(Plan(experiment=name), "courtyard", "sfm", "adc", seed, views)
+            write_trial(Path(environment["GSBENCH_RUNS"]), data, views)
+
+
+def begun(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, trainings: Trainings) -> CommitSearch:
+    monkeypatch.setattr(versions, "run_program", trainings)
+    arms = {"courtyard": ("sfm-adc", "sfm-adc")}
+    declaration = declare_gate("psnr", "0.1", arms, range(3), {"eval": {"extra": {}}})
+    for commit, _, _ in COMMITS:
+        (tmp_path / commit / "sub").mkdir(parents=True)
+    (tmp_path / COMMITS[1][0] / "src" / "gsbench").mkdir(parents=True)
+    (tmp_path / COMMITS[1][0] / "src" / "gsbench" / "__init__.py").touch()
+    trees: Any = SimpleNamespace(tree=lambda commit: tmp_path / commit, prefix="sub")
+    return CommitSearch(
+        tmp_path / "runs" / "search", ["scene=courtyard"], frozenset({"courtyard"}), declaration, trees, COMMITS
+    )
+
+
+def test_the_commit_is_found_and_nothing_is_trained_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    trainings = Trainings()
+    search = begun(tmp_path, monkeypatch, trainings)
+    found = first_worse(2, search.result)
+    assert found == (1, 2)
+    assert trainings.done == [("a", "0,1"), ("c", "0,1"), ("b", "0,1")]
+    assert [environment.get("PYTHONPATH") for environment in trainings.environments][2] == str(
+        tmp_path / COMMITS[1][0] / "src"
+    )
+    assert (search.result(2), search.result(1), len(trainings.done)) == (WORSE, PASSED, 3)
+    newest, middle, oldest = search.table()
+    assert newest.startswith(f"{'c' * 10}  2026-01-03  change c")
+    assert "worse in PSNR" in newest
+    assert "passed" in middle
+    assert oldest.endswith("the good one")
+    assert versions._conclusion(found, search) == [f"It became worse with {'c' * 10} (2026-01-03): change c"]
+    between = f"It became worse with one of 2 commits, from {'b' * 10} to {'c' * 10}."
+    assert versions._conclusion((0, 2), search) == [between]
+    assert versions._conclusion(None, search)[0].startswith("The last commit is not shown to be worse")
+
+
+def test_a_commit_that_does_not_train_is_passed_over_but_not_the_last(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    search = begun(tmp_path, monkeypatch, Trainings(fails="b"))
+    assert search.table()[1].endswith("not tried")
+    assert first_worse(2, search.result) == (0, 2)
+    assert search.table()[1].endswith("does not train: it broke")
+    last = begun(tmp_path / "last", monkeypatch, Trainings(fails="c"))
+    with pytest.raises(TrainingError, match="it broke"):
+        last.result(2)
+    good = begun(tmp_path / "good", monkeypatch, Trainings(fails="a"))
+    with pytest.raises(TrainingError, match="it broke"):
+        good.result(1)
