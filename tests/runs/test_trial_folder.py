@@ -78,9 +78,9 @@ def test_changed_views_and_curves_are_not_used(trial: Path, caplog: pytest.LogCa
     (one,) = (one for one in load_experiment(trial.parents[3], EXPERIMENT).trials if one.path == trial)
     with pytest.raises(InputError, match=r"per_view\.csv was changed after it was written"):
         read_views(one)
-    assert one.folder.rows("metrics.jsonl") == []
+    assert one.folder.curves() == []
     assert "metrics.jsonl was changed after it was written" in caplog.text
-    assert len(one.folder.rows("events.jsonl")) == 10
+    assert len(one.folder.curves("events.jsonl")) == 10
 
 
 def test_settings_are_those_that_the_results_were_made_by(trial: Path) -> None:

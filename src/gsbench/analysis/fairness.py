@@ -139,7 +139,7 @@ MEASURED: dict[str, Callable[[Sequence[TrialResult]], str]] = {
     "initial points": _span(lambda trial: trial.record.num_init_points),
     "initial cloud (hash)": _distinct(lambda trial: trial.cloud[:12]),
     "iterations": _span(lambda trial: trial.record.iterations),
-    "rounds of the densifier": _span(lambda trial: len(trial.folder.rows(EVENTS)) or None),
+    "rounds of the densifier": _span(lambda trial: len(trial.folder.curves(EVENTS)) or None),
     "budget": _distinct(budget_words),
     "Gaussians in the end": _span(lambda trial: trial.record.num_gaussians),
     "seconds of training": _span(lambda trial: trial.record.seconds.get("train")),

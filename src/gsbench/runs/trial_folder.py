@@ -268,8 +268,8 @@ class TrialFolder:
 
     # ---- files beside the results
 
-    def rows(self, name: str, kind: Any = Row) -> list[Any]:
-        """The rows of a file of JSON lines, such as ``metrics.jsonl``; [] if there is no such file.
+    def curves(self, name: str = layout.CURVES, kind: Any = Row) -> list[Any]:
+        """What a training recorded over its iterations: the rows of a file of JSON lines; [] if there is no such file.
 
         With a warning, a finished trial's file that was changed after it was written is left out, and so are all rows
         from a damaged one on.

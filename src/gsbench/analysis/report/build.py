@@ -196,7 +196,7 @@ def _mean_curves(trials: Sequence[TrialResult], name: str, keys: Sequence[str]) 
     """The mean curve over trials of each key in the trials' file ``name``; each file is read once."""
     curves_by_key: dict[str, list[Curve]] = {key: [] for key in keys}
     for trial in trials:
-        rows = trial.folder.rows(name)
+        rows = trial.folder.curves(name)
         for key, curves in curves_by_key.items():
             curves.append([(float(row["step"]), float(row[key])) for row in rows if key in row])
     return {key: mean_by_step(curves) for key, curves in curves_by_key.items()}
@@ -261,7 +261,7 @@ def _logged_histograms(trials: Sequence[TrialResult]) -> dict[int, Curve]:
     """The logged histograms by iteration, pooled over trials, as (volume at the bin's centre, share)."""
     pooled: dict[int, dict[float, float]] = {}
     for trial in trials:
-        for row in trial.folder.rows(layout.HISTOGRAMS, Histogram):
+        for row in trial.folder.curves(layout.HISTOGRAMS, Histogram):
             for low, high, count in zip(row.log10_edges, row.log10_edges[1:], row.counts, strict=False):
                 bins, volume = pooled.setdefault(row.step, {}), 10 ** ((low + high) / 2)
                 bins[volume] = bins.get(volume, 0.0) + count
