@@ -167,6 +167,22 @@ def test_a_training_leaves_its_model_its_lineage_and_its_summary(
     assert "snapshots" not in train_step(views, parts).inputs
 
 
+def test_renders_of_a_program_are_collected_for_the_test_views(
+    views: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def run(command: Any, log: Path, output: Path, *rest: Any) -> Any:
+        for view in views.scene.test:
+            Image.fromarray(255 - view.image).save(output / view.name)
+        return SimpleNamespace(seconds=1.0, peak_memory_mb=1.0)
+
+    monkeypatch.setattr(train_steps, "run_program", run)
+    external_step(views, replace(trainer(tmp_path, "none"), result="*.png"), parts_of()).build(tmp_path)
+    for view in views.scene.test:
+        assert (np.asarray(Image.open(tmp_path / "renders" / view.name)) == 255 - view.image).all()
+    summary = json.loads((tmp_path / "training.json").read_text())
+    assert (summary["evaluated_from"], summary["num_gaussians"]) == ("renders", None)
+
+
 def test_training_starts_from_gaussians_where_the_initialiser_left_some(views: Any) -> None:
     init, cpu = views.store.path(CLOUD_STEP), torch.device("cpu")
     assert len(train_steps.initial_gaussians(init, cpu)) == 7
