@@ -46,13 +46,13 @@ class Stepper:
     """A training of ``setting`` with the rasterizer ``raster``, an executor's name or the import path of a class."""
 
     def __init__(self, raster: str, setting: Setting) -> None:
+        flush_denormals()  # as in a trial
         self.threads = setting.threads or torch.get_num_threads()
         torch.set_num_threads(self.threads)
         self.device = device_of(raster)
         if self.device.type == "cuda":
             disable_tf32()
         gaussians, scene = make_scene(setting.scene, setting.width, setting.height, setting.count, setting.ply)
-        flush_denormals()  # as in a trial
         self.count = len(gaussians)
         self.trainer = Trainer(
             scene,
