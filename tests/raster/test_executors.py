@@ -132,6 +132,25 @@ def test_departures_are_told() -> None:
     ]
 
 
+def test_python_headers_are_looked_for_where_the_usual_scheme_has_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Debian's own scheme for packages, ``posix_local``, names a folder that has no headers."""
+    asked = []
+    monkeypatch.setattr(executors.sysconfig, "get_paths", lambda scheme: asked.append(scheme) or {"include": tmp_path})
+    monkeypatch.setenv("CC", sys.executable)
+    for default in ("posix_local", "posix_prefix", "nt"):
+        monkeypatch.setattr(executors.sysconfig, "get_default_scheme", lambda default=default: default)
+        assert [line.partition(":")[0] for line in executors.missing_tools()] == [str(tmp_path / "Python.h")]
+    assert asked == ["posix_prefix", "posix_prefix", "nt"]
+    (tmp_path / "Python.h").touch()
+    assert executors.missing_tools() == []
+    monkeypatch.setenv("CC", "no-such-compiler -O2")
+    assert executors.missing_tools() == [
+        "a C compiler (CC is no-such-compiler -O2, which is not there): install the package gcc"
+    ]
+
+
 @pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without a GPU")
 def test_a_gpu_that_cannot_be_used_is_explained(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("triton")
