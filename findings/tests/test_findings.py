@@ -73,7 +73,8 @@ def test_claims_can_be_read(file: Path) -> None:
 
 @pytest.mark.parametrize("file", sorted(FINDINGS.glob("experiment/*.yaml")), ids=lambda file: file.stem)
 def test_experiments_are_composed(file: Path) -> None:
-    trials = compose_trials([f"hydra.searchpath=['file://{FINDINGS}']", f"+experiment={file.stem}"])
+    path = ["init.path=/somewhere"] if "override /init: points" in file.read_text() else []
+    trials = compose_trials([f"hydra.searchpath=['file://{FINDINGS}']", f"+experiment={file.stem}", *path])
     assert len(trials) >= 6
 
 

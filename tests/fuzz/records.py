@@ -59,14 +59,18 @@ def values_of(runs: Path, densify: str, seed: int, threshold: float) -> dict[str
         "name": EXPERIMENT,
         "seed": seed,
         "runs": str(runs),
-        "scene": {"name": "courtyard", "test_every": 8},
+        "scene": {
+            "name": "courtyard", "kind": "courtyard", "test_every": 8, "width": 64, "height": 48, "downscale": 1,
+            "max_size": None,
+        },
+        "raster": {"name": "cpu"},
         "init": {"name": "sfm", "poses": "shared"},
         "densify": {"name": densify, "volume_threshold": threshold},
         "train": {"iterations": 100, "max_seconds": None},
         "eval": {"primary": None},
         "tracking": {"enabled": True, "uri": None, "flush_seconds": 1.0, "patience_seconds": 1.0, "images": 1},
         "launch": {"name": "serial"},
-    }
+    }  # fmt: skip
 
 
 def write_trial(runs: Path, densify: str, seed: int, threshold: float = 0.03) -> Path:

@@ -82,7 +82,7 @@ def test_every_kind_of_file_is_among_the_damaged(places: dict[str, Path]) -> Non
 # What is ours to read goes through the typed readers; what these files read is somebody else's or their own process's.
 READS_ITSELF = {
     "analysis/paper.py", "datasets/catalog.py",  # of the package
-    "launch/batch.py", "init/base.py",  # text of this very process
+    "launch/batch.py", "init/base.py", "runs/keys.py",  # text of this very process
     "analysis/differences.py",  # arms of the package; those of trials are read by TrialFolder
     "claims/stopping.py",  # text of this process
     "system/install.py",  # what pip wrote of the package

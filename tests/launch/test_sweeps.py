@@ -103,6 +103,7 @@ PROGRAM = ["densify.version=1.0", "allow_targets=[mine,python,git,brush,openspla
 WITH_CODE = [*PROGRAM, "densify.options.code=/code"]
 NEEDED = {  # what a YAML leaves to its user
     ("train", "none"): ["densify=none"],
+    **{("init", name): ["init.path=/somewhere"] for name in ("ply", "points")},
     ("densify", "external/program"): [*PROGRAM, "densify.command=[mine]", "densify.result=mine.ply"],
     ("densify", "external/3dgs"): WITH_CODE,
     ("densify", "external/gsplat"): WITH_CODE,

@@ -252,7 +252,7 @@ class FinishedTrials:
                 settings = files.settings()
                 raster = settings["raster"]["name"]
                 size = _size_key(settings["scene"])
-            except (FileNotFoundError, DamagedError, KeyError, TypeError):
+            except (FileNotFoundError, DamagedError, KeyError, TypeError, AttributeError):
                 continue
             if not record.iterations or record.resolution is None:
                 continue

@@ -275,13 +275,13 @@ def _logged_histograms(trials: Sequence[TrialResult]) -> dict[int, Curve]:
 def _threshold(trials: Sequence[TrialResult]) -> float | None:
     """The absolute volume threshold (cubed scene units), if all arms that have one have the same; else None."""
     configs = [group[0].config for group in group_by(trials, lambda trial: trial.arm).values()]
-    thresholds = {
+    thresholds = [
         config["densify.volume_threshold"]
         for config in configs
         if config.get("densify.threshold_mode", "absolute") == "absolute" and "densify.volume_threshold" in config
-    }
-    is_shared = len(thresholds) == 1 and all(isinstance(value, int | float) for value in thresholds)
-    return float(thresholds.pop()) if is_shared else None
+    ]
+    are_numbers = all(isinstance(value, int | float) for value in thresholds)  # a damaged file may hold anything
+    return float(thresholds[0]) if are_numbers and len(set(thresholds)) == 1 else None
 
 
 def provenance(trials: Sequence[TrialResult]) -> Table:
