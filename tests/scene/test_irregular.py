@@ -16,6 +16,7 @@ from gsbench.errors import InputError
 from gsbench.gaussians.ply import check_ply, read_ply
 from gsbench.init.placed import read_points
 from gsbench.scene.colmap import read_model
+from gsbench.scene.colmap_files import check_model
 from gsbench.scene.images import IMAGE_SUFFIXES, check_picture_names, exif_orientation, image_size, read_image
 from gsbench.scene.options import SplitRule
 from gsbench.scene.readers import fingerprint, list_images, read_photos
@@ -181,6 +182,27 @@ def test_quaternions_of_any_length_are_rotations(kind: str, file: str, length: f
     for image_id, image in model.images.items():
         found = read.images[image_id].cam_from_world().matrix()
         np.testing.assert_allclose(found, image.cam_from_world().matrix(), atol=1e-9)
+
+
+def test_each_sensor_of_a_rig_is_checked(tmp_path: Path) -> None:
+    """A sensor without a pose has three fields in ``rigs.txt``, one with a pose has ten."""
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_frames_per_rig, options.num_points3D, options.num_cameras_per_rig = 3, 12, 4
+    pycolmap.synthesize_dataset(options).write_text(tmp_path)
+    rigs = (tmp_path / "rigs.txt").read_text().split("\n")
+    first = next(number for number, line in enumerate(rigs) if line and not line.startswith("#"))
+    words = rigs[first].split()
+    fields = [words[4 + 10 * sensor : 14 + 10 * sensor] for sensor in range(3)]
+    assert all(sensor[2] == "1" for sensor in fields)
+    for broken, refused in ((fields[2][:3] + ["0"] * 4 + fields[2][7:], True), (fields[2], False)):
+        without_pose = [*fields[0][:2], "0"]
+        rigs[first] = " ".join([*words[:4], *without_pose, *fields[1], *broken])
+        (tmp_path / "rigs.txt").write_text("\n".join(rigs))
+        if refused:
+            with pytest.raises(InputError, match=r"rigs\.txt: a sensor of rig 1 has no pose that can be used"):
+                check_model(tmp_path)
+        else:
+            check_model(tmp_path)
 
 
 def test_a_rig_whose_sensor_has_no_rotation_is_refused(tmp_path: Path) -> None:

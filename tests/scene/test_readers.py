@@ -92,9 +92,13 @@ def test_split_lists(make_scene):
         "04.png",
         "05.png",
     )
+    (root / "last.txt").write_text("05.png\n")
     (root / "bad.txt").write_text("00.png\n99.png\n")
     with pytest.raises(InputError, match=r"split lists name 99\.png"):
         read_colmap("toy", root, split=SplitRule(test_list="bad.txt"))
+    (root / "one.txt").write_text("00.png\n")
+    with pytest.raises(InputError, match=r"2 images in the split lists, but at least 3 are needed"):
+        read_colmap("toy", root, split=SplitRule(train_list="one.txt", test_list="last.txt"))
     (root / "both.txt").write_text("00.png\n")
     with pytest.raises(InputError, match=r"00\.png for training and for testing"):
         read_photos("toy", root, split=SplitRule(train_list="train.txt", test_list="both.txt"))
