@@ -95,6 +95,14 @@ def test_the_nearer_setting_counts() -> None:
     assert [word for word in words if "max_gaussians" in word] == ["densify.max_gaussians=3"]
 
 
+def test_the_direction_of_a_claim_is_the_sign_of_its_question() -> None:
+    def sign(direction: str) -> int:
+        file = parse_claims(changed("claims", 0, "direction", to=direction))
+        return file.question(file.claims[0], {"courtyard": ("garden/sfm-adc/0a", "garden/sfm-volumetric/0b")}).sign
+
+    assert [sign(direction) for direction in ("higher", "same", "lower")] == [1, 0, -1]
+
+
 def test_the_question_has_what_decides_and_no_words() -> None:
     file = parse_claims(GOOD)
     keys = ("garden/sfm-adc/0a", "garden/sfm-volumetric/0b")
