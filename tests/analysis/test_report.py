@@ -217,7 +217,7 @@ def test_logged_histograms_are_shares_of_all_trials_together() -> None:
             Histogram(step=8, log10_edges=edges, counts=[0, 5, 0]),
         ],
     ]
-    trials = [SimpleNamespace(folder=SimpleNamespace(rows=lambda name, kind, own=own: own)) for own in rows]
+    trials = [SimpleNamespace(folder=SimpleNamespace(curves=lambda name, kind, own=own: own)) for own in rows]
     found = _logged_histograms(trials)  # type: ignore[arg-type]
     assert list(found) == [4, 8]
     assert np.array(found[4]) == pytest.approx(np.array([[10**-3.5, 0.25], [10**-0.5, 0.75]]))

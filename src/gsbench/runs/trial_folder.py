@@ -269,7 +269,7 @@ class TrialFolder:
     # ---- files beside the results
 
     def curves(self, name: str = layout.CURVES, kind: Any = Row) -> list[Any]:
-        """What a training recorded over its iterations: the rows of a file of JSON lines; [] if there is no such file.
+        """The rows of a file of JSON lines that a training wrote over its iterations; [] if there is no such file.
 
         With a warning, a finished trial's file that was changed after it was written is left out, and so are all rows
         from a damaged one on.
