@@ -55,7 +55,6 @@ from gsbench.scene.types import Capture, Scene
 from gsbench.system.install import version_of
 from gsbench.system.locks import hold
 from gsbench.system.stopping import reinstall_handlers
-from gsbench.train.device import flush_denormals
 
 log = logging.getLogger(__name__)
 
@@ -161,7 +160,6 @@ def _run(trial: Trial, folder: TrialFolder) -> TrialRecord:
         parts = Parts(values)
         parts.check(on_this_machine=True)
         _ = parts.rasterizer  # raises now, not after hours of work, if it cannot run on this machine
-        flush_denormals()
         torch.set_num_threads(parts.threads)
 
         def announce(stage: keys.Stage, place: Path) -> None:

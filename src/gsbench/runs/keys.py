@@ -100,7 +100,7 @@ class Stage:
 class Step:
     """One step of a trial: ``build(folder)`` computes its result, which ``inputs`` (with upstream keys) determine.
 
-    ``code`` has the states of the rooms that it uses (`gsbench.runs.code`). ``check`` is called after building; it
+    ``code`` has the states of the rooms that it uses (`ROOMS`). ``check`` is called after building; it
     raises if other code than that in ``inputs`` may have built the result.
     """
 

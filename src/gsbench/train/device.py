@@ -32,16 +32,6 @@ def disable_tf32() -> None:
     torch.backends.cuda.matmul.allow_tf32 = False
 
 
-def flush_denormals() -> None:
-    """Make the processor treat floating-point numbers too small for the normal format (float32: below 1.2e-38) as 0.
-
-    Adam's moments of Gaussians with tiny gradients fall below that bound. Intel processors then need some 150 cycles
-    per operation: Adam took 36 of the 83 ms of a step, and takes 7 of 53 with this. Call it before torch's first
-    parallel operation: threads take the setting from the thread that starts them.
-    """
-    torch.set_flush_denormal(True)
-
-
 def free_bytes(device: torch.device) -> int | None:
     """The bytes of a GPU's memory that torch can still use; None for a CPU."""
     if device.type != "cuda":

@@ -16,16 +16,20 @@ from gsbench.pipeline.steps.evaluate import _with_legend, draw_ellipsoids
 from tests.train.conftest import orbit_camera
 
 
-def test_only_the_voluminous_is_outlined() -> None:
-    scales = torch.tensor([[1.0, 1.0, 1.0], [0.01, 0.01, 0.01]])
-    gaussians = Gaussians(
-        means=torch.tensor([[0.0, 0.0, 4.0], [1.0, 0.5, 4.0]]),
-        log_scales=scales.log(),
+def two_gaussians(means: list[list[float]], log_scales: torch.Tensor) -> Gaussians:
+    return Gaussians(
+        means=torch.tensor(means),
+        log_scales=log_scales,
         quaternions=torch.tensor([[1.0, 0, 0, 0]] * 2),
         opacity_logits=torch.zeros(2),
         sh_dc=torch.zeros(2, 3),
         sh_rest=torch.zeros(2, 15, 3),
     )
+
+
+def test_only_the_voluminous_is_outlined() -> None:
+    scales = torch.tensor([[1.0, 1.0, 1.0], [0.01, 0.01, 0.01]])
+    gaussians = two_gaussians([[0.0, 0.0, 4.0], [1.0, 0.5, 4.0]], scales.log())
     camera = orbit_camera(0.0)
     causes = torch.tensor([int(Cause.SPLIT_VOLUME), int(Cause.CLONE)])
     black = np.zeros((camera.height, camera.width, 3), dtype=np.uint8)
@@ -49,14 +53,7 @@ def test_only_the_voluminous_is_outlined() -> None:
 
 def test_of_too_many_the_most_voluminous_are_outlined(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(evaluate, "MAX_OUTLINES", 1)
-    gaussians = Gaussians(
-        means=torch.tensor([[0.0, 0.0, 4.0]] * 2),
-        log_scales=torch.tensor([[-0.5] * 3, [0.0] * 3]),
-        quaternions=torch.tensor([[1.0, 0, 0, 0]] * 2),
-        opacity_logits=torch.zeros(2),
-        sh_dc=torch.zeros(2, 3),
-        sh_rest=torch.zeros(2, 15, 3),
-    )
+    gaussians = two_gaussians([[0.0, 0.0, 4.0]] * 2, torch.tensor([[-0.5] * 3, [0.0] * 3]))
     camera = orbit_camera(0.0)
     causes = torch.tensor([int(Cause.CLONE), int(Cause.ADDED)])
     black = np.zeros((camera.height, camera.width, 3), dtype=np.uint8)
