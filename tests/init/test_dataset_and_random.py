@@ -135,6 +135,8 @@ def test_a_trained_model_becomes_points_under_the_cameras_and_is_kept_whole(cour
     assert report.num_points == 20
     cloud = read_cloud(tmp_path / "out" / MODEL_FOLDER)
     np.testing.assert_allclose(cloud.points, gaussians.means.double().numpy())
+    red = 0.5 + 0.28209479177387814 * gaussians.sh_dc[:, 0].numpy()  # Y00 = 1 / (2 sqrt(pi))
+    np.testing.assert_allclose(cloud.colors[:, 0] / 255, red.clip(0, 1), atol=0.5 / 255 + 1e-6)
     kept = read_ply(tmp_path / "out" / GAUSSIANS_FILE)
     assert torch.equal(kept.log_scales, gaussians.log_scales)
     with pytest.raises(InputError, match=r"init\.path=nowhere\.ply"):
