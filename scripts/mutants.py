@@ -43,6 +43,7 @@ SOURCE = "src/gsbench"
 ROOMS = ["analysis", "claims", "densify", "eval", "gaussians", "init", "pipeline", "raster", "runs", "scene", "train"]
 YAML = ["tests/config/test_yaml_defaults.py"]  # the defaults of classes
 FURTHER_TESTS = {
+    "claims": ["tests/app/test_sweeps.py"],
     "pipeline": ["tests/end_to_end/test_smoke.py"],
     "densify": YAML,
     "eval": YAML,

@@ -134,6 +134,11 @@ BAD: list[tuple[str, Callable[[], Any], str]] = [
     ("no number", lambda: changed("claims", 0, "least", to="much"), "above 0"),
     ("an infinite width", lambda: changed("claims", 0, "least", to="inf"), "above 0"),
     ("a count without percent", lambda: changed("claims", 0, "metric", to="gaussians"), "such as 10%"),
+    (
+        "a width above the metric's range",
+        lambda: changed("claims", 0, to=GOOD["claims"][0] | {"metric": "ssim", "least": 1}),
+        "more than ssim can differ by",
+    ),
     ("an unknown direction", lambda: changed("claims", 0, "direction", to="lowre"), "'higher', 'lower' or 'same'"),
     ("an unknown key", lambda: changed("claims", 0, "metrics", to="psnr"), "did you mean metric"),
     ("an unknown key at the top", lambda: changed("clams", to=[]), "did you mean claims"),
