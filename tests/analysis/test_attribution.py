@@ -233,5 +233,5 @@ def test_the_pair_that_stands_for_two_arms_is_as_alike_as_there_is() -> None:
         found = representatives(trials, *arms)  # type: ignore[arg-type]
         assert found[0] is expected[0]
         assert found[1] is expected[1]
-    with pytest.raises(ValueError, match="no trial of sfm-c"):
+    with pytest.raises(KeyError, match="sfm"):
         representatives(trials, arms[0], Arm("sfm", "c"))  # type: ignore[arg-type]

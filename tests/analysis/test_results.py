@@ -58,7 +58,7 @@ DAMAGES = {
     "another scene": (lambda path: rewrite(path, scene="kitchen"), "foreign, its results.json is of scene 'kitchen'"),
     "another experiment": (lambda path: rewrite(path, experiment="other"), "of experiment 'other'"),
     "another arm": (lambda path: rewrite(path, densify="none"), "of arm 'sfm-none'"),
-    "another seed": (lambda path: rewrite(path, seed=7), "of seed 7"),
+    "another seed": (lambda path: rewrite(path, seed=7), "of seed '7'"),
     "a copy under another name": (lambda path: path.rename(path.with_name("copy of run")), "not named"),
     "nothing yet": (lambda path: (path / "results.json").unlink(), "unfinished, no results.json yet"),
 }

@@ -90,10 +90,12 @@ def test_trainings_that_do_not_differ_are_sure() -> None:
 
 def test_holm_is_step_down_and_monotone() -> None:
     """Textbook case: 0.01 x 4, 0.02 x 3, 0.03 x 2, 0.04 x 1, with the running maximum."""
-    p_values = [0.04, 0.01, None, 0.03, 0.02]
-    factors = holm_factors(p_values)
-    adjusted = [p * factor if p and factor else None for p, factor in zip(p_values, factors, strict=True)]
-    assert adjusted == [pytest.approx(x) if x else None for x in (0.06, 0.04, None, 0.06, 0.06)]
+    p_values = [0.04, 0.01, 0.03, 0.02]
+    adjusted = [p * factor for p, factor in zip(p_values, holm_factors(p_values), strict=True)]
+    assert adjusted == pytest.approx([0.06, 0.04, 0.06, 0.06])
+    assert holm_factors([0.0, 0.02, 0.0]) == [3, 1, 2]
+    untested, tested = answer_family([np.array([[0.3]]), np.array([[0.3, 0.1, 0.25, 0.4]])])
+    assert (untested.mean, untested.test, tested.rate, tested.equal_rate) == (0.3, None, ALPHA, ALPHA)
 
 
 @pytest.mark.parametrize("seed", range(10))

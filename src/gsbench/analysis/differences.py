@@ -17,6 +17,7 @@ from typing import Any
 import yaml
 
 from gsbench.analysis.results import Arm, TrialResult, canonical, group_by, seeds_words
+from gsbench.parsing import LOADER
 from gsbench.runs.keys import SHOWN
 from gsbench.system.install import conf_dir
 from gsbench.words import counted, listed
@@ -59,14 +60,11 @@ WITHOUT_EFFECT = (
     *("init.weights", "init.download", "init.threads", "densify.time_limit_minutes"),
 )
 
-UNSET = canonical(None)
 CODE = "code of "  # prefix of a user's modules among the keys of ``TrialResult.code``
 
 FACTS = ("Source", "Compared", "Tests", "Otherwise", "Departs from adc by")
 # A fact is one comment line; indented comment lines continue it.
 FACT = re.compile(rf"^# (?P<key>{'|'.join(FACTS)}): (?P<text>.*(?:\n#   .*)*)$", re.MULTILINE)
-
-_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 def differing_conditions(trials: Sequence[TrialResult], code: bool = True) -> dict[str, list[str]]:
@@ -92,9 +90,9 @@ def differing_settings(trials: Sequence[TrialResult]) -> dict[str, list[str]]:
     """
     if len({trial.config_hash for trial in trials}) == 1:
         return {}
-    configs = {trial.key: trial.config_texts for trial in trials}.values()
-    keys = {key for texts in configs for key in texts if not key.startswith(IGNORED_SETTINGS)}
-    values_by_key = {key: {texts.get(key, UNSET) for texts in configs} for key in keys}
+    configs = {trial.key: trial.config for trial in trials}.values()
+    keys = {key for config in configs for key in config if not key.startswith(IGNORED_SETTINGS)}
+    values_by_key = {key: {canonical(config.get(key)) for config in configs} for key in keys}
     return {key: sorted(values) for key, values in sorted(values_by_key.items()) if len(values) > 1}
 
 
@@ -219,11 +217,9 @@ def is_mixed(names: Sequence[str]) -> bool:
 def representatives(trials: Iterable[TrialResult], first: Arm, second: Arm) -> tuple[TrialResult, TrialResult]:
     """One trial of each arm: of the same scene and seed if possible, else of the same scene, else of the same seed.
 
-    Raises ValueError for an arm without trials.
+    Raises KeyError for an arm without trials.
     """
     by_arm = group_by(trials, lambda trial: trial.arm)
-    if missing := [arm for arm in (first, second) if arm not in by_arm]:
-        raise ValueError(f"no trial of {missing[0]}")
     pairs = itertools.product(by_arm[first], by_arm[second])
     return max(pairs, key=lambda pair: (pair[0].scene == pair[1].scene, pair[0].seed == pair[1].seed))
 
@@ -272,7 +268,7 @@ def _with_defaults(name: str) -> dict[str, Any]:
 
 
 def _own_settings(name: str) -> dict[str, Any]:
-    settings: dict[str, Any] = yaml.load((_arms_folder() / f"{name}.yaml").read_text(encoding="utf-8"), Loader=_LOADER)
+    settings: dict[str, Any] = yaml.load((_arms_folder() / f"{name}.yaml").read_text(encoding="utf-8"), Loader=LOADER)
     return settings
 
 

@@ -60,7 +60,7 @@ def fairness_table(trials: Sequence[TrialResult], first: Arm, second: Arm) -> Ta
     """The fairness sheet of two arms as a table with notes.
 
     ``trials`` are all trials of the experiment, each with its variant. Measured rows cover the paired trials: one
-    value, or the smallest, the largest and the mean. Raises ValueError for an arm without trials.
+    value, or the smallest, the largest and the mean. Raises KeyError for an arm without trials.
     """
     pairs = pair_trials(trials, first, second)
     one, other = pairs[0] if pairs else representatives(trials, first, second)

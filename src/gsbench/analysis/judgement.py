@@ -39,7 +39,6 @@ class SceneVerdict:
 
     scene: str
     mean: float
-    deviation: float | None
     seeds: int
     interval: Interval | None
     p: float | None
@@ -104,8 +103,9 @@ class Verdict:
     @property
     def deviation(self) -> float | None:
         """The deviation of paired differences within scenes; None with one pair per scene."""
-        values = self.pairs.differences if self.pairs.rows else np.empty((0, 0))
-        return float(np.sqrt(values.var(axis=1, ddof=1).mean())) if self.pairs.seeds > 1 else None
+        if self.pairs.seeds < 2:
+            return None
+        return float(np.sqrt(self.pairs.differences.var(axis=1, ddof=1).mean()))
 
     @property
     def equal(self) -> bool:
@@ -139,9 +139,10 @@ def judge(trials: Sequence[TrialResult], declaration: Declaration) -> list[Verdi
         return [trial for arm in (question.baseline, question.arm) for trial in by_arm.get(arm, [])]  # type: ignore[arg-type]
 
     unjudged = [_with_pairs(trials_of(question), question, declaration) for question in declaration.questions]
-    judged: dict[int, Verdict] = {k: one for k, one in enumerate(unjudged) if one.untestable or not one.pairs.rows}
+    judged = list(unjudged)
+    testable = [k for k, one in enumerate(unjudged) if one.pairs.rows and not one.untestable]
     for secondary in (False, True):
-        family = [k for k, one in enumerate(unjudged) if k not in judged and one.question.secondary == secondary]
+        family = [k for k in testable if unjudged[k].question.secondary == secondary]
         # With looks, the shares of the error rate were fixed beforehand: questions without pairs keep theirs.
         sharing = sum(question.secondary == secondary for question in declaration.questions)
         if declaration.looks:
@@ -154,7 +155,7 @@ def judge(trials: Sequence[TrialResult], declaration: Declaration) -> list[Verdi
             answers = answer_family(differences, declaration.error_rate / candidates)
             for k, answer in zip(family, answers, strict=True):
                 judged[k] = _decide(replace(unjudged[k], family=len(family)), answer)
-    return _with_scenes([judged[k] for k in range(len(unjudged))], declaration.error_rate)
+    return _with_scenes(judged, declaration.error_rate)
 
 
 def _with_pairs(trials: Sequence[TrialResult], question: Question, declaration: Declaration) -> Verdict:
@@ -261,19 +262,14 @@ def _with_scenes(verdicts: Sequence[Verdict], level: float) -> list[Verdict]:
 
     All scenes of all questions are one family. If a question has one scene, that scene has the question's own answer.
     """
-    answered = [verdict for verdict in verdicts if verdict.answer is not None]
-    several = [verdict.pairs.differences for verdict in answered if len(verdict.pairs.rows) > 1]
+    several = [one.pairs.differences for one in verdicts if one.answer is not None and len(one.pairs.rows) > 1]
     answers = iter(answer_family([row[None] for differences in several for row in differences], level))
     completed = []
     for verdict in verdicts:
-        if verdict.answer is None:
-            completed.append(verdict)
-            continue
-        rows = list(zip(verdict.pairs.scenes, verdict.pairs.differences, strict=True))
         scenes = []
-        for scene, row in rows:
-            answer = next(answers) if len(rows) > 1 else verdict.answer
-            deviation = float(row.std(ddof=1)) if len(row) > 1 else None
-            scenes.append(SceneVerdict(scene, float(row.mean()), deviation, len(row), answer.interval, answer.p))
+        for row in verdict.pairs.rows:
+            answer = next(answers) if verdict.answer and len(verdict.pairs.rows) > 1 else verdict.answer
+            if answer is not None:
+                scenes.append(SceneVerdict(row.scene, answer.mean, verdict.pairs.seeds, answer.interval, answer.p))
         completed.append(replace(verdict, scenes=tuple(scenes)))
     return completed

@@ -69,7 +69,7 @@ class Paper:
 
     def scenes(self, name: str) -> list[str]:
         """The scenes of the table ``name`` in the printed order."""
-        return list(dict.fromkeys(key[0] for key in self.tables[name]))
+        return list(dict.fromkeys(scene for scene, *_ in self.tables[name]))
 
 
 @dataclass(frozen=True)

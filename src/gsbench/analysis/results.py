@@ -6,7 +6,6 @@ last: a folder that has it is complete. Nothing here needs torch, so tables over
 
 import json
 import math
-import os
 import re
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -43,13 +42,6 @@ class Configurations:
 
     def __init__(self, known: Mapping[str, Mapping[str, Any]] | None = None) -> None:
         self._known: dict[str, Mapping[str, Any]] = dict(known or {})
-        self._texts: dict[str, Mapping[str, str]] = {}
-
-    def texts(self, trial: str, folder: Path) -> Mapping[str, str]:
-        """The settings of `shared` as text that is equal for equal values."""
-        if trial not in self._texts:
-            self._texts[trial] = {key: canonical(value) for key, value in self.shared(trial, folder).items()}
-        return self._texts[trial]
 
     def shared(self, trial: str, folder: Path) -> Mapping[str, Any]:
         """The settings of a trial, read from ``folder`` or from another seed before; {} if they cannot be read."""
@@ -151,11 +143,6 @@ class TrialResult:
         They are read once for all trials that share them; `whole_config` is read from the trial's own file.
         """
         return self.settings.shared(self.key, self.path)
-
-    @property
-    def config_texts(self) -> Mapping[str, str]:
-        """The settings of `config` as comparable text."""
-        return self.settings.texts(self.key, self.path)
 
     @cached_property
     def key(self) -> str:
@@ -297,11 +284,6 @@ class Experiment:
     def seeds(self) -> tuple[int, ...]:
         return tuple(sorted({trial.seed for trial in self.trials}))
 
-    @property
-    def by_folder(self) -> dict[str, TrialResult]:
-        """The trials by their folders within the experiment, ``<scene>/<arm>/<hash8>-seed<k>``."""
-        return {trial.path.relative_to(self.folder).as_posix(): trial for trial in self.trials}
-
 
 def group_by(items: Iterable[T], key: Callable[[T], K]) -> dict[K, list[T]]:
     """The items grouped by ``key(item)``, in order of appearance."""
@@ -333,20 +315,19 @@ def read_experiment(folder: Path) -> Experiment:
     """Read every trial of the experiment in ``folder``; it may have no trials yet."""
     runs_dir = folder.parent
     trials: list[TrialResult] = []
-    warnings: list[str] = []
+    faults: dict[Path, str] = {}
     settings = Configurations()
-    for path in trial_folders(folder):
+    for path in map(Path, trial_folders(folder)):
         try:
-            trials.append(read_trial(Path(path), runs_dir, settings))
+            trials.append(read_trial(path, runs_dir, settings))
         except _UnusableError as reason:
-            warnings.append(f"{os.path.relpath(path, runs_dir)}: {one_line(str(reason))}")
-    faults = _read_settings(trials, settings)
-    for trial in trials:
-        if fault := faults.get(trial.key):
-            warnings.append(f"{os.path.relpath(trial.path, runs_dir)}: damaged, {fault}")
-    trials = [trial for trial in trials if not faults.get(trial.key)]
-    trials.sort(key=lambda trial: (trial.scene, trial.init, trial.densify, trial.seed, trial.config_hash))
-    return Experiment(folder.name, folder, tuple(trials), tuple(sorted(warnings)))
+            faults[path] = one_line(str(reason))
+    of_settings = _read_settings(trials, settings)
+    faults |= {trial.path: f"damaged, {fault}" for trial in trials if (fault := of_settings.get(trial.key))}
+    usable = [trial for trial in trials if trial.path not in faults]
+    usable.sort(key=lambda trial: (trial.scene, trial.init, trial.densify, trial.seed, trial.config_hash))
+    warnings = sorted(f"{path.relative_to(runs_dir)}: {fault}" for path, fault in faults.items())
+    return Experiment(folder.name, folder, tuple(usable), tuple(warnings))
 
 
 def _read_settings(trials: Sequence[TrialResult], settings: Configurations) -> dict[str, str]:
@@ -407,13 +388,12 @@ def read_trial(path: Path, runs_dir: Path, settings: Configurations) -> TrialRes
     match = TRIAL_FOLDER.fullmatch(path.name)
     if match is None:
         raise _UnusableError("foreign, the folder is not named <hash8>-seed<k>")
-    folder_names = path.relative_to(runs_dir).parts[-4:-1]
     recorded = {"experiment": record.experiment, "scene": record.scene, "arm": f"{record.init}-{record.densify}"}
-    for (key, value), folder_name in zip(recorded.items(), folder_names, strict=True):
-        if value != folder_name:
+    recorded["seed"] = str(record.seed)
+    names = (*path.relative_to(runs_dir).parts[-4:-1], match["seed"])
+    for (key, value), name in zip(recorded.items(), names, strict=True):
+        if value != name:
             raise _UnusableError(f"foreign, its {RESULTS} is of {key} {value!r}")
-    if str(record.seed) != match["seed"]:
-        raise _UnusableError(f"foreign, its {RESULTS} is of seed {record.seed}")
     return TrialResult(path, match["hash"], record, settings=settings)
 
 

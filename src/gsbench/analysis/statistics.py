@@ -16,7 +16,7 @@ only the noise; a statement about scenes like these needs more scenes.
 """
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Literal
@@ -152,31 +152,30 @@ def answer_family(members: Sequence[Array], level: float = ALPHA) -> list[Answer
     The chance that any stated sign is false is at most ``level``; so is the chance that any "too small" is false.
     """
     tests = [t_test(member) for member in members]
-    factors = holm_factors([None if test is None else test.p for test in tests])
+    factors = iter(holm_factors([test.p for test in tests if test is not None]))
     equal_rate = level / max(1, sum(test is not None for test in tests))
     answers = []
-    for member, test, factor in zip(members, tests, factors, strict=True):
-        if test is None or factor is None:
+    for member, test in zip(members, tests, strict=True):
+        if test is None:
             answers.append(Answer(float(member.mean()), None, level, level, level))
         else:
-            p = min(1.0, factor * test.p)
-            answers.append(Answer(test.mean, test, level, level / factor, equal_rate, p))
+            factor = next(factors)
+            answers.append(Answer(test.mean, test, level, level / factor, equal_rate, min(1.0, factor * test.p)))
     return answers
 
 
-def holm_factors(p_values: Iterable[float | None]) -> list[float | None]:
-    """The factor (at least 1) by which Holm's method multiplies each p; a p of None is not counted and gives None.
+def holm_factors(p_values: Sequence[float]) -> list[float]:
+    """The factor (at least 1) by which Holm's method multiplies each p.
 
     The smallest of m p is multiplied by m, the next by m - 1, and so on. A product below the one before it is raised to
     that one.
     """
-    p_values = list(p_values)
-    order = sorted((p, index) for index, p in enumerate(p_values) if p is not None)
-    factors: list[float | None] = [None] * len(p_values)
+    factors = [0.0] * len(p_values)
     running = 0.0
-    for rank, (p, index) in enumerate(order):
-        running = max(running, (len(order) - rank) * p)
-        factors[index] = running / p if p > 0 else float(len(order) - rank)
+    ascending = sorted((p, index) for index, p in enumerate(p_values))
+    for left, (p, index) in zip(range(len(p_values), 0, -1), ascending, strict=True):
+        running = max(running, left * p)
+        factors[index] = running / p if p > 0 else float(left)
     return factors
 
 

@@ -82,7 +82,7 @@ def write_archive(experiment: Experiment, out: Path, pictures: bool = False) -> 
         except InputError as error:
             left_out.append(f"{trial.label}: {error}")
             continue
-        rows += [(_folder(trial), view, metrics) for view, metrics in sorted(views.items())]
+        rows += [{"trial": _folder(trial), "view": view} | metrics for view, metrics in sorted(views.items())]
         configurations.setdefault(configuration, []).append((_folder(trial), trial.seed))
         kept.append(trial)
     if not kept:
@@ -183,12 +183,10 @@ def _read(file: Path) -> tuple[dict[str, Any], dict[str, bytes]]:
         raise InputError("no such file") from None
     except IsADirectoryError:
         raise InputError("it is a folder: give an archive, or a folder of nerfbaselines' result files") from None
-    except (json.JSONDecodeError, RecursionError) as error:
+    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise InputError(f"its {MANIFEST} is not JSON ({error})") from None
     except (OSError, zipfile.BadZipFile, zlib.error, LZMAError, EOFError, NotImplementedError, RuntimeError) as error:
         raise InputError(f"it is not a complete zip archive ({error}): fetch or export it again") from None
-    except UnicodeDecodeError:
-        raise InputError(f"its {MANIFEST} is not UTF-8") from None
     for name, content in contents.items():
         if hashlib.sha256(content).hexdigest() != manifest["sha256"][name]:
             raise InputError(f"{name} was changed after the export (its sha256 is another): export it again")
@@ -273,20 +271,14 @@ def _checked_folder(folder: object) -> str:
     return str(folder)
 
 
-def read_configuration(trial: TrialResult) -> dict[str, Any]:
-    """The configuration in a trial's ``config.yaml``; raises InputError if it is missing or damaged."""
+def _configuration(trial: TrialResult) -> str:
+    """The trial's ``config.yaml`` as JSON, without paths of this machine; raises InputError if it is damaged."""
     try:
         values = read_yaml(trial.path / CONFIG)
     except FileNotFoundError:
         raise InputError(NO_CONFIGURATION) from None
     if not isinstance(values, dict):
         raise InputError(f"its {CONFIG} is not a mapping")
-    return values
-
-
-def _configuration(trial: TrialResult) -> str:
-    """The trial's configuration as JSON, without paths of this machine; raises InputError if it is damaged."""
-    values = read_configuration(trial)
     return json.dumps(without_paths({key: value for key, value in values.items() if key not in (*PRIVATE, SEED_KEY)}))
 
 
@@ -319,13 +311,11 @@ def _lines(content: bytes) -> list[dict[str, Any]]:
     return [json.loads(line) for line in content.decode().splitlines()]
 
 
-def _table(rows: Sequence[tuple[str, str, Mapping[str, float]]]) -> bytes:
-    names = list(dict.fromkeys(name for _, _, metrics in rows for name in metrics))
+def _table(rows: Sequence[Mapping[str, object]]) -> bytes:
     text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["trial", "view", *names])
-    for folder, view, metrics in rows:
-        writer.writerow([folder, view, *(repr(metrics[name]) if name in metrics else "" for name in names)])
+    writer = csv.DictWriter(text, dict.fromkeys(name for row in rows for name in row), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
     return text.getvalue().encode()
 
 

@@ -137,7 +137,7 @@ def prepare(file: ClaimsFile, runs: Path, find_missing: FindMissing, permissions
     for claim in file.claims:
         scenes: dict[str, tuple[str, str]] = {}
         reasons: dict[str, list[str]] = {}  # scenes by reason
-        for scene in () if claim.not_testable else file.scenes_of(claim):
+        for scene in () if claim.not_testable else claim.scenes or file.scenes:
             trials = []
             for arm in (claim.baseline, claim.arm):
                 words = (*file.words(claim, scene, arm), f"name={file.name}", "seed=0", *permissions)

@@ -111,9 +111,6 @@ class ClaimsFile:
     error_rate: Annotated[float, Interval(gt=0, le=MAX_ALPHA)] = ALPHA
     size: str = ""
 
-    def scenes_of(self, claim: Claim) -> tuple[str, ...]:
-        return tuple(claim.scenes or self.scenes)
-
     def words(self, claim: Claim, scene: str, arm: str) -> list[str]:
         """The settings of a claim's trials with this scene and arm, as command-line words without seed and name."""
         chosen = self.settings | self.scenes[scene] | self.arms[arm] | claim.split | claim.budget
@@ -240,20 +237,15 @@ def _check_settings(settings: Mapping[str, Any], where: str) -> None:
 
 def _check_claim(claim: Claim, file: ClaimsFile) -> None:
     where = f"claim {claim.id}"
-    for role, arm in (("baseline", claim.baseline), ("arm", claim.arm)):
-        if arm not in file.arms:
+    named = [("baseline", claim.baseline, file.arms), ("arm", claim.arm, file.arms)]
+    named += [("scene", scene, file.scenes) for scene in claim.scenes]
+    for role, name, known in named:
+        if name not in known:
             raise InputError(
-                f"{where}: {role} {arm!r} is none of the arms{did_you_mean(arm, file.arms)} "
-                f"(there are {', '.join(file.arms)})"
+                f"{where}: the file has no {role} {name!r}{did_you_mean(name, known)} (there are {', '.join(known)})"
             )
     if claim.baseline == claim.arm:
         raise InputError(f"{where}: {claim.arm} is compared with itself: name two arms")
-    for scene in claim.scenes:
-        if scene not in file.scenes:
-            raise InputError(
-                f"{where}: {scene!r} is none of the scenes{did_you_mean(scene, file.scenes)} "
-                f"(there are {', '.join(file.scenes)})"
-            )
     if len(set(claim.scenes)) < len(claim.scenes):
         raise InputError(f"{where}: a scene is listed twice in {', '.join(claim.scenes)}")
     for group, settings in (("budget", claim.budget), ("split", claim.split)):

@@ -1,7 +1,8 @@
 """The report as one HTML file: it needs no network and no other file, and can be read without JavaScript."""
 
-import logging
+import itertools
 import math
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -28,14 +29,12 @@ from gsbench.analysis.verdicts import PairVerdicts
 from gsbench.errors import InputError
 from gsbench.eval.facts import find_metric
 from gsbench.events import RefineEvent
-from gsbench.parsing import DamagedError
+from gsbench.parsing import read_if_sound
 from gsbench.runs import layout
-from gsbench.runs.experiments import read_tuning
+from gsbench.runs.experiments import TuningRecord
 from gsbench.runs.trial_record import Histogram
 from gsbench.scene.images import read_image
 from gsbench.words import counted, signed
-
-log = logging.getLogger(__name__)
 
 COSTS_COMPARED = ("gaussians", "train_time")
 EVENT_CAUSES = (*RefineEvent.GROWN, "relocated", *RefineEvent.PRUNED)
@@ -259,12 +258,11 @@ def histogram(volumes: NDArray[np.float64]) -> Curve:
 
 def _logged_histograms(trials: Sequence[TrialResult]) -> dict[int, Curve]:
     """The logged histograms by iteration, pooled over trials, as (volume at the bin's centre, share)."""
-    pooled: dict[int, dict[float, float]] = {}
+    pooled: dict[int, dict[float, float]] = defaultdict(lambda: defaultdict(float))
     for trial in trials:
         for row in trial.folder.curves(layout.HISTOGRAMS, Histogram):
-            for low, high, count in zip(row.log10_edges, row.log10_edges[1:], row.counts, strict=False):
-                bins, volume = pooled.setdefault(row.step, {}), 10 ** ((low + high) / 2)
-                bins[volume] = bins.get(volume, 0.0) + count
+            for (low, high), count in zip(itertools.pairwise(row.log10_edges), row.counts, strict=True):
+                pooled[row.step][10 ** ((low + high) / 2)] += count
     return {
         step: [(volume, count / total) for volume, count in sorted(bins.items()) if count]
         for step, bins in sorted(pooled.items())
@@ -309,12 +307,8 @@ def provenance(trials: Sequence[TrialResult]) -> Table:
 
 def search_summary(home: Path) -> tuple[str, str] | None:
     """A line on the experiment's search, and its chart as SVG; None if there is no search or it cannot be read."""
-    try:
-        record = read_tuning(home)
-    except FileNotFoundError:
-        return None
-    except DamagedError as error:
-        log.warning("left out: %s", error)
+    record = read_if_sound(home / layout.TUNING, TuningRecord)
+    if record is None:
         return None
     done = [(number, point, point.value) for number, point in enumerate(record.points, 1) if point.value is not None]
     failed = len(record.points) - len(done)

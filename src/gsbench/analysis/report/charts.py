@@ -75,10 +75,6 @@ def line_chart(
         marker=marked,
         width=WIDTH,
         height=HEIGHT,
-        left=LEFT,
-        right=WIDTH - RIGHT,
-        top=TOP,
-        bottom=HEIGHT - BOTTOM,
         few=TICKS,
     )
 
@@ -104,8 +100,6 @@ def forest_plot(title: str, rows: Sequence[ForestRow], x_label: str, better: int
         x_label=x_label,
         width=WIDTH,
         height=bottom + BOTTOM,
-        left=FOREST_LEFT,
-        right=WIDTH - RIGHT,
         top=FOREST_TOP,
         bottom=bottom,
     )
@@ -115,10 +109,10 @@ ROUND = (1, 2, 2.5, 5, 10)  # steps between ticks, as multiples of a power of te
 
 
 class Axis:
-    """Maps values to pixels, with ticks at round values."""
+    """Maps values to pixels from ``start`` to ``end``, with ticks at round values."""
 
     def __init__(self, values: Sequence[float], log: bool, start: float, end: float, ticks: int = TICKS) -> None:
-        self._log, self._start, self._end = log, start, end
+        self._log, self.start, self.end = log, start, end
         scaled = [self._scale(value) for value in values]
         low, high = min(scaled), max(scaled)
         if high - low < 1e-12:
@@ -139,7 +133,7 @@ class Axis:
 
     def to_px(self, value: float) -> float:
         fraction = (self._scale(value) - self._low) / (self._high - self._low)
-        return self._start + fraction * (self._end - self._start)
+        return self.start + fraction * (self.end - self.start)
 
     def _scale(self, value: float) -> float:
         return math.log10(value) if self._log else value
