@@ -35,7 +35,6 @@ def main() -> None:
 
 def run(argv: list[str]) -> int:
     """Run the command line ``argv``; returns the exit code and prints errors as one line."""
-    os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
     os.environ.setdefault(*SAFE_PATH)  # also for Python processes that libraries start
     set_up_logging()
     try:

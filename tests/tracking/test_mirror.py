@@ -91,7 +91,7 @@ def test_results_that_changed_replace_the_run(runs: Path) -> None:
 def wait_for_run(folder: Path) -> None:
     """Wait until the trial's run is there and noted."""
     deadline = time.monotonic() + SECONDS
-    while "logged" not in (json.loads((folder / STATE).read_text()) if (folder / STATE).exists() else {}):
+    while "token" not in (json.loads((folder / STATE).read_text()) if (folder / STATE).exists() else {}):
         assert time.monotonic() < deadline
         time.sleep(0.1)
 

@@ -22,18 +22,20 @@ import time
 import traceback
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, closing, suppress
+from dataclasses import replace
 from pathlib import Path
 from queue import Empty, Queue
 from typing import Any, NoReturn
 
 from gsbench.errors import InputError
 from gsbench.files import write_json
+from gsbench.parsing import read_if_sound
 from gsbench.runs.layout import CONFIG, FAILED, RESULTS
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.isolate import describe_exit, error_lines, python_command
 from gsbench.system.locks import BusyError, hold
 from gsbench.tracking.mlflow_sink import MlflowSink, untyped_address
-from gsbench.tracking.sinks import Sink, TensorBoardSink, TrackedTrial, WandbSink, read_state
+from gsbench.tracking.sinks import MirrorState, Sink, TensorBoardSink, TrackedTrial, WandbSink
 from gsbench.words import counted
 
 log = logging.getLogger(__name__)
@@ -148,6 +150,7 @@ class TrackerRun:
             held.enter_context(hold(folder.path / LOCK, "mirroring", wait=False))
             self._sink: Sink = sink_of(options)(options, self._trial)
             self._file = folder.path / self._sink.state_file
+            self._state = read_if_sound(self._file, MirrorState) or MirrorState()
             self._open()
             self._held = held.pop_all()
 
@@ -158,22 +161,22 @@ class TrackerRun:
     @property
     def is_complete(self) -> bool:
         """Return whether the run shows the trial's present results."""
-        return self._state["complete"] is not None and self._state["complete"] == self._trial.results_hash()
+        return self._state.shows(self._trial.results_hash())
 
     def add_curves(self) -> None:
-        """Log the records that were written since the last call."""
-        if self.is_complete:
+        """Log the records that were written since the last call. A run that shows results is left as it is."""
+        if self._state.complete is not None:
             return
-        for name, newest, scalars in self._trial.curves(self._state["logged"]):
+        for name, newest, scalars in self._trial.curves(self._state.logged):
             self._sink.log(scalars)
-            self._state["logged"][name] = newest
-        write_json(self._file, self._state)
+            self._state.logged[name] = newest
+        self._note()
 
     def end(self) -> None:
         """Log the rest, and close the run with the trial's end by its files: failed, done, or otherwise killed."""
         if self.is_complete:
             return
-        if self._state["complete"] is not None:  # the run shows earlier results, which new ones have replaced
+        if self._state.complete is not None:  # the run shows earlier results, which new ones have replaced
             self._open()
         self.add_curves()
         folder = self._trial.folder
@@ -184,12 +187,15 @@ class TrackerRun:
         else:
             images, with_model = int(self._options["images"]), bool(self._options.get("model"))
             self._sink.complete(self._trial.summary(results, images, with_model))
-            self._state["complete"] = self._trial.results_hash()
-        write_json(self._file, self._state)
+            self._state = replace(self._state, complete=self._trial.results_hash())
+        self._note()
 
     def _open(self) -> None:
-        self._state = self._sink.open(read_state(self._file), self._trial.results_hash())
-        write_json(self._file, self._state)
+        self._state = self._sink.open(self._state, self._trial.results_hash())
+        self._note()
+
+    def _note(self) -> None:
+        write_json(self._file, self._state.to_json())
 
 
 # ---- once, after the end

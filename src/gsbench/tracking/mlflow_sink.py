@@ -23,7 +23,7 @@ from gsbench.errors import InputError
 from gsbench.files import atomic, require_no_links, write_json
 from gsbench.runs import layout
 from gsbench.runs.layout import ARTIFACTS, DATABASE
-from gsbench.tracking.sinks import Scalar, Summary, TrackedTrial
+from gsbench.tracking.sinks import MirrorState, Scalar, Summary, TrackedTrial
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
@@ -165,30 +165,32 @@ class MlflowSink:
         self.run_id = ""
         self._started = 0  # ms since 1970
 
-    def open(self, state: dict[str, Any], results: str | None) -> dict[str, Any]:
+    def open(self, state: MirrorState, results: str | None) -> MirrorState:
         """Open the run (see `gsbench.tracking.sinks.Sink`). A deleted run, or one in another tracker, is replaced."""
-        uri = self._uri()
-        experiment_id = ensure_experiment(self.client, self._trial.values["name"], self._trial.folder.runs)
+        runs, uri = self._trial.folder.runs, str(self.client.tracking_uri)
+        if uri == default_uri(runs):
+            uri = OWN_DATABASE  # a runs folder may be moved
+        experiment_id = ensure_experiment(self.client, self._trial.values["name"], runs)
         run = None
-        if state.get("uri") in (uri, self.client.tracking_uri) and state.get("token"):
-            same = f"tags.`{TOKEN_TAG}` = '{state['token']}'"
+        if state.uri == uri and state.token:
+            same = f"tags.`{TOKEN_TAG}` = '{state.token}'"
             run = next(iter(self.client.search_runs([experiment_id], same, max_results=1)), None)
-        if run is not None and state["complete"] not in (None, results):
+        if run is not None and state.complete not in (None, results):
             self.client.delete_run(run.info.run_id)  # it shows results that are no longer the trial's
             run = None
         if run is None:
             token = uuid.uuid4().hex
-            state = {"uri": uri, "token": token, "started": int(time.time() * 1000), "complete": None, "logged": {}}
+            state = MirrorState(uri=uri, token=token, started=int(time.time() * 1000))
             # Written before the run is created, so that its token finds it even if the server's answer is lost.
-            write_json(self._trial.folder.path / STATE, state)
+            write_json(self._trial.folder.path / STATE, state.to_json())
             user = psutil.Process().username()
             tags = self._trial.tags() | {TOKEN_TAG: token, "mlflow.user": user}
             run = self.client.create_run(experiment_id, tags=tags, run_name=self._trial.label)
-        self.run_id, self._started = run.info.run_id, state["started"]
+        self.run_id, self._started = run.info.run_id, state.started
         if PARAMS_TAG not in run.data.tags:
             self._log_params()
-        require_own_artifacts(self.client, str(run.info.artifact_uri), self._trial.folder.runs)
-        if state["complete"] is None:
+        require_own_artifacts(self.client, str(run.info.artifact_uri), runs)
+        if state.complete is None:
             self.client.update_run(self.run_id, status="RUNNING")
         return state
 
@@ -236,8 +238,3 @@ class MlflowSink:
     def _time_of(self, seconds: float) -> int:
         """The time, in ms since 1970, ``seconds`` of training after the run's start."""
         return int(self._started + 1000 * seconds)
-
-    def _uri(self) -> str:
-        """The address to keep in the state: the tracker's, or `OWN_DATABASE`, since a runs folder may be moved."""
-        uri = str(self.client.tracking_uri)
-        return OWN_DATABASE if uri == default_uri(self._trial.folder.runs) else uri

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from gsbench.files import require_no_links
-from gsbench.parsing import Count, Record, read_if_sound
+from gsbench.parsing import Count, Record
 from gsbench.runs import layout
 from gsbench.runs.keys import TRAIN, flatten, sha256_of
 from gsbench.runs.trial_folder import TrialFolder
@@ -40,6 +40,25 @@ class Summary:
     files: Sequence[tuple[str, Path]]  # (folder in the tracker, "" for none; file)
     step: int
     seconds: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class MirrorState(Record):
+    """The state of a mirror, kept in the trial's folder.
+
+    `TrackerRun` keeps the first two fields; a sink uses the others to find its run again.
+    """
+
+    complete: str | None = None  # hash of the results that the run shows
+    logged: dict[str, Count] = field(default_factory=dict)  # newest iteration sent, by file
+    uri: str | None = None
+    token: str | None = None
+    started: Count = 0  # ms since 1970
+    id: str | None = None
+
+    def shows(self, results: str | None) -> bool:
+        """Return whether the run shows the results with this hash; False without results."""
+        return results is not None and self.complete == results
 
 
 class Sink(Protocol):
@@ -72,12 +91,12 @@ class Sink(Protocol):
     """
 
     name: str  # the tracker's, in messages
-    state_file: str  # in the trial's folder, for the state that `open` returns; see `MirrorState`
+    state_file: str  # in the trial's folder, for the state that `open` returns
 
-    def open(self, state: dict[str, Any], results: str | None) -> dict[str, Any]:
+    def open(self, state: MirrorState, results: str | None) -> MirrorState:
         """Begin a run for the trial, or continue the run that ``state`` names; returns the state to keep.
 
-        ``results`` is the hash of the trial's results, None without results. If ``state["complete"]`` is another hash,
+        ``results`` is the hash of the trial's results, None without results. If ``state.complete`` is another hash,
         the run shows results that are no longer the trial's, and is replaced.
         """
 
@@ -183,28 +202,6 @@ def _seconds(record: Mapping[str, float]) -> float:
     return float(record.get("seconds", record["step"] / 1000))
 
 
-@dataclass(frozen=True, kw_only=True)
-class MirrorState(Record):
-    """The state of a mirror. `TrackerRun` keeps the first two fields; a sink uses the others to find its run again."""
-
-    complete: str | None = None  # hash of the results that the run shows
-    logged: dict[str, Count] = field(default_factory=dict)  # newest iteration sent, by file
-    uri: str | None = None
-    token: str | None = None
-    started: Count | None = None  # ms since 1970
-    id: str | None = None
-
-    def __post_init__(self) -> None:
-        if self.token is not None and self.started is None:
-            raise ValueError("it has a run and no start")
-
-
-def read_state(file: Path) -> dict[str, Any]:
-    """Read the state in ``file``. It is empty, as if nothing were mirrored yet, for an absent or damaged file."""
-    state = read_if_sound(file, MirrorState)
-    return {} if state is None else {"complete": None, "logged": {}} | state.to_json()
-
-
 # ---- TensorBoard: event files in ``tensorboard/`` of the runs folder
 
 
@@ -219,9 +216,9 @@ class TensorBoardSink:
         self._started = time.time()
         self._writer: Any = None
 
-    def open(self, state: dict[str, Any], results: str | None) -> dict[str, Any]:
+    def open(self, state: MirrorState, results: str | None) -> MirrorState:
         """Open the run as `gsbench.tracking.sinks.Sink` says."""
-        if self._folder.is_dir() and state.get("complete") is not None and state["complete"] == results:
+        if self._folder.is_dir() and state.shows(results):
             return state
         from torch.utils.tensorboard import SummaryWriter
 
@@ -231,7 +228,7 @@ class TensorBoardSink:
         for name, values in (("settings", self._trial.params()), ("trial", self._trial.tags())):
             table = "".join(f"| {key} | {value} |\n" for key, value in values.items())
             self._writer.add_text(name, f"| | |\n|---|---|\n{table}")
-        return {"complete": None, "logged": {}}
+        return MirrorState()
 
     def log(self, scalars: Sequence[Scalar]) -> None:
         """Write numbers, and flush them to the file."""
@@ -273,13 +270,12 @@ class WandbSink:
             os.environ["WANDB_BASE_URL"] = options["uri"]
         self._run: Any = None
 
-    def open(self, state: dict[str, Any], results: str | None) -> dict[str, Any]:
+    def open(self, state: MirrorState, results: str | None) -> MirrorState:
         """Open the run (see `gsbench.tracking.sinks.Sink`). A run with earlier results stays beside the new one."""
-        if state.get("complete") is not None:
-            if state["complete"] == results:
-                return state
-            state = {}
-        state = state or {"id": uuid.uuid4().hex[:8], "complete": None, "logged": {}}
+        if state.shows(results):
+            return state
+        if state.complete is not None or state.id is None:
+            state = MirrorState(id=uuid.uuid4().hex[:8])
         import wandb
 
         trial = self._trial
@@ -289,7 +285,7 @@ class WandbSink:
         self._run = wandb.init(
             project=trial.values["name"],
             name=trial.label,
-            id=state["id"],
+            id=state.id,
             resume="allow",
             group=f"{trial.values['scene']['name']} {trial.arm}",
             config=trial.params(),

@@ -14,15 +14,12 @@ from gsbench.runs.layout import DATABASE
 from gsbench.system.install import install_command
 from gsbench.system.isolate import end_descendants
 from gsbench.system.stopping import stop_on_signals
+from gsbench.tracking.mlflow_sink import SETTINGS, default_uri, tracker_uri
 from gsbench.verbs.arguments import ArgumentParser, port
 from gsbench.view import ADDRESS
 
 VIEWER_PORT, DASHBOARD_PORT = 8080, 5000
-LEAN = {  # environment; MLflow's defaults take eight processes and 2 GB
-    "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false",
-    "MLFLOW_DISABLE_TELEMETRY": "true",
-    "MLFLOW_LOGGING_LEVEL": "WARNING",
-}
+LEAN = {"MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false"}  # MLflow's defaults take eight processes and 2 GB
 
 
 def view(argv: Sequence[str], runs: Path) -> int:
@@ -65,8 +62,6 @@ def ui(argv: Sequence[str], runs: Path) -> int:
     options = parser.parse_args(argv)
     if options.uri is not None and "://" not in options.uri:
         raise InputError(f"--uri {options.uri} is not an address such as sqlite:///FILE")
-    from gsbench.tracking import default_uri, tracker_uri
-
     uri = tracker_uri(options.uri, runs)
     if uri.startswith("http"):
         raise InputError(f"{uri} is a server, which has its own page: open that in the browser")
@@ -87,7 +82,7 @@ def serve(uri: str, port: int) -> int:
     command += ["--uvicorn-opts", f"--app-dir={shlex.quote(str(Path(mlflow_spec.origin).parents[1]))}"]
     with stop_on_signals():
         # Not `subprocess.run`: it would kill only `mlflow ui`, and its orphaned server would keep the port.
-        server = subprocess.Popen(command, env=LEAN | dict(os.environ))
+        server = subprocess.Popen(command, env=SETTINGS | LEAN | dict(os.environ))
         try:
             return server.wait()
         except KeyboardInterrupt:
