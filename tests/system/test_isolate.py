@@ -113,11 +113,6 @@ def test_early_exit_without_output(functions):
         run_isolated(functions.leave)
 
 
-def test_function_of_main_or_lambda_is_refused():
-    with pytest.raises(ValueError, match="top-level function"):
-        run_isolated(lambda: 1)
-
-
 @pytest.mark.parametrize("sign", [signal.SIGINT, signal.SIGKILL])
 def test_child_ends_with_its_parent(functions, tmp_path: Path, sign: signal.Signals):
     beats, script = tmp_path / "beats.txt", tmp_path / "main.py"

@@ -145,8 +145,6 @@ def run_isolated(
     raises `CrashError`, whose message ends with the last error lines of the output.
     """
     what = what or function.__name__
-    if function.__module__ == "__main__" or "<" in function.__qualname__:
-        raise ValueError(f"run_isolated: {function.__qualname__} must be a top-level function of an importable module")
     with tempfile.TemporaryDirectory(prefix="gsbench-isolate-") as folder:
         call, result = Path(folder, "call.pickle"), Path(folder, "result.pickle")
         call.write_bytes(pickle.dumps((function, args, kwargs)))

@@ -1,7 +1,6 @@
 """Parsing of a verb's words by argparse, with gsbench's errors of one line."""
 
 import argparse
-import re
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -10,7 +9,6 @@ from gsbench.verbs import VERBS
 from gsbench.words import did_you_mean, is_path
 
 MAX_PORT = 65535
-SETTING = re.compile(r"[+~]*[a-z_]\w*([./]\w+)*=")
 
 
 class ArgumentParser(argparse.ArgumentParser):
@@ -26,18 +24,9 @@ class ArgumentParser(argparse.ArgumentParser):
         super().__init__(prog=f"gsbench {verb}".strip(), description=description, **options)
 
     def parse_args(self, args: Any = None, namespace: Any = None) -> Any:
-        words = list(args or [])
-        settings = [word for word in words if word.lstrip("+").startswith("allow_targets=")]
-        parsed, unknown = self.parse_known_args([word for word in words if word not in settings], namespace)
-        # Settings may stand anywhere on the line. argparse takes positional words in one row only, leaves later ones
-        # unknown, and would take some for an option's value.
-        takers = [action.dest for action in self._actions if not action.option_strings and "=" in str(action.metavar)]
-        if takers:
-            settings += [word for word in unknown if SETTING.match(word)]
-            setattr(parsed, takers[0], [*getattr(parsed, takers[0]), *settings])
-            unknown = [word for word in unknown if not SETTING.match(word)]
-        else:
-            unknown += settings
+        # Settings may stand anywhere on the line, and permissions also before the first positional word.
+        words = sorted(args or [], key=lambda word: word.lstrip("+").startswith("allow_targets="))
+        parsed, unknown = self.parse_known_intermixed_args(words, namespace)
         if unknown:
             options = [option for action in self._actions for option in action.option_strings]
             hints = (did_you_mean(word.partition("=")[0], options) for word in unknown if word.startswith("--"))

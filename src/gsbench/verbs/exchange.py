@@ -30,7 +30,7 @@ def evaluate(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: 0 if every photograph was measured."""
     from gsbench.renders.measure import measure_renders
 
-    measure_renders(_evaluate_parser().parse_intermixed_args(argv), runs)
+    measure_renders(_evaluate_parser().parse_args(argv), runs)
     return 0
 
 
@@ -86,8 +86,6 @@ def export(argv: Sequence[str], runs: Path) -> int:
         raise InputError(f"one TRIAL is exported, not {len(options.trial)}; for an initial model: export init TRIAL")
     trial = find_trial(options.trial[-1], runs)
     out = options.out
-    if out.is_dir() and not is_init:
-        raise InputError(f"--out {out} is a folder: name the file to write")
     if not is_init:
         check_form(out)
     with writable_output(out):
@@ -123,21 +121,21 @@ def check_form(out: Path) -> None:
     """Raise InputError unless the name of the file is that of a 3DGS PLY."""
     if not out.name.lower().endswith(".ply") or out.name.lower().endswith(".compressed.ply"):
         raise InputError(
-            f"--out {out}: gsbench writes the 3DGS .ply, which every viewer and trainer reads (docs/other_models.md "
-            "says what makes other forms of it)"
+            f"--out {out}: name a file that ends in .ply, the 3DGS form, which every viewer and trainer reads "
+            "(docs/other_models.md says what makes other forms of it)"
         )
 
 
 def export_init(entry: Path, out: Path) -> None:
-    """Copy the COLMAP model of the stage result ``entry`` to `MODEL_FOLDER` of ``out``, as 3DGS trainers read it."""
+    """Copy the COLMAP model of the stage result ``entry`` to `MODEL_FOLDER` of ``out``, as 3DGS trainers read it.
+
+    Raises FileExistsError if ``out`` has a model.
+    """
     from gsbench.init.base import MODEL_FOLDER
 
     model = entry / MODEL_FOLDER
     if not model.is_dir():
         raise InputError(f"the initial model is no longer in the store ({model}): run the trial again")
-    first = out / MODEL_FOLDER.parts[0]
-    if first.exists():
-        raise InputError(f"{first} exists already: give another --out")
     shutil.copytree(model, out / MODEL_FOLDER)
 
 

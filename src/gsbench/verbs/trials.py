@@ -5,7 +5,7 @@ import logging
 import os
 import time
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 from gsbench.analysis.differences import find_superseded
@@ -64,7 +64,7 @@ def status(argv: Sequence[str], runs: Path) -> int:
         print(f"{counted(len(missing), 'trial')} removed from the plan")
         return 0
     if options.json:
-        print(json.dumps([_as_dict(trial) for trial in trials], indent=1))
+        print(json.dumps([asdict(trial) for trial in trials], indent=1, default=str))  # str: of the folder
     else:
         print("\n".join(lines_of(trials, options.all)))
     return 0 if all(trial.state in ("done", "running", "queued", "superseded") for trial in trials) else 1
@@ -123,10 +123,6 @@ def _age(trial: TrialState) -> str:
         return ""
     time_since = readable_time(max(0.0, time.time() - trial.since))
     return f"for {time_since}" if trial.state in ("running", "queued") else f"{time_since} ago"
-
-
-def _as_dict(trial: TrialState) -> dict[str, object]:
-    return {"folder": str(trial.folder), "state": trial.state, "since": trial.since, "note": trial.note}
 
 
 def retry(argv: Sequence[str], runs: Path) -> int:

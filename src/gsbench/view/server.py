@@ -11,10 +11,10 @@ servers of this machine. It sends the page's origin (``Origin``) and the name un
 import http
 import logging
 import math
+import socket
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from typing import Any
 from unittest import mock
 from urllib.parse import urlsplit
@@ -43,7 +43,6 @@ DEFAULT_THRESHOLD = math.log10(VOLUME_THRESHOLD)
 MAX_ASPECT = 10.0  # of a page, whose width decides the size of the picture
 MIN_FOV = 1e-3  # radians
 MAX_DISTANCE = 1e9  # world units
-SHARES = (1, 100)  # %, range of the share of Gaussians that is drawn, most opaque first
 
 
 class Viewer:
@@ -78,13 +77,14 @@ class Viewer:
         panes = [] if view is None else [(f"photograph {view.name}", photograph_at(camera, view))]
         for painter in self.painters:
             label = f"{painter.trial.label}: {len(painter.trial.gaussians):,} Gaussians"
-            panes.append((label, painter.draw(camera, layers_of(layers, painter, self._share.value))))
+            panes.append((label, painter.draw(camera, layers)))
         return side_by_side(panes)
 
     def layers(self) -> Layers:
         """The layers selected by the controls."""
         return Layers(
             sh_degree=min(max(int(self._degree.value), 0), MAX_SH_DEGREE),
+            share=float(self._share.value),
             causes=bool(self._causes.value),
             log10_volume=float(self._threshold.value),
             cloud=bool(self._cloud.value),
@@ -109,7 +109,7 @@ class Viewer:
             self._beside = gui.add_checkbox("Photograph beside", True)
         with gui.add_folder("Gaussians", expand_by_default=False):
             self._degree = gui.add_slider("SH degree", 0, 3, 1, 3)
-            self._share = gui.add_slider("Most opaque, %", *SHARES, 1, 100)
+            self._share = gui.add_slider("Most opaque, %", 1, 100, 1, 100)
         with gui.add_folder("Growth", expand_by_default=False):
             self._cloud = gui.add_checkbox("Initial cloud", False)
             self._causes = gui.add_checkbox("Large ones by cause", False)
@@ -219,12 +219,6 @@ class Session:
             self.client.scene.set_background_image(image, format="jpeg", jpeg_quality=90)
 
 
-def layers_of(layers: Layers, painter: TrialPainter, share: float) -> Layers:
-    """``layers`` limited to ``share`` per cent of this trial's Gaussians."""
-    count = len(painter.trial.gaussians)
-    return layers if share >= SHARES[1] else replace(layers, max_gaussians=max(1, round(share / 100 * count)))
-
-
 def page_camera(
     wxyz: NDArray[np.float64], position: NDArray[np.float64], fov: float, aspect: float, height: int, panes: int
 ) -> Camera:
@@ -282,8 +276,6 @@ def orbit_distance(views: Sequence[View]) -> float:
 
 def free_port() -> int:
     """A port of the loopback interface that is free now."""
-    import socket
-
     with socket.socket() as probe:
         probe.bind((HOST, 0))
         return int(probe.getsockname()[1])
@@ -291,8 +283,6 @@ def free_port() -> int:
 
 def check_port(port: int) -> None:
     """Raise InputError if ``port`` cannot be used (0 means any free port)."""
-    import socket
-
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:

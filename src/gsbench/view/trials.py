@@ -172,7 +172,7 @@ class Layers:
     """Settings of a picture."""
 
     sh_degree: int = MAX_SH_DEGREE
-    max_gaussians: int | None = None  # keep only the most opaque; None: all
+    share: float = 100.0  # % of the Gaussians, the most opaque
     causes: bool = False  # show the Gaussians above a volume in the colours of their causes
     log10_volume: float = math.log10(VOLUME_THRESHOLD)  # that volume
     cloud: bool = False  # show the initial cloud instead of the trained model
@@ -207,9 +207,9 @@ class TrialPainter:
     def draw(self, camera: Camera, layers: Layers) -> Picture:
         """The trial from ``camera``, [H, W, 3] uint8. With default ``layers`` this is the evaluation's render."""
         gaussians = self._initial if layers.cloud else self.trial.gaussians
-        limit = layers.max_gaussians
-        if not layers.cloud and limit is not None and limit < len(gaussians):
-            gaussians = self._by_opacity.map(lambda tensor: tensor[:limit])
+        if not layers.cloud and layers.share < 100:
+            count = max(1, round(layers.share / 100 * len(gaussians)))
+            gaussians = self._by_opacity.map(lambda tensor: tensor[:count])
         image = self._render(gaussians, camera, layers.sh_degree, self._background).image
         large = self.above(layers.log10_volume)
         if layers.causes and len(large):
