@@ -14,16 +14,7 @@ from annotated_types import Ge, Interval
 from pydantic import PositiveFloat, PositiveInt
 
 from gsbench.errors import InputError
-from gsbench.init.base import (
-    WORK_FOLDER,
-    Initializer,
-    InitReport,
-    PointsFrom,
-    Poses,
-    Preparation,
-    Seed,
-    Timer,
-)
+from gsbench.init.base import WORK_FOLDER, Initializer, InitReport, PointsFrom, Poses, Preparation, Seed, Timer
 from gsbench.init.colmap.pairs import STRONGEST, Pairing, proposed_pairs
 from gsbench.logs import Progress, no_progress
 from gsbench.scene.options import MIN_IMAGES

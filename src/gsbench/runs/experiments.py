@@ -14,16 +14,7 @@ from pydantic import Field
 
 from gsbench.errors import InputError
 from gsbench.files import require_no_links
-from gsbench.parsing import (
-    STRICT,
-    Amount,
-    Count,
-    Number,
-    Record,
-    Text,
-    Whole,
-    read_typed,
-)
+from gsbench.parsing import STRICT, Amount, Count, Number, Record, Text, Whole, read_typed
 from gsbench.runs.keys import sha256_of
 from gsbench.runs.layout import DECLARED, IN_RUNS, TUNING
 from gsbench.runs.trial_record import Declared, read_rows
