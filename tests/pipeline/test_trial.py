@@ -8,11 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
 
 from gsbench.config.compose import compose_one
 from gsbench.errors import InputError, TrainingError
-from gsbench.pipeline.parts import Parts, build, build_own_rasterizer, build_rasterizer
+from gsbench.pipeline.parts import Parts, build, build_own_rasterizer
 from gsbench.pipeline.trial import _recorded_failures, run_trial
 from gsbench.runs import layout
 from gsbench.runs.trial_folder import TrialFolder
@@ -159,7 +158,7 @@ def test_a_part_that_cannot_be_made_is_refused_with_its_setting(
 def test_a_rasterizer_of_ones_own_goes_by_a_name_of_its_own(own_module: None, name: str, sound: bool) -> None:
     values = {"name": "own", "_target_": f"own_classes.{name}"}
     if sound:
-        assert build_rasterizer(values, ["own_classes"], torch.device("cpu")).name == "named"
+        assert build_own_rasterizer(values, ["own_classes"]).name == "named"
     else:
         with pytest.raises(InputError, match="needs an attribute name"):
             build_own_rasterizer(values, ["own_classes"])
@@ -174,7 +173,6 @@ def test_a_rasterizer_of_ones_own_goes_by_a_name_of_its_own(own_module: None, na
             with pytest.raises(InputError, match="raster=named does not give them"):
                 _ = parts.rasterizer
     assert build_own_rasterizer({"name": "cpu"}, []) is None
-    assert build_rasterizer({"name": "reference"}, [], torch.device("cpu")).name == "reference"
 
 
 @pytest.mark.parametrize("place", ["scene", "trial", "log.txt", "store/views"])

@@ -13,9 +13,8 @@ import pytest
 import torch
 
 from gsbench.config.compose import compose_one
-from gsbench.densify import ADC, PixelGS
 from gsbench.errors import InputError
-from gsbench.pipeline.parts import build_rasterizer, check_features
+from gsbench.pipeline.parts import Parts, build_own_rasterizer
 from gsbench.raster import create_rasterizer
 from gsbench.runs.keys import config_hash, rasterizer_inputs
 from tests.config.test_schema import composed
@@ -72,7 +71,7 @@ def test_the_real_program_trains_with_it_and_knows_its_source(folder: Path) -> N
 
 def test_options_are_checked_and_the_key_has_them(folder: Path) -> None:
     values = composed(*OWN, "+raster.rows=7")
-    rasterizer = build_rasterizer(values["raster"], values["allow_targets"], CPU)
+    rasterizer = build_own_rasterizer(values["raster"], values["allow_targets"])
     key = rasterizer_inputs(rasterizer)
     assert isinstance(key, dict)
     assert key["rows"] == 7
@@ -84,21 +83,20 @@ def test_options_are_checked_and_the_key_has_them(folder: Path) -> None:
     ):
         values = composed(*OWN, *words)
         with pytest.raises(InputError, match=message):
-            build_rasterizer(values["raster"], values["allow_targets"], CPU)
+            build_own_rasterizer(values["raster"], values["allow_targets"])
     with pytest.raises(InputError, match=r"allow_targets=\[untiled\]"):
         compose_one(OWN[:1])
 
 
 def test_without_a_footprint_it_is_refused_where_one_is_asked_for(folder: Path) -> None:
-    values = composed(*OWN)
-    rasterizer = build_rasterizer(values["raster"], values["allow_targets"], CPU)
-    check_features(ADC(), "adc", rasterizer.name, rasterizer)
+    Parts(composed(*OWN)).check(on_this_machine=False)
+    parts = Parts(composed(*OWN, "densify=pixelgs"))
     with pytest.raises(
         InputError, match=r"densify=pixelgs needs .* raster=untiled does not give them; take raster=reference"
     ):
-        check_features(PixelGS(), "pixelgs", rasterizer.name, rasterizer)
-    rasterizer.has_footprint = True  # type: ignore[attr-defined]
-    check_features(PixelGS(), "pixelgs", rasterizer.name, rasterizer)
+        parts.check(on_this_machine=False)
+    parts.own_rasterizer.has_footprint = True  # type: ignore[union-attr]
+    parts.check(on_this_machine=False)
 
 
 def test_only_rasterizers_with_a_name_of_their_own(folder: Path) -> None:
@@ -118,7 +116,7 @@ def test_only_rasterizers_with_a_name_of_their_own(folder: Path) -> None:
         ("Absent", {}, "cannot be imported"),
     ):
         with pytest.raises(InputError, match=message):
-            build_rasterizer({"name": "auto", "_target_": f"untiled.{target}", **options}, ["untiled"], CPU)
+            build_own_rasterizer({"name": "auto", "_target_": f"untiled.{target}", **options}, ["untiled"])
 
 
 def test_its_source_is_part_of_the_hash(folder: Path) -> None:

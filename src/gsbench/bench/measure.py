@@ -13,8 +13,8 @@ from gsbench.bench.scenes import SEED, make_scene
 from gsbench.densify import ADC
 from gsbench.errors import InputError
 from gsbench.logs import Progress, progress
-from gsbench.pipeline.parts import build_rasterizer
-from gsbench.raster.base import Rasterizer
+from gsbench.pipeline.parts import build_own_rasterizer
+from gsbench.raster import Rasterizer, create_rasterizer
 from gsbench.raster.executors import find_executor
 from gsbench.system.isolate import run_isolated
 from gsbench.system.resources import peak_memory_mb, reset_peak_memory
@@ -125,9 +125,8 @@ def device_of(raster: str) -> torch.device:
 
 def make_rasterizer(raster: str, device: torch.device, threads: int) -> Rasterizer:
     """Make the executor called ``raster``, or the class at that import path, which the user has typed and so trusts."""
-    if "." in raster:
-        return build_rasterizer({"_target_": raster}, [raster.partition(".")[0]], device, threads)
-    return build_rasterizer({"name": raster}, [], device, threads)
+    own = build_own_rasterizer({"_target_": raster}, [raster.partition(".")[0]]) if "." in raster else None
+    return create_rasterizer(raster, device, threads) if own is None else own
 
 
 def constant_scene_options() -> TrainConfig:

@@ -20,10 +20,10 @@ from omegaconf.grammar_parser import parse
 
 from gsbench.errors import InputError
 from gsbench.external.settings import program_of
+from gsbench.runs.keys import TARGET, entries_of, targets_in
 from gsbench.system.own_modules import allowed_modules
 from gsbench.words import did_you_mean
 
-TARGET = "_target_"
 PERMISSIONS = "allow_targets"  # the setting that says what may run; it counts on the command line only
 PACKAGE = "gsbench"
 COMPONENTS = ("init", "densify", "raster")  # groups that name one class each; `eval.extra` names any number
@@ -165,11 +165,6 @@ def check_permissions(values: Mapping[str, Any]) -> None:
     _check_launch(values["launch"], allowed)
 
 
-def targets_in(values: Any, place: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
-    """Yield every ``_target_`` at any depth, lists included, as (keys that lead to its mapping, the target)."""
-    return ((inner, value) for inner, key, value in _entries(values, place) if key == TARGET and value is not None)
-
-
 def packages_allowed_at(place: Sequence[str]) -> tuple[str, ...]:
     """The packages of gsbench whose classes a place of the configuration may name without permission."""
     if len(place) == 1 and place[0] in COMPONENTS:
@@ -189,21 +184,13 @@ def check_composed(config: DictConfig, allowed: Sequence[str]) -> None:
     raw: Any = OmegaConf.to_container(config, resolve=False)
     if "hydra" in raw:  # Hydra removes its node when it runs a job
         _check_hydra(raw["hydra"])
-    for place, key, value in _entries(raw):
+    for place, key, value in entries_of(raw):
         if isinstance(value, str) and "${" in value:
             _check_interpolation(place, key, value)
         if key in SPECIAL_KEYS:  # `_partial_` makes a function of anything, to be called later
             raise InputError(f"{'.'.join((*place, key))}: gsbench makes no objects this way: leave it out")
     for place, target in targets_in(raw):
         _check_place(place, target, allowed)
-
-
-def _entries(values: Any, place: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], str, Any]]:
-    """Yield every entry at any depth, lists included, as (keys that lead there, its key, its value)."""
-    if isinstance(values, Mapping | list | tuple):
-        for key, value in values.items() if isinstance(values, Mapping) else enumerate(values):
-            yield place, str(key), value
-            yield from _entries(value, (*place, str(key)))
 
 
 def _check_interpolation(place: tuple[str, ...], key: str, value: str) -> None:
@@ -258,13 +245,13 @@ def _check_hydra(hydra: dict[str, Any]) -> None:
     # Hydra instantiates these, and ${…} may stand for a mapping that names a class.
     own_sweeper = sweeper | {"params": None, "grids": None}
     plugins = {"callbacks": hydra["callbacks"], "launcher": launcher, "sweeper": own_sweeper}
-    for place, key, value in _entries(plugins, ("hydra",)):
+    for place, key, value in entries_of(plugins, ("hydra",)):
         if isinstance(value, str) and "${" in value:
             raise InputError(f"{'.'.join((*place, key))}: write the settings themselves here, without ${{…}}")
     if not isinstance(launcher, dict) or launcher.get(TARGET) not in known_launchers():
         raise InputError("hydra.launcher: gsbench works with basic and joblib, beside launch=serial, local and slurm")
     # A job is composed after this check, and its words could name packages to import configurations from.
-    for place, key, value in _entries(sweeper, ("hydra", "sweeper")):
+    for place, key, value in entries_of(sweeper, ("hydra", "sweeper")):
         for text in (key, value) if key != TARGET else ():
             if isinstance(text, str) and NOT_SWEPT.match(text):
                 raise InputError(

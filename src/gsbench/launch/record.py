@@ -34,7 +34,6 @@ from gsbench.system.locks import hold
 
 log = logging.getLogger(__name__)
 
-PLAN_VERSION = 1
 LEVELS = 3  # folders of scene, arm and trial
 
 
@@ -58,7 +57,6 @@ def _checked_folder(name: str) -> str:
 class PlanFile(Record):
     """``plan.json``; ``trials`` are by their folders within the experiment."""
 
-    version: int
     trials: dict[Annotated[str, AfterValidator(_checked_folder)], PlannedTrial]
 
 
@@ -115,7 +113,7 @@ def read_plan(home: Path) -> dict[Path, PlannedTrial]:
 
 def _write_plan(home: Path, trials: dict[Path, PlannedTrial]) -> None:
     names = {folder.relative_to(home).as_posix(): trial for folder, trial in trials.items()}
-    write_json(home / PLAN, PlanFile(version=PLAN_VERSION, trials=names).to_json())
+    write_json(home / PLAN, PlanFile(trials=names).to_json())
 
 
 # ---- declarations

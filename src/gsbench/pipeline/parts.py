@@ -19,7 +19,6 @@ from gsbench.config.trust import (
     is_external,
     load_class,
     packages_allowed_at,
-    targets_in,
 )
 from gsbench.densify import Densifier
 from gsbench.errors import InputError
@@ -33,7 +32,7 @@ from gsbench.init.base import Initializer
 from gsbench.raster import EXECUTORS, Rasterizer, create_rasterizer
 from gsbench.raster.executors import AUTO, offers, resolve
 from gsbench.runs.experiments import metric_and_question
-from gsbench.runs.keys import OWN, UserCode, module_digest, unnamed_modules, user_modules
+from gsbench.runs.keys import OWN, UserCode, module_digest, targets_in, unnamed_modules, user_modules
 from gsbench.scene.options import SceneConfig
 from gsbench.settings import check_values, unknown_setting
 from gsbench.system.resources import available_threads
@@ -95,12 +94,6 @@ class Parts:
         """The trainer that the group densify describes: a densifier of gsbench's own trainer, or another program."""
         trainer: Densifier | External = build("densify", self.values["densify"], self._allowed)
         return trainer
-
-    @property
-    def densifier(self) -> Densifier:
-        """The densifier. Only for a trial that gsbench itself trains."""
-        assert isinstance(self.trainer, Densifier)
-        return self.trainer
 
     @property
     def program(self) -> External | None:
@@ -170,7 +163,11 @@ class Parts:
                 resolve(name, device.type)
 
     def _check_features(self, raster: str) -> None:
-        check_features(self.trainer, self.values["densify"]["name"], raster, self.own_rasterizer)
+        """Raise InputError if the densifier needs a feature that raster=``raster`` lacks."""
+        for need, (offer, words) in OPTIONAL_FEATURES.items():
+            if getattr(self.trainer, need, False) and not offers(raster, offer, self.own_rasterizer):
+                able = " or ".join(f"raster={executor.name}" for executor in EXECUTORS if getattr(executor, offer))
+                raise InputError(f"densify={self.values['densify']['name']} {words.format(raster)}; take {able}")
 
 
 def build(group: str, values: dict[str, Any], allow_targets: list[str]) -> Any:
@@ -209,17 +206,6 @@ def build(group: str, values: dict[str, Any], allow_targets: list[str]) -> Any:
         raise InputError(f"{group}: {target} cannot be made ({type(error).__name__}: {error})") from error
 
 
-def build_rasterizer(
-    values: dict[str, Any], allow_targets: list[str], device: torch.device, threads: int | None = None
-) -> Rasterizer:
-    """The rasterizer that ``values`` of the group raster describes: the user's own class, or one of gsbench's by name.
-
-    Raises InputError if it cannot run on ``device``.
-    """
-    own = build_own_rasterizer(values, allow_targets)
-    return create_rasterizer(values["name"], device, threads) if own is None else own
-
-
 def build_own_rasterizer(values: dict[str, Any], allow_targets: list[str]) -> Rasterizer | None:
     """The user's own rasterizer; None if ``values`` of the group raster name one of gsbench's."""
     if values.get("_target_") is None:
@@ -232,17 +218,6 @@ def build_own_rasterizer(values: dict[str, Any], allow_targets: list[str]) -> Ra
             f"rasterizer has; it has {name!r}"
         )
     return rasterizer
-
-
-def check_features(densifier: Any, arm: str, raster: str, own: Any = None) -> None:
-    """Raise InputError if densify=``arm`` needs a feature that raster=``raster`` lacks.
-
-    ``own`` is the rasterizer object if it is the user's.
-    """
-    for need, (offer, words) in OPTIONAL_FEATURES.items():
-        if getattr(densifier, need, False) and not offers(raster, offer, own):
-            able = " or ".join(f"raster={executor.name}" for executor in EXECUTORS if getattr(executor, offer))
-            raise InputError(f"densify={arm} {words.format(raster)}; take {able}")
 
 
 def build_metrics(values: dict[str, Any], allow_targets: list[str]) -> dict[str, Metric]:

@@ -26,6 +26,7 @@ from gsbench.files import write_json
 from gsbench.parsing import DamagedError, read_json
 from gsbench.settings import option_fields
 
+TARGET = "_target_"  # the key of a class's import path
 OWN = "gsbench."  # prefix of the import paths of gsbench's own classes
 # Options that cannot change a result. This holds for gsbench's own classes; a user's class may use the names otherwise.
 WITHOUT_EFFECT = ("threads", "weights", "download", "time_limit_minutes")
@@ -319,7 +320,7 @@ def user_modules(values: Mapping[str, Any]) -> dict[str, str]:
     These are the modules of its classes, and the modules in ``allow_targets``, which the classes may import. An
     installed module is included only if a class comes from it.
     """
-    of_classes = {target.split(".")[0] for target in _targets(values) if not target.startswith(OWN)}
+    of_classes = {name.split(".")[0] for _, name in targets_in(values) if not name.startswith(OWN)}
     if not of_classes:
         return {}
     helpers = {name.split(".")[0] for name in values.get("allow_targets") or ()} - of_classes
@@ -360,16 +361,17 @@ def unnamed_modules(before: Collection[str], named: Collection[str]) -> list[str
     return sorted(top for top, spec in specs.items() if spec is not None and not _is_installed(spec))
 
 
-def _targets(values: Any) -> Iterator[str]:
-    """The import paths (``_target_``) in a configuration, at any depth."""
-    if isinstance(values, Mapping):
-        if isinstance(values.get("_target_"), str):
-            yield values["_target_"]
-        for value in values.values():
-            yield from _targets(value)
-    elif isinstance(values, list | tuple):
-        for value in values:
-            yield from _targets(value)
+def targets_in(values: Any, place: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """Yield every ``_target_`` at any depth, lists included, as (keys that lead to its mapping, the target)."""
+    return ((inner, value) for inner, key, value in entries_of(values, place) if key == TARGET and value is not None)
+
+
+def entries_of(values: Any, place: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], str, Any]]:
+    """Yield every entry at any depth, lists included, as (keys that lead there, its key, its value)."""
+    if isinstance(values, Mapping | list | tuple):
+        for key, value in values.items() if isinstance(values, Mapping) else enumerate(values):
+            yield place, str(key), value
+            yield from entries_of(value, (*place, str(key)))
 
 
 def _find_spec(name: str, folder: str | None = None) -> ModuleSpec | None:

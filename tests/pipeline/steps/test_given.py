@@ -146,7 +146,7 @@ def test_a_training_leaves_its_model_its_lineage_and_its_summary(
     monkeypatch.setattr(train_steps, "reset_peak_memory", reset.append)
     cpu = torch.device("cpu")
     parts: Any = SimpleNamespace(
-        densifier=ADC(), rasterizer=ReferenceRasterizer(), train=TrainConfig(iterations=2), seed=5, device=cpu,
+        trainer=ADC(), rasterizer=ReferenceRasterizer(), train=TrainConfig(iterations=2), seed=5, device=cpu,
         measured_earlier=[1], user_code=UserCode(),
     )  # fmt: skip
     step = train_step(views, parts)

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from gsbench.densify import Lineage
+from gsbench.densify import Densifier, Lineage
 from gsbench.errors import InputError, TrainingError
 from gsbench.external.exchange import collect_model, collect_renders, write_test_cameras, write_training_views
 from gsbench.external.program import run_program
@@ -51,7 +51,8 @@ def train_step(views: Views, parts: Parts) -> Step:
 
     It also keeps snapshots of the model at the earlier iterations of ``eval.at``, for `evaluate_step`.
     """
-    densifier, rasterizer, options, seed = parts.densifier, parts.rasterizer, parts.train, parts.seed
+    densifier, rasterizer, options, seed = parts.trainer, parts.rasterizer, parts.train, parts.seed
+    assert isinstance(densifier, Densifier)
     device, snapshot_at, user = parts.device, parts.measured_earlier, parts.user_code
     values = dataclasses.asdict(options)
     train_options = {key: value for key, value in values.items() if key not in WITHOUT_EFFECT_ON_MODEL}
