@@ -84,15 +84,6 @@ def test_rasterizers_on_a_gpu(gpus: None, monkeypatch: pytest.MonkeyPatch) -> No
     assert texts["raster=gsplat"].startswith("needs gsplat: ")
 
 
-def test_triton_that_is_too_old_is_said_with_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(machine, "version_of", lambda package: "3.3.1")
-    monkeypatch.setattr(importlib.metadata, "version", lambda package: "3.3.1")
-    ((verdict, text),) = said(machine.check_triton())
-    assert verdict == "note"
-    assert "needs triton 3.4 or newer, and 3.3.1 is installed" in text
-    assert "torch>=2.8" in text
-
-
 def test_the_whole_of_it_on_this_machine(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     machine.doctor([], tmp_path / "runs")
     lines = capsys.readouterr().out.splitlines()

@@ -22,7 +22,7 @@ from gsbench.gaussians.initial import gaussians_from_cloud
 from gsbench.raster import create_rasterizer
 from gsbench.system.install import install_command
 from gsbench.verbs import servers
-from gsbench.view.server import Session, Viewer, check_port, free_port
+from gsbench.view.server import Session, Viewer, check_port
 from gsbench.view.trials import Layers, TrialPainter, find_trial, load_viewed, read_causes
 from tests.view.browser import Browser
 
@@ -105,7 +105,7 @@ def test_the_initial_cloud_is_what_the_training_started_from(painters: list[Tria
 
 def test_page_answers_until_it_is_stopped(painters: list[TrialPainter]) -> None:
     pytest.importorskip("viser", reason="the viewer needs viser (extra view)")
-    viewer = Viewer(painters[:1], free_port())
+    viewer = Viewer(painters[:1], 0)
     assert viewer.url.startswith("http://127.0.0.1:")
     with urllib.request.urlopen(viewer.url, timeout=20) as answer:
         assert answer.status == 200

@@ -3,11 +3,9 @@
 A rasterizer of your own needs no entry: ``raster._target_=mine.MyRasterizer`` (docs/rasterizer.md).
 """
 
-import importlib.metadata
 import importlib.util
 import logging
 import os
-import re
 import shutil
 import sys
 import sysconfig
@@ -35,8 +33,6 @@ class Executor:
     text: str  # description in one line
     package: str | None = None  # a package that it needs beyond gsbench's own requirements
     install: str = ""  # how to get that package
-    minimum: tuple[int, int] | None = None  # the oldest version of the package that works
-    upgrade: str = ""  # how to get that version
     takes_threads: bool = False  # its class has an argument ``threads``
     has_footprint: bool = True  # it gives ``RenderOutput.footprint``
     has_splitting_matrix: bool = True  # it gives ``RenderOutput.splitting_probe``
@@ -57,21 +53,7 @@ class Executor:
             return f"runs on device={needed}, not on {device_type}; choose from {alternatives}, or set device={needed}"
         if not self.is_installed:
             return f"needs {self.package}: {self.install}"
-        return self.too_old()
-
-    def too_old(self) -> str | None:
-        """The remedy if its package is older than ``minimum``; None if it is new enough or of unknown version."""
-        if self.package is None or self.minimum is None:
-            return None
-        try:
-            installed = importlib.metadata.version(self.package)
-        except importlib.metadata.PackageNotFoundError:  # the distribution for some GPUs has another name
-            return None
-        numbers = [int(number) for number in re.findall(r"\d+", installed)[:2]]
-        if tuple(numbers) >= self.minimum:
-            return None
-        minimum = ".".join(map(str, self.minimum))
-        return f"needs {self.package} {minimum} or newer, and {installed} is installed: {self.upgrade}"
+        return None
 
 
 EXECUTORS = (  # ``auto`` takes the first that is made for the type of device and installed
@@ -95,8 +77,6 @@ EXECUTORS = (  # ``auto`` takes the first that is made for the type of device an
         text="Triton kernels, compiled at first use by what torch brings along; the same bits on every run",
         package="triton",
         install="pip install triton, in the version that your torch asks for",
-        minimum=(3, 4),  # 3.3 has no `knobs`, and its kernels accept no named tuples
-        upgrade="pip install 'torch>=2.8', which brings it along",
     ),
     Executor(
         "gsplat",
@@ -193,8 +173,6 @@ def load_driver() -> None:
     except (RuntimeError, OSError, AssertionError, ImportError) as error:
         missing = missing_tools()
         reason = "Triton needs " + " and ".join(missing) if missing else f"Triton cannot start: {error}"
-        if old := find_executor("triton").too_old():
-            reason = f"raster=triton {old}"
         raise InputError(reason) from error
 
 

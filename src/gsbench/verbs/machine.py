@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from gsbench.errors import InputError
-from gsbench.raster.executors import AUTO, EXECUTORS, find_executor, resolve
+from gsbench.raster.executors import AUTO, EXECUTORS, resolve
 from gsbench.scene.options import MIN_SIZE
 from gsbench.system.install import install_command, version_of
 from gsbench.system.own_modules import allow_modules
@@ -110,9 +110,7 @@ def check_triton() -> Iterator[Finding]:
 
     if version_of("triton") is None:  # it comes with torch for CUDA, so there is no GPU to run it on
         return
-    if fault := find_executor("triton").too_old():
-        yield Finding("note", "triton", f"raster=triton {fault}")
-    elif missing := missing_tools():
+    if missing := missing_tools():
         yield Finding("note", "triton", f"at its first run on a GPU it needs {' and '.join(missing)}")
 
 

@@ -54,7 +54,7 @@ class Viewer:
         self.painters = tuple(painters)
         self.views: dict[str, View] = {view.name: view for view in painters[0].trial.views}
         with refuse_other_pages():
-            self.server: Any = viser.ViserServer(host=HOST, port=port or free_port(), verbose=False)
+            self.server: Any = viser.ViserServer(host=HOST, port=port, verbose=False)
         self.server.gui.configure_theme(control_layout="collapsible", show_logo=False, show_share_button=False)
         self.server.scene.set_up_direction(mean_up(painters[0].trial.views))
         self._sessions: dict[int, Session] = {}
@@ -272,13 +272,6 @@ def orbit_distance(views: Sequence[View]) -> float:
     """The distance from a page's camera to its pivot: the mean distance of the views from their centre, world units."""
     centers = np.stack([view.camera.center for view in views])  # [V, 3]
     return max(float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).mean()), 1e-3)
-
-
-def free_port() -> int:
-    """A port of the loopback interface that is free now."""
-    with socket.socket() as probe:
-        probe.bind((HOST, 0))
-        return int(probe.getsockname()[1])
 
 
 def check_port(port: int) -> None:
