@@ -53,10 +53,8 @@ def version_of(package: str) -> str | None:
 def conf_dir() -> Path:
     """The folder ``conf``: inside the package of a wheel, beside ``src`` in a checkout."""
     package = Path(__file__).resolve().parents[1]
-    for candidate in (package / "conf", package.parents[1] / "conf"):
-        if (candidate / "config.yaml").is_file():
-            return candidate
-    raise FileNotFoundError("gsbench's conf folder was not found; reinstall gsbench")
+    inside = package / "conf"
+    return inside if inside.is_dir() else package.parents[1] / "conf"
 
 
 SECONDS_FOR_GIT = 10

@@ -10,6 +10,7 @@ import contextlib
 import functools
 import os
 import platform
+import re
 import subprocess
 import sys
 from collections.abc import Mapping
@@ -65,15 +66,10 @@ def cpu_name() -> str:
 
 
 def _linux_name() -> str:
-    try:
-        lines = CPU_INFO.read_text(encoding="utf-8", errors="replace").splitlines()
-    except OSError:
-        return ""
-    entries: dict[str, str] = {}
-    for line in lines:
-        key, _, value = line.partition(":")
-        entries.setdefault(key.strip(), value.strip())
-    named = next((entries[key] for key in CPU_NAME_KEYS if entries.get(key)), "")
+    text = CPU_INFO.read_text(encoding="utf-8", errors="replace") if CPU_INFO.is_file() else ""
+    # Each core has an entry of the same keys; the first one counts.
+    entries = dict(reversed(re.findall(r"^(\w[\w ]*?)[ \t]*:[ \t]*(\S.*)$", text, re.MULTILINE)))
+    named = next((entries[key] for key in CPU_NAME_KEYS if key in entries), "")
     if named or "CPU part" not in entries:
         return named
     return f"ARM implementer {entries.get('CPU implementer', '?')} part {entries['CPU part']}"  # no name on 64-bit ARM

@@ -76,7 +76,7 @@ class Mirror:
         self._options = options
         try:
             if self._process is not None and self._process.poll() is not None:
-                self._finish(0)
+                self._finish(self._process, 0)
             if self._process is None:
                 self._process = self._start()
             assert self._process.stdin is not None
@@ -88,7 +88,7 @@ class Mirror:
     def __exit__(self, kind: type[BaseException] | None, error: object, trace: object) -> None:
         stopped = kind is not None and not issubclass(kind, Exception)
         if self._process is not None:
-            self._finish(SECONDS_TO_STOP if stopped else float(self._options["patience_seconds"]))
+            self._finish(self._process, SECONDS_TO_STOP if stopped else float(self._options["patience_seconds"]))
 
     def _start(self) -> subprocess.Popen[bytes]:
         """A fresh interpreter that runs `gsbench.tracking.mirror.follow`. Raises OSError where it cannot start."""
@@ -102,23 +102,19 @@ class Mirror:
             start_new_session=True,  # Ctrl-C must reach only the trials' process, which then ends this one
         )
 
-    def _finish(self, seconds: float) -> None:
+    def _finish(self, process: subprocess.Popen[bytes], seconds: float) -> None:
         """Close the process's input, wait for its end ``seconds`` at most, then kill it."""
-        process, self._process = self._process, None
-        assert process is not None
-        try:
-            process.communicate(timeout=seconds)
-        except subprocess.TimeoutExpired:
-            log.warning("tracking: %s is slow; `gsbench sync` mirrors the rest later", sink_of(self._options).name)
-            return
-        finally:  # also where a signal interrupts the wait
-            process.kill()
-            process.wait()
-            with suppress(OSError):
-                process.stdin.close()  # type: ignore[union-attr]
+        self._process = None
+        with self._errors, process:
+            try:
+                process.communicate(timeout=seconds)
+            except subprocess.TimeoutExpired:
+                log.warning("tracking: %s is slow; `gsbench sync` mirrors the rest later", sink_of(self._options).name)
+                return
+            finally:  # also where a signal interrupts the wait
+                process.kill()
             self._errors.seek(0)
             stderr = self._errors.read()
-            self._errors.close()
         if process.returncode == TRACKER_FAILED:
             text = stderr.decode("utf-8", "replace").strip()
             log.debug("tracking failed:\n%s", text)
