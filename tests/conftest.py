@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
+import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # before torch is imported, as the program itself does
 os.environ["MLFLOW_DISABLE_TELEMETRY"] = "true"
@@ -18,6 +21,17 @@ settings.register_profile("explore", deadline=None, suppress_health_check=[Healt
 settings.load_profile("gsbench")
 
 ROOT = Path(__file__).resolve().parents[1]
+
+
+def script(name: str) -> Any:
+    """A file of scripts/ as a module."""
+    specification = importlib.util.spec_from_file_location(name, ROOT / "scripts" / f"{name}.py")
+    assert specification is not None
+    assert specification.loader is not None
+    module = importlib.util.module_from_spec(specification)
+    sys.modules[name] = module  # for its dataclasses
+    specification.loader.exec_module(module)
+    return module
 
 
 @pytest.fixture(scope="session")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import re
 import tomllib
 from pathlib import Path
@@ -13,7 +12,7 @@ import pytest
 import yaml
 
 import gsbench
-from tests.conftest import ROOT
+from tests.conftest import ROOT, script
 
 PUBLIC = {"pypi.org", "files.pythonhosted.org"}
 WORKFLOWS = sorted((ROOT / ".github" / "workflows").glob("*.yml"))
@@ -145,16 +144,6 @@ def test_the_site_has_every_document() -> None:
     assert set(pages) <= docs | made
     index = (ROOT / "docs" / "index.md").read_text()
     assert [name for name in docs - {"index.md"} if f"]({name}" not in index] == []
-
-
-def script(name: str) -> Any:
-    """A file of scripts/ as a module."""
-    specification = importlib.util.spec_from_file_location(name, ROOT / "scripts" / f"{name}.py")
-    assert specification is not None
-    assert specification.loader is not None
-    module = importlib.util.module_from_spec(specification)
-    specification.loader.exec_module(module)
-    return module
 
 
 REPOSITORY = "https://example.org/owner/gsbench/"

@@ -2,21 +2,14 @@
 
 from __future__ import annotations
 
-import importlib.util
 import re
-import sys
 
 import pytest
 
 from gsbench.config.command_words import options
-from tests.conftest import ROOT
+from tests.conftest import script
 
-spec = importlib.util.spec_from_file_location("fidelity", ROOT / "scripts" / "fidelity.py")
-assert spec is not None
-assert spec.loader is not None
-fidelity = importlib.util.module_from_spec(spec)
-sys.modules["fidelity"] = fidelity  # for its dataclass
-spec.loader.exec_module(fidelity)
+fidelity = script("fidelity")
 PAGE = fidelity.PAGE.read_text(encoding="utf-8")
 
 

@@ -40,6 +40,13 @@ def test_commit_and_changes_are_told(repository: Path) -> None:
     assert checkout_of(repository, "a.txt") == {"commit": git("rev-parse", "HEAD"), "edited": True}
 
 
+def test_a_folder_that_the_repository_does_not_follow_is_no_checkout(repository: Path) -> None:
+    inner = repository / ".venv" / "site-packages"
+    inner.mkdir(parents=True)
+    (inner / "b.py").touch()
+    assert checkout_of(inner, "b.py") == {}
+
+
 @pytest.mark.parametrize("setting", ["core.fsmonitor", "filter.x.clean", "filter.x.process", "Filter.y.CLEAN"])
 def test_git_starts_nothing_that_a_capture_names(repository: Path, tmp_path: Path, setting: str) -> None:
     name = setting.split(".")[1]

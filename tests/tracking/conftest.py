@@ -1,4 +1,4 @@
-"""A PostgreSQL server of our own."""
+"""A runs folder with a database, and a PostgreSQL server of our own."""
 
 from __future__ import annotations
 
@@ -10,7 +10,16 @@ from pathlib import Path
 
 import pytest
 
+from gsbench.tracking import connect, ensure_experiment
 from tests.tracking.helpers import free_port
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A runs folder with a database; making one takes MLflow seconds."""
+    folder = tmp_path_factory.mktemp("runs")
+    ensure_experiment(connect(None, folder), "tracked", folder)
+    return folder
 
 
 @pytest.fixture

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import socket
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -88,6 +89,29 @@ def write_trial(folder: Path, values: dict[str, Any], records: int = RECORDS, ps
 def found_runs(client: Any, name: str) -> list[Any]:
     experiment = client.get_experiment_by_name(name)
     return [] if experiment is None else client.search_runs([experiment.experiment_id])
+
+
+def run_of(client: Any, seed: int) -> Any:
+    """The only run of the experiment ``tracked`` with this seed."""
+    (run,) = [run for run in found_runs(client, "tracked") if run.data.tags["seed"] == str(seed)]
+    return run
+
+
+MIRROR = """
+import sys
+from pathlib import Path
+from tests.tracking.helpers import begin_trial, following, options, trial_values, write_trial
+runs, uri, seed, patience = Path(sys.argv[1]), sys.argv[2] or None, int(sys.argv[3]), float(sys.argv[4])
+values = trial_values(runs, seed)
+folder = begin_trial(values, uri, patience)
+with following(options(uri, patience), folder):
+    write_trial(folder, values)
+"""
+
+
+def mirror_command(runs: Path, uri: str | None, seed: int, patience: float = 30.0) -> list[str]:
+    """The command of a process that writes and mirrors a trial."""
+    return [sys.executable, "-c", MIRROR, str(runs), uri or "", str(seed), str(patience)]
 
 
 def history(client: Any, run_id: str, key: str) -> list[tuple[int, float]]:

@@ -29,6 +29,7 @@ from tests.tracking.helpers import (
     found_runs,
     free_port,
     history,
+    mirror_command,
     mirror_trial,
     options,
     trial_values,
@@ -41,16 +42,6 @@ pytestmark = pytest.mark.slow
 SECONDS = 240
 PATIENCE = 4.0
 TINY = [*SMALL, "train.iterations=20", "scene.views=8", "init.count=500", "eval.lpips=[]", "eval.flip=false"]
-MIRROR = """
-import sys
-from pathlib import Path
-from tests.tracking.helpers import begin_trial, following, options, trial_values, write_trial
-runs, uri, seed, patience = Path(sys.argv[1]), sys.argv[2], int(sys.argv[3]), float(sys.argv[4])
-values = trial_values(runs, seed)
-folder = begin_trial(values, uri, patience)
-with following(options(uri, patience), folder):
-    write_trial(folder, values)
-"""
 
 
 @pytest.fixture(scope="module")
@@ -79,13 +70,7 @@ def check_complete(runs: Path, name: str, code: int, errors: str) -> None:
     assert json.loads(results.read_text())["status"] == "complete"
 
 
-@pytest.mark.parametrize(
-    "kind",
-    [
-        "refuses",
-        *(kind for kind in ("never answers", "answers after a minute", "hangs up", "postgresql")),
-    ],
-)
+@pytest.mark.parametrize("kind", ["refuses", "never answers", "answers after a minute", "hangs up", "postgresql"])
 def test_a_bad_tracker_costs_a_trial_one_line(kind: str, runs: Path) -> None:
     with ExitStack() as stack:
         port = free_port()
@@ -101,10 +86,7 @@ def test_a_bad_tracker_costs_a_trial_one_line(kind: str, runs: Path) -> None:
     check_complete(runs, name, program.returncode, errors)
 
 
-@pytest.mark.parametrize(
-    "signum",
-    [signal.SIGINT, *(signum for signum in (signal.SIGTERM, signal.SIGKILL))],
-)
+@pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
 def test_nothing_is_left_of_a_trial_that_is_ended_while_its_tracker_hangs(signum: int, runs: Path) -> None:
     name = f"ended_by_{signum}"
     with Listener() as tracker:
@@ -128,8 +110,6 @@ def test_sync_can_be_stopped_while_the_tracker_hangs(runs: Path) -> None:
         address = f"postgresql+psycopg2://x@127.0.0.1:{tracker.port}/x"
         folder = begin_trial(values, address)
         write_trial(folder, values)
-        results = json.loads((folder / "results.json").read_text()) | {"status": "complete"}
-        (folder / "results.json").write_text(json.dumps(results))
         program = subprocess.Popen(
             [sys.executable, "-m", "gsbench.cli", "sync", "synced", "--uri", address],
             env=child_environment() | {"GSBENCH_RUNS": str(runs)},
@@ -176,13 +156,9 @@ def tracker(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
         else:
             port = urlsplit(request.getfixturevalue("postgresql")).port
         gate = stack.enter_context(Gate(port))
-        http = request.param == "http"
-        yield (
-            gate,
-            f"http://127.0.0.1:{gate.port}"
-            if http
-            else f"postgresql+psycopg2://gsbench@127.0.0.1:{gate.port}/postgres",
-        )
+        address = f"127.0.0.1:{gate.port}"
+        uri = f"http://{address}" if request.param == "http" else f"postgresql+psycopg2://gsbench@{address}/postgres"
+        yield gate, uri
 
 
 def test_a_tracker_may_go_at_any_moment(
@@ -217,7 +193,7 @@ def test_a_tracker_may_go_at_any_moment(
 
 def mirror_a_trial(runs: Path, uri: str, seed: int, patience: float) -> str:
     """Mirror a trial in a process of its own, which must end well; returns what it said."""
-    words = [sys.executable, "-c", MIRROR, str(runs), uri, str(seed), str(patience)]
+    words = mirror_command(runs, uri, seed, patience)
     done = subprocess.run(words, env=child_environment(), capture_output=True, text=True, timeout=SECONDS, check=False)
     assert done.returncode == 0, done.stderr
     return done.stderr

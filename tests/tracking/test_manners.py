@@ -14,29 +14,21 @@ import pytest
 
 from gsbench.errors import InputError
 from gsbench.runs.trial_folder import TrialFolder
-from gsbench.tracking import connect, default_uri, ensure_experiment, tracker_uri
+from gsbench.tracking import connect, default_uri, tracker_uri
 from tests.tracking.helpers import (
     RECORDS,
     begin_trial,
     child_environment,
     following,
-    found_runs,
     history,
     mirror_trial,
     options,
+    run_of,
     trial_values,
     write_trial,
 )
 
 pytestmark = pytest.mark.slow
-
-
-@pytest.fixture(scope="module")
-def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A runs folder with a database; making one takes MLflow seconds."""
-    folder = tmp_path_factory.mktemp("runs")
-    ensure_experiment(connect(None, folder), "tracked", folder)
-    return folder
 
 
 def mirrored(runs: Path, seed: int, **more: Any) -> tuple[Any, Any]:
@@ -47,7 +39,7 @@ def mirrored(runs: Path, seed: int, **more: Any) -> tuple[Any, Any]:
     (folder / "point_cloud.ply").write_text("ply\n")
     assert mirror_trial(options() | more, folder, values)
     client = connect(None, runs)
-    (run,) = [run for run in found_runs(client, "tracked") if run.data.tags["seed"] == str(seed)]
+    run = run_of(client, seed)
     return client, run
 
 
@@ -72,7 +64,7 @@ def test_a_trial_goes_where_the_environment_says(runs: Path, tmp_path: Path, mon
     with following(options(), folder):
         write_trial(folder, values)
     assert not (tmp_path / "mlflow.db").exists()
-    (run,) = [run for run in found_runs(connect(None, runs), "tracked") if run.data.tags["seed"] == "20"]
+    run = run_of(connect(None, runs), 20)
     assert run.info.status == "FINISHED"
     assert run.data.tags["mlflow.user"] == getpass.getuser()
 
@@ -85,7 +77,7 @@ def test_a_failed_run_holds_its_reason_until_it_is_mended(runs: Path) -> None:
         (folder / "failed.json").write_text(json.dumps({"message": "the loss became nan", "traceback": "…"}))
         raise RuntimeError
     client = connect(None, runs)
-    (run,) = [run for run in found_runs(client, "tracked") if run.data.tags["seed"] == "22"]
+    run = run_of(client, 22)
     assert run.info.status == "FAILED"
     assert run.data.tags["error"] == "the loss became nan"
     assert artifacts(client, run) == {"config.yaml", "failed.json", "log.txt"}
@@ -127,7 +119,7 @@ def test_a_run_that_was_deleted_is_mirrored_anew(runs: Path) -> None:
     client.delete_run(run.info.run_id)
     values = trial_values(runs, seed=28)
     assert mirror_trial(options(), TrialFolder.of(values).path, values)
-    (again,) = [run for run in found_runs(client, "tracked") if run.data.tags["seed"] == "28"]
+    again = run_of(client, 28)
     assert again.info.run_id != run.info.run_id
     assert history(client, again.info.run_id, "train/loss") == [(i, 1 / i) for i in range(1, RECORDS + 1)]
     assert "results.json" in artifacts(client, again)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -11,31 +10,28 @@ import pytest
 
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.tracking import connect
-from tests.tracking.helpers import RECORDS, child_environment, found_runs, history, mirror_trial, options, trial_values
+from tests.tracking.helpers import (
+    RECORDS,
+    child_environment,
+    found_runs,
+    history,
+    mirror_command,
+    mirror_trial,
+    options,
+    trial_values,
+)
 
 pytestmark = pytest.mark.slow
 
 JOBS = 8
-CHILD = """
-import json, sys
-from tests.tracking.helpers import begin_trial, following, options, trial_values, write_trial
-from pathlib import Path
-runs, uri, seed = Path(sys.argv[1]), sys.argv[2] or None, int(sys.argv[3])
-values = trial_values(runs, seed)
-folder = begin_trial(values, uri)
-with following(options(uri), folder):
-    write_trial(folder, values)
-"""
 
 
 def run_jobs(runs: Path, uri: str | None) -> None:
     """Eight trials at once, in processes of their own, all new to the tracker."""
-    command = [sys.executable, "-c", CHILD, str(runs), uri or ""]
+    commands = [mirror_command(runs, uri, seed) for seed in range(JOBS)]
     jobs = [
-        subprocess.Popen(
-            [*command, str(seed)], env=child_environment(), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-        )
-        for seed in range(JOBS)
+        subprocess.Popen(command, env=child_environment(), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+        for command in commands
     ]
     outputs = [job.communicate(timeout=240)[0] for job in jobs]
     assert [job.returncode for job in jobs] == [0] * JOBS, outputs

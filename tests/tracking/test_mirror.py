@@ -28,20 +28,13 @@ from tests.tracking.helpers import (
     history,
     mirror_trial,
     options,
+    run_of,
     trial_values,
     write_trial,
 )
 from tests.tracking.servers import Listener
 
 SECONDS = 240  # within which what never comes is told from a slow machine
-
-
-@pytest.fixture(scope="module")
-def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A runs folder with a database; making one takes MLflow seconds."""
-    folder = tmp_path_factory.mktemp("runs")
-    ensure_experiment(connect(None, folder), "tracked", folder)
-    return folder
 
 
 @pytest.mark.slow
@@ -52,7 +45,7 @@ def test_all_that_the_files_say_is_mirrored_once(runs: Path) -> None:
         write_trial(folder, values)
     assert not mirror_trial(options(), folder, values)
     client = connect(None, runs)
-    (run,) = [run for run in found_runs(client, "tracked") if run.data.tags["seed"] == "1"]
+    run = run_of(client, 1)
     assert run.info.status == "FINISHED"
     assert run.data.metrics["psnr"] == 20.0
     assert run.data.metrics["total/cloned"] == 150
@@ -71,7 +64,7 @@ def test_a_crash_between_sending_and_noting_it_repeats_nothing(runs: Path) -> No
     (folder / STATE).write_text(json.dumps(state | {"complete": None, "logged": {"metrics.jsonl": 70}}))
     assert mirror_trial(options(), folder, values)
     client = connect(None, runs)
-    (run,) = [run for run in found_runs(client, "tracked") if run.data.tags["seed"] == "2"]
+    run = run_of(client, 2)
     assert len(history(client, run.info.run_id, "train/loss")) == RECORDS
     assert len(history(client, run.info.run_id, "psnr")) == 1
 
@@ -84,7 +77,7 @@ def test_results_that_changed_replace_the_run(runs: Path) -> None:
     write_trial(folder, values, psnr=33.0)
     assert mirror_trial(options(), folder, values)
     assert not mirror_trial(options(), folder, values)
-    (run,) = [run for run in found_runs(connect(None, runs), "tracked") if run.data.tags["seed"] == "3"]
+    run = run_of(connect(None, runs), 3)
     assert run.data.metrics["psnr"] == 33.0
 
 
@@ -107,12 +100,12 @@ def test_a_failed_and_a_stopped_trial_say_so_and_are_gone_on_with(runs: Path) ->
             if status == "FAILED":  # as a trial does before anyone beside it is told
                 (folder / "failed.json").write_text(json.dumps({"message": "x"}))
             raise error
-        (run,) = [run for run in found_runs(client, "tracked") if run.data.tags["seed"] == "4"]
+        run = run_of(client, 4)
         assert run.info.status == status
     (folder / "failed.json").unlink()
     with following(options(), folder):
         write_trial(folder, values)
-    (run,) = [run for run in found_runs(client, "tracked") if run.data.tags["seed"] == "4"]
+    run = run_of(client, 4)
     assert run.info.status == "FINISHED"
 
 
@@ -129,7 +122,7 @@ def test_curves_of_a_training_in_progress_are_followed(runs: Path, tmp_path: Pat
         deadline = time.monotonic() + SECONDS
         while not seen and time.monotonic() < deadline:
             time.sleep(0.1)
-            (run,) = [run for run in found_runs(client, "tracked") if run.data.tags["seed"] == "5"]
+            run = run_of(client, 5)
             seen = len(history(client, run.info.run_id, "train/loss"))
     assert seen == 1
 
@@ -199,7 +192,7 @@ def test_a_mirror_that_crashes_is_said_and_the_next_trial_has_another(
     (said,) = [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
     assert "the mirror crashed (SIGKILL" in said
     assert "gsbench sync" in said
-    (run,) = [run for run in found_runs(connect(None, runs), "tracked") if run.data.tags["seed"] == "7"]
+    run = run_of(connect(None, runs), 7)
     assert run.info.status == "FINISHED"
 
 

@@ -19,23 +19,15 @@ from gsbench.tracking.mlflow_sink import STATE
 from tests.tracking.helpers import (
     RECORDS,
     begin_trial,
-    found_runs,
     history,
     mirror_trial,
     options,
+    run_of,
     trial_values,
     write_trial,
 )
 
 AT = {"50": {"metrics": {"psnr": 15.0}, "num_gaussians": 7}}
-
-
-@pytest.fixture(scope="module")
-def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A runs folder with a database; making one takes MLflow seconds."""
-    folder = tmp_path_factory.mktemp("runs")
-    ensure_experiment(connect(None, folder), "tracked", folder)
-    return folder
 
 
 def finished_trial(runs: Path, seed: int) -> tuple[Path, dict[str, Any]]:
@@ -48,11 +40,6 @@ def finished_trial(runs: Path, seed: int) -> tuple[Path, dict[str, Any]]:
     (folder / "renders").mkdir()
     Image.fromarray(np.full((4, 6, 3), 200, np.uint8)).save(folder / "renders" / "view 1#.png")
     return folder, values
-
-
-def run_of(client: Any, seed: int) -> Any:
-    (run,) = [run for run in found_runs(client, "tracked") if run.data.tags.get("seed") == str(seed)]
-    return run
 
 
 @pytest.mark.slow
