@@ -11,7 +11,7 @@ import torch
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from gsbench.eval.metrics import flip, flip_map, psnr
-from gsbench.eval.ssim import masked_ssim, ssim
+from gsbench.eval.ssim import ssim
 
 
 def distorted_pair(height: int = 40, width: int = 53, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -110,7 +110,7 @@ def test_flip_depends_on_the_viewing_distance() -> None:
     ("shape", "other"), [((4, 5, 3), (4, 6, 3)), ((3, 4, 5), (3, 4, 5)), ((2, 1, 4, 5), (2, 1, 4, 5))]
 )
 def test_wrong_shapes_are_refused(shape: tuple[int, ...], other: tuple[int, ...]) -> None:
-    for metric in (psnr, ssim, flip, flip_map, lambda x, y: masked_ssim(x, y, torch.ones(4, 5, dtype=torch.bool))):
+    for metric in (psnr, ssim, flip, flip_map, lambda x, y: ssim(x, y, mask=torch.ones(4, 5, dtype=torch.bool))):
         words = "image" if shape == other else f"{shape} and {other}"
         with pytest.raises(ValueError, match=re.escape(words)):
             metric(torch.zeros(shape), torch.zeros(other))

@@ -137,7 +137,8 @@ def parse_word(word: str) -> Override:
     """A word as Hydra reads it. Raises InputError unless it is a ``key=value``."""
     if "=" not in word and not word.startswith("~"):
         raise InputError(f"{word!r} is not a setting like key=value")
-    if bracket_depth(word) > MAX_BRACKETS:
+    open_at_once = accumulate(((letter in "[{(") - (letter in "]})") for letter in word), initial=0)
+    if max(open_at_once) > MAX_BRACKETS:
         raise InputError(f"{word[:40]!r}… opens more than {MAX_BRACKETS} brackets within each other")
     try:
         override = OverridesParser.create().parse_override(word)
@@ -166,11 +167,6 @@ def value_text(value: object) -> str:
     if isinstance(value, list):
         return f"[{','.join(map(value_text, value))}]"
     return "null" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
-
-
-def bracket_depth(word: str) -> int:
-    """The largest number of brackets that are open at once."""
-    return max(accumulate(((letter in "[{(") - (letter in "]})") for letter in word), initial=0))
 
 
 def hint_for(word: str) -> str:

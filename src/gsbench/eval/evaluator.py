@@ -24,7 +24,7 @@ from gsbench.eval.lpips import Lpips, load_lpips
 from gsbench.eval.metric import MaskedMetric, Metric, UnavailableError
 from gsbench.eval.metrics import flip, flip_map, psnr
 from gsbench.eval.protocol import Protocol
-from gsbench.eval.ssim import masked_ssim, ssim
+from gsbench.eval.ssim import ssim
 from gsbench.weights import MissingWeightsError
 
 
@@ -72,11 +72,10 @@ class Ssim:
     def __init__(self, context: MetricContext) -> None:
         self._padding = context.protocol.ssim_padding
 
-    def measure(self, image: Tensor, truth: Tensor) -> float:
-        return float(ssim(in_double_precision(image), in_double_precision(truth), self._padding))
+    def measure(self, image: Tensor, truth: Tensor, mask: Tensor | None = None) -> float:
+        return float(ssim(in_double_precision(image), in_double_precision(truth), self._padding, mask))
 
-    def measure_masked(self, image: Tensor, truth: Tensor, mask: Tensor) -> float:
-        return float(masked_ssim(in_double_precision(image), in_double_precision(truth), mask, self._padding))
+    measure_masked = measure
 
 
 class LpipsMetric:

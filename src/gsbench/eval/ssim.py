@@ -30,13 +30,14 @@ def window() -> Tensor:
 _WEIGHTS = window().tolist()  # plain numbers, because a tensor would have to be copied to each device
 
 
-def ssim(image: Tensor, target: Tensor, padding: SsimPadding = "zero") -> Tensor:
+def ssim(image: Tensor, target: Tensor, padding: SsimPadding = "zero", mask: Tensor | None = None) -> Tensor:
     """Structural similarity (eq. 13), averaged over pixels and channels.
 
     Images are [H, W, 3] in [0, 1] (the value is a 0-dimensional tensor) or a batch [B, 3, H, W] (the values are [B]).
     With ``padding`` "zero" the images are padded with zeros and the full map is averaged, as in the evaluation of 3DGS.
-    With "valid" only pixels whose window lies inside the image count, as in scikit-image. Raises ValueError for wrong
-    shapes and sizes.
+    With "valid" only pixels whose window lies inside the image count, as in scikit-image. With ``mask`` [H, W], for one
+    image, only windows whose centre counts are averaged (NaN if none does). Raises ValueError for wrong shapes and
+    sizes.
     """
     check_pair(image, target)
     if padding not in get_args(SsimPadding):
@@ -44,21 +45,12 @@ def ssim(image: Tensor, target: Tensor, padding: SsimPadding = "zero") -> Tensor
     if padding == "valid":
         check_size(as_batch(image), WINDOW_SIZE, "ssim without padding")
     luminance, structure = ssim_parts(as_batch(image), as_batch(target), padding)
-    values = (luminance * structure).flatten(1).mean(dim=1)  # [B]
-    return values[0] if image.ndim == 3 else values
-
-
-def masked_ssim(image: Tensor, target: Tensor, mask: Tensor, padding: SsimPadding = "zero") -> Tensor:
-    """`ssim` of two images [H, W, 3], averaged over windows whose centre counts in ``mask`` [H, W].
-
-    The value is NaN if no pixel counts.
-    """
-    check_pair(image, target)
-    if padding == "valid":
-        check_size(as_batch(image), WINDOW_SIZE, "ssim without padding")
-        mask = mask[WINDOW_RADIUS:-WINDOW_RADIUS, WINDOW_RADIUS:-WINDOW_RADIUS]
-    luminance, structure = ssim_parts(as_batch(image), as_batch(target), padding)
-    return (luminance * structure)[0][:, mask].mean()
+    values = luminance * structure  # [B, 3, H', W']
+    if mask is not None:
+        inner = slice(WINDOW_RADIUS, -WINDOW_RADIUS) if padding == "valid" else slice(None)
+        return values[0][:, mask[inner, inner]].mean()
+    means = values.flatten(1).mean(dim=1)  # [B]
+    return means[0] if image.ndim == 3 else means
 
 
 def ssim_map(image: Tensor, target: Tensor) -> Tensor:

@@ -46,7 +46,7 @@ def arrange_cameras(cameras: Sequence[Camera]) -> Arrangement:
             fault = f"the cameras stand on one side of the scene, with none in {gap:.0f} degrees around its centre"
     if fault:
         description = f"by planes across the principal axis of the cameras' centres, since {fault}"
-        return Arrangement(_sorted(along_principal_axis(centers)), description)
+        return Arrangement(tuple(np.argsort(along_principal_axis(centers), kind="stable").tolist()), description)
     if gap > OPEN_RING:
         order = np.roll(order, -(widest + 1))
     return Arrangement(
@@ -116,10 +116,6 @@ def _azimuths(cameras: Sequence[Camera], centers: Array) -> tuple[Array | None, 
     aside = np.cross(up, first)
     degrees = np.degrees(np.arctan2(flat @ aside, flat @ first))  # [V]
     return np.round(degrees, AZIMUTH_DECIMALS).astype(np.float64) % 360.0, ""
-
-
-def _sorted(coordinates: Array) -> tuple[int, ...]:
-    return tuple(int(index) for index in np.argsort(coordinates, kind="stable"))
 
 
 def select_images(names: Sequence[str], max_images: int, least: int = MIN_IMAGES) -> list[str]:

@@ -167,9 +167,10 @@ def list_images(folder: Path) -> list[str]:
     while folders or links:
         # Links come last, so that images are listed under their real folder rather than under a link to it.
         parent = folders.pop() if folders else links.pop(0)
-        if (identity := _identity(parent)) in seen:  # also ends circles of links
+        status = parent.stat()
+        if (status.st_dev, status.st_ino) in seen:  # also ends circles of links
             continue
-        seen.add(identity)
+        seen.add((status.st_dev, status.st_ino))
         for entry in sorted(_entries(parent), key=lambda entry: entry.name):
             if entry.name.startswith("."):
                 continue
@@ -184,11 +185,6 @@ def list_images(folder: Path) -> list[str]:
             "%s: %s not read: save as JPEG", folder, f"{counted(unread, 'HEIC file')} {'is' if unread == 1 else 'are'}"
         )
     return sorted(names)
-
-
-def _identity(folder: Path) -> tuple[int, int]:
-    status = folder.stat()
-    return status.st_dev, status.st_ino
 
 
 def _entries(folder: Path) -> list[os.DirEntry[str]]:

@@ -118,10 +118,6 @@ class Resolution:
         end, wait = self.options.position_steps, self.schedule.full_from
         return end * max(0, step - wait) / max(end - wait, 1)
 
-    @property
-    def limits_count(self) -> bool:
-        return self.options.resolution_schedule == "pictures_and_count"
-
     def limit(self, refinement: Refinement, most: int | None) -> int:
         """The limit on the count after a round: n0 + (n - n0) / s^(2 - x), and n in the last round.
 
