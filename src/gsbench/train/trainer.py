@@ -134,8 +134,8 @@ class Trainer:
         self.scaled_views = ScaledViews(scene.train, self.targets, self.device, image_budget)
         scheduled = options.resolution_schedule != "none"
         self.resolution = Resolution(options, scene.train, len(initial)) if scheduled else None
-        limits_count = self.resolution is not None and options.resolution_schedule == "pictures_and_count"
-        limit = self.resolution.limit if limits_count else None
+        counts = options.resolution_schedule == "pictures_and_count"
+        limit = self.resolution.limit if self.resolution is not None and counts else None
         is_white = bool((self.background == 1).all())
         self.context = DensifyContext(scene.extent, is_white, self.device, views, limit)
         densifier.begin(initial, self.context)
