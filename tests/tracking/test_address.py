@@ -9,9 +9,19 @@ import pytest
 
 from gsbench.cli import run
 from gsbench.errors import InputError
-from gsbench.tracking import connect
+from gsbench.tracking import connect, default_uri, tracker_uri
 from gsbench.tracking.mlflow_sink import STATE, VARIABLE, untyped_address
 from tests.tracking.helpers import begin_trial, found_runs, free_port, mirror_trial, options, trial_values, write_trial
+
+
+def test_the_address_is_the_configured_one_then_the_environments_then_ours(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
+    assert tracker_uri(None, tmp_path) == default_uri(tmp_path) == f"sqlite:///{tmp_path}/mlflow.db"
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", "http://127.0.0.1:1")
+    assert tracker_uri(None, tmp_path) == "http://127.0.0.1:1"
+    assert tracker_uri("http://127.0.0.1:2", tmp_path) == "http://127.0.0.1:2"
 
 
 def test_an_address_counts_where_it_is_typed_or_of_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,7 +14,7 @@ import pytest
 
 from gsbench.errors import InputError
 from gsbench.runs.trial_folder import TrialFolder
-from gsbench.tracking import connect, default_uri, tracker_uri
+from gsbench.tracking import connect, default_uri
 from tests.tracking.helpers import (
     RECORDS,
     begin_trial,
@@ -45,16 +45,6 @@ def mirrored(runs: Path, seed: int, **more: Any) -> tuple[Any, Any]:
 
 def artifacts(client: Any, run: Any) -> set[str]:
     return {item.path for item in client.list_artifacts(run.info.run_id)}
-
-
-def test_the_address_is_the_configured_one_then_the_environments_then_ours(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
-    assert tracker_uri(None, tmp_path) == default_uri(tmp_path) == f"sqlite:///{tmp_path}/mlflow.db"
-    monkeypatch.setenv("MLFLOW_TRACKING_URI", "http://127.0.0.1:1")
-    assert tracker_uri(None, tmp_path) == "http://127.0.0.1:1"
-    assert tracker_uri("http://127.0.0.1:2", tmp_path) == "http://127.0.0.1:2"
 
 
 def test_a_trial_goes_where_the_environment_says(runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

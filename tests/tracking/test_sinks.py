@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 from pathlib import Path
 from typing import Any
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -14,8 +16,10 @@ from PIL import Image
 from gsbench.config.compose import compose_one
 from gsbench.errors import InputError
 from gsbench.launch.batch import check_trackers
+from gsbench.runs.trial_folder import TrialFolder
 from gsbench.tracking import connect, ensure_experiment
 from gsbench.tracking.mlflow_sink import STATE
+from gsbench.tracking.sinks import TrackedTrial
 from tests.tracking.helpers import (
     RECORDS,
     begin_trial,
@@ -42,30 +46,69 @@ def finished_trial(runs: Path, seed: int) -> tuple[Path, dict[str, Any]]:
     return folder, values
 
 
-@pytest.mark.slow
-def test_measurements_on_the_way_are_steps_of_the_final_metrics_curve(runs: Path) -> None:
+def test_mlflow_shows_a_curve_of_the_final_metrics_and_a_grid_of_the_test_pictures(runs: Path) -> None:
     folder, values = finished_trial(runs, seed=1)
     mirror_trial(options(), folder, values)
     client = connect(None, runs)
     run = run_of(client, 1)
+    assert run.info.run_name == "seed 1 a_scene a_init-a_densify"
     assert history(client, run.info.run_id, "psnr") == [(50, 15.0), (RECORDS, 20.0)]
     assert run.data.metrics["psnr"] == 20.0  # what the tables show is the last
-
-
-def test_test_pictures_are_an_image_grid(runs: Path) -> None:
-    folder, values = finished_trial(runs, seed=2)
-    mirror_trial(options(), folder, values)
-    client = connect(None, runs)
-    run = run_of(client, 2)
     assert run.data.tags["mlflow.loggedImages"] == "True"  # by which the page knows that it has a grid to show
     names = [Path(item.path).name for item in client.list_artifacts(run.info.run_id, "images")]
     assert any(name.startswith(f"renders~view 1_+step+{RECORDS}+") and name.endswith(".png") for name in names), names
 
 
-def test_run_names_begin_with_the_seed(runs: Path) -> None:
-    folder, values = finished_trial(runs, seed=3)
-    mirror_trial(options(), folder, values)
-    assert run_of(connect(None, runs), 3).info.run_name == "seed 3 a_scene a_init-a_densify"
+def test_the_summary_of_a_trial(tmp_path: Path) -> None:
+    folder, values = finished_trial(tmp_path, seed=3)
+    trial = TrackedTrial(TrialFolder(folder), values)
+    results = trial.folder.sound_record()
+    assert results is not None
+    summary = trial.summary(results, images=1, with_model=False)
+    assert (summary.step, summary.seconds) == (RECORDS, 2.0)
+    found = {(scalar.key, scalar.step): scalar for scalar in summary.scalars}
+    assert found["psnr", 50].seconds == pytest.approx(2.0 * 50 / RECORDS)
+    assert found["psnr", RECORDS].seconds == 2.0
+    assert {key: scalar.value for (key, step), scalar in found.items() if step == RECORDS} == {
+        "psnr": 20.0, "num_gaussians": 13.0, "num_init_points": 5.0, "peak_memory_mb": 1.5, "seconds_train": 2.0,
+        "total/cloned": 150.0,
+    }  # fmt: skip
+    assert summary.tags["hash_config"] == "abc"
+    assert list(summary.pictures) == ["renders/view 1#"]
+    assert trial.summary(results, images=0, with_model=False).pictures == {}
+    assert {path.name for _, path in summary.files} == {"config.yaml", "results.json", "events.jsonl"}
+
+
+def test_weights_and_biases_gets_all_of_a_trial_in_one_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With a stand-in for its client, which notes what it is told."""
+    wandb = MagicMock()
+    monkeypatch.setitem(sys.modules, "wandb", wandb)
+    monkeypatch.setenv("WANDB_BASE_URL", "http://before")
+    folder, values = finished_trial(tmp_path, seed=1)
+    sink = options("http://wandb.example") | {"sink": "wandb"}
+    assert mirror_trial(sink, folder, values)
+    assert not mirror_trial(sink, folder, values)
+    assert os.environ["WANDB_BASE_URL"] == "http://wandb.example"
+    (asked,) = (call.kwargs for call in wandb.init.call_args_list)
+    assert (asked["project"], asked["resume"]) == ("tracked", "allow")
+    assert asked["name"] == "seed 1 a_scene a_init-a_densify"
+    run = wandb.init.return_value
+    logged = [call.args[0] for call in run.log.call_args_list]
+    losses = [(row["iteration"], row["train/loss"]) for row in logged if "train/loss" in row]
+    assert losses == [(i, 1 / i) for i in range(1, RECORDS + 1)]
+    assert {"iteration": 50, "psnr": 15.0} in logged
+    assert [row["iteration"] for row in logged if "renders/view 1#" in row] == [RECORDS]
+    assert run.summary.update.call_args.args[0]["psnr"] == 20.0
+    assert {Path(call.args[0]).name for call in run.save.call_args_list} >= {"config.yaml", "results.json"}
+    run.finish.assert_called_once_with(0)
+    write_trial(folder, values, psnr=33.0)
+    assert mirror_trial(sink, folder, values)
+    assert wandb.init.call_args.kwargs["id"] != asked["id"]  # the run with earlier results stays beside it
+    (folder / "results.json").unlink()
+    (folder / "failed.json").write_text(json.dumps({"message": "the loss became nan"}))
+    assert mirror_trial(sink, folder, values)
+    run.summary.__setitem__.assert_called_once_with("error", "the loss became nan")
+    run.finish.assert_called_with(1)
 
 
 def test_experiments_open_as_machine_learning(runs: Path) -> None:
