@@ -20,6 +20,7 @@ from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.ply import write_ply
 from gsbench.launch.record import add_to_plan
 from gsbench.runs.trial_folder import TrialFolder
+from gsbench.system.own_modules import allowed_modules
 from gsbench.system.stopping import Stopped
 from gsbench.verbs import load_verb, machine, servers, trials
 from tests.finished import write_results
@@ -141,6 +142,11 @@ def test_retry_of_a_trial_without_a_plan_takes_its_own_configuration(runs: Path)
     again = trials.recompose(folders[1], None, runs, [], str(runs.parent))
     assert TrialFolder.of(again.values).path == folders[1]
     assert again.values == compose_one(["name=x", "densify=adc", "seed=1"]).values
+    own = trials.recompose(folders[1], None, runs, ["allow_targets=[mine.Arm]"], "theirs")
+    assert own.values["allow_targets"] == ["mine.Arm"]
+    assert allowed_modules()["mine"] == "theirs"
+    with pytest.raises(InputError, match="is in no plan, so no setting of it can be changed"):
+        trials.recompose(folders[1], None, runs, ["launch=local"], "theirs")
 
 
 def test_a_second_retry_without_a_plan_runs_the_same_trial(runs: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -18,7 +18,6 @@ from PIL import Image
 
 from gsbench.errors import InputError
 from gsbench.events import Cause
-from gsbench.gaussians.initial import gaussians_from_cloud
 from gsbench.raster import create_rasterizer
 from gsbench.system.install import install_command
 from gsbench.verbs import servers
@@ -56,18 +55,6 @@ def test_drawing_a_test_view_gives_the_trials_own_render(small_runs: Path, paint
             np.testing.assert_array_equal(view.image, photograph)
 
 
-def test_fewer_gaussians_are_the_most_opaque(painters: list[TrialPainter]) -> None:
-    painter = painters[0]
-    camera, gaussians = painter.trial.views[0].camera, painter.trial.gaussians
-    count = round(len(gaussians) / 10)
-    kept = gaussians.select(torch.topk(gaussians.opacities, count).indices)
-    with torch.no_grad():
-        direct = painter.rasterizer.render(kept, camera, 1, torch.zeros(3)).image
-    drawn = painter.draw(camera, Layers(sh_degree=1, share=10))
-    assert np.abs(drawn - 255 * direct.clamp(0, 1).numpy()).max() < 1.01
-    assert np.abs(drawn.astype(int) - painter.draw(camera, Layers())).mean() > 3
-
-
 def test_the_large_are_shown_in_the_colour_of_their_cause(painters: list[TrialPainter]) -> None:
     painter = painters[1]
     trial = painter.trial
@@ -91,16 +78,6 @@ def test_the_large_are_shown_in_the_colour_of_their_cause(painters: list[TrialPa
     assert len(seen)
     assert (seen > hues.min(axis=0) - 8).all()
     assert (seen < hues.max(axis=0) + 8).all()
-
-
-def test_the_initial_cloud_is_what_the_training_started_from(painters: list[TrialPainter]) -> None:
-    painter = painters[0]
-    camera, cloud = painter.trial.views[0].camera, painter.trial.cloud
-    start = gaussians_from_cloud(cloud.points, cloud.colors)
-    with torch.no_grad():
-        direct = painter.rasterizer.render(start, camera, 3, torch.zeros(3)).image
-    drawn = painter.draw(camera, Layers(cloud=True))
-    assert np.abs(drawn - 255 * direct.clamp(0, 1).numpy()).max() < 1.01
 
 
 def test_page_answers_until_it_is_stopped(painters: list[TrialPainter]) -> None:

@@ -7,14 +7,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
 from gsbench.errors import InputError
+from gsbench.events import Cause
+from gsbench.gaussians.initial import gaussians_from_cloud
+from gsbench.gaussians.model import Gaussians
+from gsbench.init.base import PointCloud
+from gsbench.raster import create_rasterizer
 from gsbench.scene.types import Camera, View
 from gsbench.view.server import fitting_fov, level_up, mean_up, page_camera
-from gsbench.view.trials import photograph_at, read_causes, side_by_side
+from gsbench.view.trials import Layers, TrialPainter, ViewedTrial, photograph_at, read_causes, side_by_side
+from tests.gaussians.helpers import random_gaussians
 
 
 def smooth_image(height: int, width: int) -> np.ndarray:
@@ -53,6 +60,8 @@ def test_panes_stand_side_by_side_with_labels() -> None:
     assert (row[:20, :60] != 40).any()
     assert (row[:20, 62:] != 80).any()
     assert (row[:, 57:60] == 40).all()  # the label was made to fit
+    assert (row[20:, 60] == 255).all()  # a line divides the panes
+    assert (row[20:, 0] == 40).all()
 
 
 def test_page_camera_projects_as_the_page_does() -> None:
@@ -118,6 +127,51 @@ def test_mean_up_points_up() -> None:
 def test_what_is_no_camera_is_not_drawn(wxyz: tuple, position: tuple, fov: float, aspect: float) -> None:
     with pytest.raises(ValueError, match=r"no camera|is not drawn"):
         page_camera(np.array(wxyz, float), np.array(position, float), fov, aspect, 540, 1)
+
+
+def painter() -> TrialPainter:
+    """A model of 40 Gaussians in front of `make_view`, nine of them large, and a cloud of four points."""
+    gaussians = random_gaussians(40, seed=1, dtype=torch.float32)
+    volumes = np.linspace(-3.0, 0.9, 40)
+    causes = np.array([Cause.CLONE, Cause.SPLIT_VOLUME] * 20, np.uint8)
+    cloud = PointCloud(
+        np.array([[0.0, 0.0, 4.0], [1.0, 0.0, 4.0], [0.0, 1.0, 4.0], [1.0, 1.0, 4.0]]), np.full((4, 3), 200, np.uint8)
+    )
+    trial = ViewedTrial("a", gaussians, causes, volumes, cloud, (make_view(),), (0.0, 0.0, 0.0))
+    return TrialPainter(trial, create_rasterizer("reference", torch.device("cpu")))
+
+
+def rendered(painter: TrialPainter, gaussians: Gaussians, degree: int = 3) -> np.ndarray:
+    with torch.no_grad():
+        image = painter.rasterizer.render(gaussians, make_view().camera, degree, torch.zeros(3)).image
+    return np.round(255 * image.clamp(0, 1).numpy())
+
+
+def test_layers_choose_what_is_drawn() -> None:
+    shown, camera = painter(), make_view().camera
+    gaussians = shown.trial.gaussians
+    assert rendered(shown, gaussians).max() > 50
+    np.testing.assert_allclose(shown.draw(camera, Layers()), rendered(shown, gaussians), atol=1)
+    np.testing.assert_allclose(shown.draw(camera, Layers(sh_degree=0)), rendered(shown, gaussians, 0), atol=1)
+    opaque = gaussians.select(torch.topk(gaussians.opacities, 4).indices)
+    np.testing.assert_allclose(shown.draw(camera, Layers(share=10)), rendered(shown, opaque), atol=1)
+    single = gaussians.select(gaussians.opacities.argmax()[None])
+    np.testing.assert_allclose(shown.draw(camera, Layers(share=1)), rendered(shown, single), atol=1)
+    cloud = gaussians_from_cloud(shown.trial.cloud.points, shown.trial.cloud.colors)
+    np.testing.assert_allclose(shown.draw(camera, Layers(cloud=True, share=1)), rendered(shown, cloud), atol=1)
+    assert list(shown.above(0.05)) == list(range(31, 40))
+    counts = shown.counts_above(0.05)
+    assert (counts[Cause.CLONE], counts[Cause.SPLIT_VOLUME], sum(counts.values())) == (4, 5, 9)
+    plain = shown.draw(camera, Layers()).astype(float)
+    none_large = shown.draw(camera, Layers(causes=True, log10_volume=99.0))
+    np.testing.assert_array_equal(none_large, plain)
+    marked = shown.draw(camera, Layers(causes=True, log10_volume=0.05)).astype(float)
+    with torch.no_grad():
+        large = gaussians.select(torch.arange(31, 40))
+        alpha = shown.rasterizer.render(large, camera, 0, torch.zeros(3)).alpha.numpy()
+    outside = (alpha == 0) & (plain.max(-1) < 255)  # brighter pixels were cut off
+    assert outside.any()
+    np.testing.assert_allclose(marked[outside], 0.35 * plain[outside], atol=1)
 
 
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04 no zip", b"no zip at all"])
