@@ -228,22 +228,14 @@ def explain_storage(error: BaseException, folder: Path) -> GsbenchError | None:
         return DiskFullError(
             f"the disk of {folder} is full: free some space, then give the same command again: it continues"
         )
-    if number == errno.EFBIG:
-        return InputError(
-            f"{place} may not grow any more ({os.strerror(number)}): raise `ulimit -f`, or set runs=FOLDER"
-        )
-    if number == errno.ENOLCK:
-        return InputError(
-            f"the file system of {place} has no locks ({os.strerror(number)}), so trials would disturb each other: "
-            "set runs=FOLDER or GSBENCH_RUNS to another file system, or start its lock service"
-        )
-    if number in BROKEN:
-        return InputError(
-            f"{place} cannot be opened ({os.strerror(number)}): look at its disk and its links, or set runs=FOLDER"
-        )
-    if number in FORBIDDEN:
-        return InputError(f"{place} cannot be written to ({os.strerror(number)}): set runs=FOLDER or GSBENCH_RUNS")
-    return None
+    faults = {
+        errno.EFBIG: "{0} may not grow any more ({1}): raise `ulimit -f`, or set runs=FOLDER",
+        errno.ENOLCK: "the file system of {0} has no locks ({1}), so trials would disturb each other: set runs=FOLDER "
+        "or GSBENCH_RUNS to another file system, or start its lock service",
+        **dict.fromkeys(BROKEN, "{0} cannot be opened ({1}): look at its disk and its links, or set runs=FOLDER"),
+        **dict.fromkeys(FORBIDDEN, "{0} cannot be written to ({1}): set runs=FOLDER or GSBENCH_RUNS"),
+    }
+    return InputError(faults[number].format(place, os.strerror(number))) if number in faults else None
 
 
 def _free(folder: Path) -> int:
