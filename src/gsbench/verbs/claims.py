@@ -28,7 +28,6 @@ from gsbench.launch.record import declare_questions
 from gsbench.launch.states import describe_plan
 from gsbench.runs.experiments import Question, read_declarations
 from gsbench.runs.layout import SEED
-from gsbench.settings import Switch
 from gsbench.verbs.arguments import ArgumentParser, names, path
 from gsbench.words import counted
 
@@ -207,13 +206,16 @@ def _above_zero(text: str) -> float:
 
 def ablate(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: the exit code says, as a sweep's does, whether a trial failed; raises InputError for bad input."""
+    from gsbench.pipeline.parts import Parts  # here, for a quick answer to --help
+
     options = _ablate_parser().parse_args(argv)
     settings = options.settings
     named = any(word.startswith(("name=", "+experiment=")) for word in settings)
     words = [*settings, *([] if named else [f"name={_default_name(settings)}"])]
     first = _trials(words)
     densify = _only_densifier(first)
-    declared = ablation.declared_switches(_class_switches(first[0]), first[0].values["densify"])
+    own = getattr(type(Parts(first[0].values).trainer), "SWITCHES", {})
+    declared = ablation.declared_switches(own, first[0].values["densify"])
     switches = ablation.choose_switches(declared, options.switches, densify)
     by_run = {
         run: _trials([*words, *_words(ablation.off_settings(run, switches), first[0])])
@@ -266,12 +268,6 @@ def _only_densifier(trials: Sequence[Trial]) -> str:
     if len({(trial.values["scene"]["name"], trial.values["seed"]) for trial in trials}) < len(trials):
         raise InputError("ablate: only scene and seed may list values")
     return str(trials[0].values["densify"]["name"])
-
-
-def _class_switches(trial: Trial) -> dict[str, Switch]:
-    from gsbench.pipeline.parts import Parts
-
-    return dict(getattr(type(Parts(trial.values).trainer), "SWITCHES", {}))
 
 
 def _words(settings: dict[str, Any], first: Trial) -> list[str]:

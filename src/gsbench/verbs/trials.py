@@ -4,6 +4,7 @@ import json
 import logging
 import os
 import time
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -90,22 +91,18 @@ def progress_with_superseded(home: Path) -> list[TrialState]:
 def lines_of(trials: list[TrialState], with_done: bool) -> list[str]:
     """A line for each trial that is not done (or for each, ``with_done``), and a summary."""
     lines = []
-    for state in ORDER:
-        if state == "done" and not with_done:
-            continue
-        for trial in trials:
-            if trial.state == state:
-                lines.append(f"{state:<8} {trial.label:<50} {_age(trial):>12}  {trial.note}".rstrip())
+    for trial in sorted(trials, key=lambda trial: ORDER.index(trial.state)):
+        if trial.state != "done" or with_done:
+            lines.append(f"{trial.state:<8} {trial.label:<50} {_age(trial):>12}  {trial.note}".rstrip())
     lines.append(summary_of(trials))
     return lines
 
 
 def summary_of(trials: list[TrialState]) -> str:
     """The number of trials in each state, in one line."""
-    counts = {state: sum(trial.state == state for trial in trials) for state in reversed(ORDER)}
-    return f"{counted(len(trials), 'trial')}: " + ", ".join(
-        f"{count} {state}" for state, count in counts.items() if count
-    )
+    counts: Counter[str] = Counter(trial.state for trial in trials)
+    texts = [f"{counts[state]} {state}" for state in reversed(ORDER) if counts[state]]
+    return f"{counted(len(trials), 'trial')}: {', '.join(texts)}"
 
 
 def _overview(runs: Path) -> int:

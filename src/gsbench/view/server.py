@@ -324,4 +324,4 @@ def refuse_other_pages() -> Iterator[None]:
     with mock.patch(SERVE, guarded):
         yield
     if not started:
-        raise GsbenchError("this version of viser cannot be kept from strange web pages: install viser 1.0 or 1.1")
+        raise GsbenchError("this version of viser cannot be kept from strange web pages: install viser 1.1")
