@@ -23,8 +23,9 @@ from gsbench.config.compose import Trial
 from gsbench.errors import GsbenchError
 from gsbench.launch.jobs import Outcome, outcome_of_error, outcome_of_results
 from gsbench.launch.record import add_to_plan, declare
-from gsbench.runs.experiments import Arm, TuningRecord, read_tuning
-from gsbench.runs.layout import CONFIG, RESULTS
+from gsbench.parsing import read_typed
+from gsbench.runs.experiments import Arm, TuningRecord
+from gsbench.runs.layout import CONFIG, RESULTS, TUNING
 from gsbench.runs.trial_record import record_from
 from hydra_plugins.gsbench import TUNE
 from tests.analysis.synthetic import Plan, trial_data, write_trial
@@ -114,7 +115,7 @@ def sweep(runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Sweep:
 
 
 def tuning(runs: Path, arm: str) -> TuningRecord:
-    return read_tuning(runs / f"fair-tune-random-{arm}")
+    return read_typed(runs / f"fair-tune-random-{arm}" / TUNING, TuningRecord)
 
 
 def chosen(runs: Path, arm: str) -> dict[str, Any]:

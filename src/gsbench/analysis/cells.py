@@ -42,10 +42,6 @@ class Cell:
     trials: tuple[TrialResult, ...]
     reason: str = ""
 
-    @property
-    def complete(self) -> bool:
-        return self.mean is not None and self.count == self.expected
-
 
 def field_value(trial: TrialResult, name: str) -> str:
     """A field of a trial, or a dotted key of its configuration, as text; a missing key counts as unset (null)."""

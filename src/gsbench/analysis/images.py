@@ -36,10 +36,10 @@ def texture_energy(image: Pixels) -> Array:
     return gaussian(rows**2 + columns**2, TEXTURE_SIGMA, mode="reflect", preserve_range=True)
 
 
-def read_ignored(trial: TrialResult, view: str) -> NDArray[np.bool_] | None:
-    """The pixels [H, W] of a test view that a mask ignores; None without a mask."""
+def read_counted(trial: TrialResult, view: str, shape: tuple[int, int]) -> NDArray[np.bool_]:
+    """The pixels [H, W] of a test view that count: all of the ``shape``, unless a mask ignores some."""
     path = trial.path / MASKS / f"{view}.png"
-    return ~read_mask(path) if path.is_file() else None
+    return read_mask(path) if path.is_file() else np.ones(shape, dtype=bool)
 
 
 def absolute_error(render: Pixels, truth: Pixels) -> Array:
@@ -67,9 +67,8 @@ def textured_error(trial: TrialResult) -> float:
     for view in view_names(trial):
         truth = read_image(trial.path / GROUND_TRUTH / f"{view}.png")
         texture = texture_energy(truth)  # [H, W]
-        ignored = read_ignored(trial, view)
-        counts = np.ones(texture.shape, dtype=bool) if ignored is None else ~ignored
-        inside = counts & (texture >= np.quantile(texture[counts], 1 - TEXTURED_SHARE))
+        counted = read_counted(trial, view, texture.shape)
+        inside = counted & (texture >= np.quantile(texture[counted], 1 - TEXTURED_SHARE))
         errors.append(float(absolute_error(read_image(trial.path / RENDERS / f"{view}.png"), truth)[inside].mean()))
     return float(np.mean(errors))
 
@@ -181,10 +180,7 @@ def _read(one: TrialResult, other: TrialResult, view: str) -> list[Pixels]:
     truth = read_image(one.path / GROUND_TRUTH / f"{view}.png")
     if not first.shape == second.shape == truth.shape:
         raise InputError(f"{one.label} and {other.label}: {view} has different sizes")
-    ignored = read_ignored(one, view)
-    images = [first, second, truth]
-    if ignored is None:
-        return images
-    rows, columns = np.indices(ignored.shape)
+    counted = read_counted(one, view, truth.shape[:2])
+    rows, columns = np.indices(counted.shape)
     stripes = np.where((rows + columns) % (2 * STRIPE) < STRIPE, *STRIPES).astype(np.uint8)  # [H, W]
-    return [np.where(ignored[..., None], stripes[..., None], image) for image in images]
+    return [np.where(counted[..., None], image, stripes[..., None]) for image in (first, second, truth)]

@@ -74,15 +74,21 @@ class Paper:
 
 @dataclass(frozen=True)
 class Published:
-    """Another paper's numbers; ``printed`` maps (scene, quantity) to the number of its method."""
+    """Another paper's numbers; ``scenes`` has the printed text of each of ``quantities`` for its method."""
 
     title: str
     source: str  # where the numbers were read
     conventions: str  # of the measurement, as far as the source states them
     densify: str  # gsbench's densifier of the paper's method
-    quantities: tuple[str, ...]
-    printed: Mapping[tuple[str, str], PrintedNumber]
+    quantities: Sequence[str]
+    scenes: Mapping[str, Sequence[str]]
     setup: Mapping[str, str]
+
+    @property
+    def printed(self) -> dict[tuple[str, str], PrintedNumber]:
+        """The printed numbers by scene and quantity."""
+        rows = ((scene, zip(self.quantities, texts, strict=True)) for scene, texts in self.scenes.items())
+        return {(scene, key): PrintedNumber(text) for scene, row in rows for key, text in row}
 
 
 @cache
@@ -113,15 +119,7 @@ def load_published(name: str) -> Published:
     names = published_names()
     if name not in names:
         raise InputError(f"no published numbers {name!r}{did_you_mean(name, names)} (there are: {', '.join(names)})")
-    content = _read(f"published/{name}.yaml")
-    quantities = tuple(content["quantities"])
-    printed = {
-        (scene, key): PrintedNumber(text)
-        for scene, texts in content["scenes"].items()
-        for key, text in zip(quantities, texts, strict=True)
-    }
-    title, source, conventions = (" ".join(content[key].split()) for key in ("title", "source", "conventions"))
-    return Published(title, source, conventions, content["densify"], quantities, printed, content["setup"])
+    return Published(**_read(f"published/{name}.yaml"))
 
 
 def _read(name: str) -> Any:
@@ -197,7 +195,7 @@ def published_table(trials: Sequence[TrialResult], name: str) -> Table:
     Raises InputError if no trial is of a scene of the paper, or if a cell would average unlike trials.
     """
     paper = load_published(name)
-    scenes = list(dict.fromkeys(scene for scene, _ in paper.printed))
+    scenes, printed = list(paper.scenes), paper.printed
     own = [trial for trial in trials if trial.scene in scenes]
     if not own:
         raise InputError(f"{name} has the scenes {', '.join(scenes)}, and no trial here is of one of them")
@@ -205,7 +203,7 @@ def published_table(trials: Sequence[TrialResult], name: str) -> Table:
     notes = [f"{paper.title}.", f"Read from {paper.source}.", f"Conventions: {paper.conventions}.", method]
 
     def find(scene: str, arm: Arm, key: str) -> PrintedNumber | None:
-        return paper.printed.get((scene, key))
+        return printed.get((scene, key))
 
     return _differences(f"Difference from {name}", name, own, scenes, paper.quantities, find, notes, paper.setup)
 

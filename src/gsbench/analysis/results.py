@@ -202,7 +202,7 @@ class TrialResult:
     @property
     def measured(self) -> float:
         """The Unix time at which the metrics were measured; if it is not recorded, that of the file."""
-        moment = None if self.record.measured is None else unix_time(self.record.measured)
+        moment = unix_time(self.record.measured)
         return self.finished if moment is None else moment
 
     @cached_property
@@ -264,8 +264,7 @@ class TrialResult:
         budget, events = self.record.budget, self.record.events
         if budget is None or not events:
             return True
-        is_steered = budget.cap == "governor"
-        return is_steered or budget.seconds is not None or events.get("blocked_by_cap") != 0
+        return budget.cap == "governor" or budget.seconds is not None or events.get("blocked_by_cap") != 0
 
 
 TrialPair = tuple[TrialResult, TrialResult]  # a trial of the baseline and one of the arm

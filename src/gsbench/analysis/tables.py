@@ -113,7 +113,7 @@ def format_cell(cell: Cell, quantity: Quantity) -> str:
     text = quantity.format(cell.mean)
     if cell.std is not None:
         text += f" ± {quantity.format(cell.std)}"
-    return text if cell.complete else f"{text} ({cell.count}/{cell.expected})"
+    return text if cell.count == cell.expected else f"{text} ({cell.count}/{cell.expected})"
 
 
 def _rows(

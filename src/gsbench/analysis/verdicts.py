@@ -267,16 +267,20 @@ def in_words(verdict: Verdict) -> str:
 
 
 def like_these_words(verdict: Verdict, words: Mapping[Outcome, str], what: str) -> str:
-    """``scenes like these: undecided; it helps in 7 of 8 (sign test p 0.070, …)``; "" with too few scenes."""
+    """``scenes like these: undecided; it helps in 7 of 8 (sign test p 0.070, …)``; "" with too few scenes.
+
+    ``words`` are other words for outcomes.
+    """
     like = verdict.like_these
     if like is None:
         return ""
+    word = words.get(like.outcome, like.outcome)
     least = "" if like.beyond is None else f", by the least that matters in {like.beyond}"
     median = "" if like.median is None else f"; median effect {verdict.shown_interval(like.median)}"
     needed = "no number of them would" if like.needed is None else f"{like.needed} of them would"
     seen = f", which {100 * like.power():.0f} % of sweeps see where nine of ten do" if like.needed else ""
     return (
-        f"scenes like these: {words[like.outcome]}; {what} in {like.helped} of {like.scenes}{least} (sign test p "
+        f"scenes like these: {word}; {what} in {like.helped} of {like.scenes}{least} (sign test p "
         f"{p_text(like.p)}, {100 * like.share.low:.0f} to {100 * like.share.high:.0f} % of such scenes{median}); "
         f"{needed} suffice at {100 * (1 - like.level):.3g} %{seen}"
     )

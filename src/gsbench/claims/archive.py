@@ -133,7 +133,10 @@ def unpack_archive(file: Path, runs: Path) -> Experiment:
     """
     try:
         manifest, contents = _read(file)
-        home = runs / _checked_name(manifest["experiment"])
+        name = manifest["experiment"]
+        if not isinstance(name, str) or not is_folder_name(name):
+            raise InputError(f"{name!r} cannot be the name of an experiment")
+        home = runs / name
         trials = [(_checked_folder(line["folder"]), line["results"]) for line in _lines(contents[TRIALS])]
         _unpack(home, trials, contents)
     except InputError as error:
@@ -182,7 +185,7 @@ def _read(file: Path) -> tuple[dict[str, Any], dict[str, bytes]]:
     except FileNotFoundError:
         raise InputError("no such file") from None
     except IsADirectoryError:
-        raise InputError("it is a folder: give an archive, or a folder of nerfbaselines' result files") from None
+        raise InputError("it is a folder: give an archive") from None
     except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise InputError(f"its {MANIFEST} is not JSON ({error})") from None
     except (OSError, zipfile.BadZipFile, zlib.error, LZMAError, EOFError, NotImplementedError, RuntimeError) as error:
@@ -255,12 +258,6 @@ def _unpack_picture(home: Path, name: str, content: bytes) -> None:
 def _folder(trial: TrialResult) -> str:
     """A trial's folder within its experiment."""
     return "/".join(trial.path.parts[-3:])
-
-
-def _checked_name(name: object) -> str:
-    if not isinstance(name, str) or not is_folder_name(name):
-        raise InputError(f"{name!r} cannot be the name of an experiment")
-    return name
 
 
 def _checked_folder(folder: object) -> str:

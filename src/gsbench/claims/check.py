@@ -7,7 +7,6 @@ the same verdicts. A published archive gives the same verdicts without any train
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import get_args
 
 from gsbench.analysis.cells import with_variants
 from gsbench.analysis.fairness import caveats, fairness_table
@@ -16,7 +15,7 @@ from gsbench.analysis.pairing import Pairs
 from gsbench.analysis.quantities import asked_quantity
 from gsbench.analysis.report.charts import ForestRow, forest_plot
 from gsbench.analysis.results import TrialResult, group_by, read_experiment, seeds_words
-from gsbench.analysis.statistics import SUPPORTED, TOO_SMALL, Outcome, plan_looks
+from gsbench.analysis.statistics import SUPPORTED, TOO_SMALL, plan_looks
 from gsbench.analysis.table_formats import Table, fill
 from gsbench.analysis.tables import cloud_notes, machine_notes
 from gsbench.analysis.verdicts import like_these_words, outlying_words
@@ -34,7 +33,6 @@ from gsbench.words import counted, some_of, without_folders
 FindMissing = Callable[[Sequence[Trial]], Sequence[str]]  # a line for each thing that these trials need and lack
 NOT_TESTABLE = "not testable here"
 LARGE = 1000.0  # numbers from here on are counts or seconds, shown without decimals
-OUTCOMES: dict[Outcome, str] = {word: word for word in get_args(Outcome)}
 SYMBOLS = {"supported": "✔", "refuted": "✘", "too small to matter": "≈", "undecided": "?", NOT_TESTABLE: "–"}
 
 
@@ -209,9 +207,8 @@ def _check_same_claims(file: ClaimsFile, declaration: Declaration) -> None:
                     f"claim {claim.id}: its {what} was {getattr(before, what)} when it was declared "
                     f"({declaration.when}), and is {getattr(in_file, what)} in the file: use the file as it was then"
                 )
-        if (claim.baseline, claim.arm) != tuple(
-            arm.densify for arm in (before.baseline, before.arm) if arm is not None
-        ):
+        arms = [arm.densify for arm in (before.baseline, before.arm) if arm is not None]
+        if arms != [claim.baseline, claim.arm]:
             raise InputError(
                 f"claim {claim.id}: other arms were declared ({declaration.when}): use the file as it was then"
             )
@@ -260,18 +257,15 @@ def make_page(
     """
     counts = {word: sum(verdict.word == word for verdict in verdicts) for word in SYMBOLS}
     tested = sum(one.word != NOT_TESTABLE for one in verdicts)
-    lines = [
-        f"{file.paper}. " + ", ".join(f"{count} {word}" for word, count in counts.items() if count) + ".",
-        _declared_line(declared, declarations),
-    ]
+    lines = [f"{file.paper}. " + ", ".join(f"{count} {word}" for word, count in counts.items() if count) + "."]
     if tested:
         which = "the verdict" if tested == 1 else f"any of the {tested} verdicts"
-        lines.insert(
-            1,
+        lines.append(
             f"The chance that {which} is false is at most {100 * file.error_rate:g} %, over all looks, if trainings "
             "differ about normally (docs/verdict.md). A verdict is about these scenes at this size. From six scenes on "
             "there is also a statement about scenes like these, with its own error rate.",
         )
+    lines.append(_declared_line(declared, declarations))
     judged = list({trial.path: trial for one in verdicts for trial in one.verdict.pairs.trials}.values())
     lines += [f"The paper: {file.size}."] if file.size else []
     lines += [*machine_notes(judged), *cloud_notes(judged)]
@@ -331,7 +325,7 @@ def _judged_on(one: ClaimVerdict) -> str:
 def _like_these(one: ClaimVerdict) -> str:
     """The statement about scenes like these; "" with too few scenes."""
     word = one.claim.direction if one.claim.sign else "higher"
-    return like_these_words(one.verdict, OUTCOMES, f"it is {word}")
+    return like_these_words(one.verdict, {}, f"it is {word}")
 
 
 def _late_words(one: ClaimVerdict) -> str:

@@ -14,9 +14,9 @@ from pydantic import Field
 
 from gsbench.errors import InputError
 from gsbench.files import require_no_links
-from gsbench.parsing import STRICT, Amount, Count, Number, Record, Text, Whole, read_typed
+from gsbench.parsing import STRICT, Amount, Count, Number, Record, Text, Whole
 from gsbench.runs.keys import sha256_of
-from gsbench.runs.layout import DECLARED, IN_RUNS, TUNING
+from gsbench.runs.layout import DECLARED, IN_RUNS
 from gsbench.runs.trial_record import Declared, read_rows
 
 log = logging.getLogger(__name__)
@@ -108,11 +108,6 @@ class TuningRecord(Record):
         """The (first) point with the best value; None if no point has a value."""
         done = [point for point in self.points if point.value is not None]
         return max(done, key=lambda point: self.direction * (point.value or 0.0), default=None)
-
-
-def read_tuning(home: Path) -> TuningRecord:
-    """The search of the experiment in ``home``; raises FileNotFoundError and DamagedError."""
-    return read_typed(home / TUNING, TuningRecord)
 
 
 # ---- the questions that were declared for an experiment before its trials ran: ``<runs>/<experiment>/declared.jsonl``
