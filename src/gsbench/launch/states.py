@@ -5,16 +5,15 @@ A file in a trial's folder names its Slurm job.
 
 from __future__ import annotations
 
-import json
 import subprocess
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import compress
 from pathlib import Path
+from statistics import fmean
 from typing import Annotated, Any, Literal
 
-import numpy as np
 import psutil
 from pydantic import Field
 
@@ -24,7 +23,7 @@ from gsbench.files import write_json
 from gsbench.launch.record import read_plan
 from gsbench.parsing import DamagedError, Record, read_if_sound
 from gsbench.runs.experiments import trial_folders
-from gsbench.runs.keys import determining_settings
+from gsbench.runs.keys import determining_settings, sha256_of
 from gsbench.runs.layout import CONFIG, FAILED, LOCK, RESULTS, SEED, SUBMITTED, TRIAL_GLOB
 from gsbench.runs.trial_folder import State, TrialFolder
 from gsbench.system.locks import read_holder
@@ -228,9 +227,6 @@ def current_user() -> str:
 # ---- a dry run: all finished trials are read once, so that ten thousand planned ones can be compared with them
 
 STATES = ("done", "partial", "missing", "running", "queued", "failed", "damaged")  # in the order of a summary
-# The fields (scene, init, densify) that a finished trial must share with the estimated one; the most similar first.
-SHARED = ((True, True, True), (True, False, True), (True, False, False), (False, False, True), (False, False, False))
-SIZE_SETTINGS = ("name", "path", "width", "height", "downscale", "max_size")  # of a scene: they determine its pixels
 
 
 class FinishedTrials:
@@ -238,29 +234,18 @@ class FinishedTrials:
 
     def __init__(self, runs: Path) -> None:
         self._folders: dict[str, list[Path]] = defaultdict(list)
-        # By rasterizer, SHARED and shared names: the number of trials, and the sums of their times for training (s per
-        # iteration and pixel) and evaluation (s per pixel).
-        self._times: dict[tuple[object, ...], Any] = defaultdict(lambda: np.zeros(3))
-        self._pixels: dict[str, int] = {}  # pixels of a view by `_size_key`
+        self._seconds: dict[str, list[float]] = defaultdict(list)  # for an iteration, by `_similarities`
         for path in runs.glob(f"*/{TRIAL_GLOB}/{RESULTS}"):
             files = TrialFolder(path.parent)
             record = files.sound_record()
             if record is None:
                 continue
             self._folders[path.parent.name].append(path.parent)
-            try:
-                settings = files.settings()
-                raster = settings["raster"]["name"]
-                size = _size_key(settings["scene"])
-            except (FileNotFoundError, DamagedError, KeyError, TypeError, AttributeError):
-                continue
-            if not record.iterations or record.resolution is None:
-                continue
-            self._pixels[size] = pixels = max(1, record.resolution[0] * record.resolution[1])
-            train, evaluate = (record.seconds.get(step, 0.0) / pixels for step in ("train", "evaluate"))
-            for shared in SHARED:
-                names = compress((record.scene, record.init, record.densify), shared)
-                self._times[raster, shared, *names] += (1, train / record.iterations, evaluate)
+            if record.iterations:
+                seconds = sum(record.seconds.get(step, 0.0) for step in ("train", "evaluate"))
+                with suppress(FileNotFoundError, DamagedError, KeyError, TypeError):
+                    for similarity in _similarities(files.settings()):
+                        self._seconds[similarity].append(seconds / record.iterations)
 
     def elsewhere(self, trial: TrialFolder) -> str | None:
         """Another experiment that has finished the same trial, so that its stages are reused; None if there is none."""
@@ -270,27 +255,19 @@ class FinishedTrials:
     def estimate(self, values: Mapping[str, Any]) -> tuple[float, int]:
         """Seconds for the whole trial with ``values``, and the number of finished trials that this is known from.
 
-        These are the most similar ones with its rasterizer. Times are taken per iteration and pixel. There is no
-        estimate, ``(0, 0)``, for photographs that no trial has read, since their size is unknown.
+        These have the same scene at the same size, the same rasterizer and, if possible, the same densifier. Times are
+        taken per iteration. Without such trials there is no estimate, ``(0, 0)``.
         """
-        names = tuple(values[group]["name"] for group in ("scene", "init", "densify"))
-        scene = values["scene"]
-        pixels = self._pixels.get(_size_key(scene))
-        if pixels is None and scene["kind"] == "courtyard":
-            longest = max(scene["width"], scene["height"])
-            scale = min(1.0, (scene["max_size"] or longest) / longest)
-            pixels = int(scene["width"] * scene["height"] * (scale / scene["downscale"]) ** 2)
-        for shared in SHARED:
-            times = self._times.get((values["raster"]["name"], shared, *compress(names, shared)))
-            if times is not None and pixels is not None:
-                count, train, evaluate = map(float, times)
-                seconds = pixels * (train * values["train"]["iterations"] + evaluate)
-                return seconds / count, int(count)
+        for similarity in _similarities(values):
+            if seconds := self._seconds.get(similarity):
+                return fmean(seconds) * values["train"]["iterations"], len(seconds)
         return 0.0, 0
 
 
-def _size_key(scene: Mapping[str, Any]) -> str:
-    return json.dumps({name: scene.get(name) for name in SIZE_SETTINGS})
+def _similarities(settings: Mapping[str, Any]) -> tuple[str, str]:
+    """What trials with similar times have in common: scene, rasterizer and densifier; scene and rasterizer."""
+    shared = [settings["scene"], settings["raster"]["name"]]
+    return sha256_of([*shared, settings["densify"]["name"]]), sha256_of(shared)
 
 
 def describe_plan(trials: Sequence[Trial], parallel: int = 1) -> list[str]:
@@ -324,7 +301,7 @@ def describe_plan(trials: Sequence[Trial], parallel: int = 1) -> list[str]:
     if counts["done"] == len(trials):
         return lines
     if without_estimate:
-        time = "no estimate: no finished trial with this rasterizer and picture size tells how long one takes here"
+        time = "no estimate: no finished trial of this scene with this rasterizer tells how long one takes here"
     elif learned_from == 0:
         time = "seconds, since other experiments have the results"
     else:
