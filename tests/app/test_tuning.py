@@ -145,8 +145,6 @@ def test_each_arm_gets_the_same_points_on_validation_views_and_the_sweep_gets_th
         assert not any(one["scene"]["validation"] for one in own)
     assert all(isinstance(one.values["densify"]["stop"], int) for one in fake.tuning("volumetric"))
     assert fake.tuning("adc")[0].values["densify"]["gradient_threshold"] == 0.0002  # the arm as it is comes first
-    assert tuning(runs, "adc").as_it_is
-    assert not tuning(runs, "volumetric").as_it_is  # its stop is beyond
 
 
 @pytest.mark.parametrize("stops", [3, 9])  # in the search, and in the sweep

@@ -10,8 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from gsbench.bench import run_bench
-from gsbench.bench.measure import Setting, Stepper
+from gsbench.bench.measure import Setting, Stepper, run_bench
 from gsbench.bench.scenes import (
     SCENES,
     camera_before,

@@ -133,7 +133,7 @@ def write_original(runs: Path) -> dict[str, Path]:
     (home / "declared.jsonl").write_text("".join(json.dumps(line) + "\n" for line in declared))
     tuning = {
         "sweep": home.name, "arm": "sfm-volumetric", "metric": "psnr", "direction": 1, "wanted": 3, "seeds": [100],
-        "scenes": ["courtyard"], "ranges": {"densify.volume_threshold": "0.01,0.03"}, "log": [], "as_it_is": True,
+        "scenes": ["courtyard"], "ranges": {"densify.volume_threshold": "0.01,0.03"}, "log": [],
         "points": [{"settings": {"densify.volume_threshold": 0.03}, "value": 20.0}],
     }  # fmt: skip
     (home / "tuning.json").write_text(json.dumps(tuning))

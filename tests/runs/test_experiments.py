@@ -9,10 +9,11 @@ from typing import Any
 import pytest
 
 from gsbench.errors import InputError
-from gsbench.parsing import DamagedError
+from gsbench.parsing import DamagedError, read_typed
 from gsbench.runs.experiments import (
     Declaration,
     Question,
+    TuningRecord,
     experiment_home,
     latest_declaration,
     list_experiments,
@@ -20,7 +21,6 @@ from gsbench.runs.experiments import (
     merge_planned,
     open_question,
     read_declarations,
-    read_tuning,
     record_text,
     trial_folders,
 )
@@ -29,7 +29,7 @@ from gsbench.runs.trial_record import Declared
 POINTS = [{"settings": {"x": 0.5}, "value": 2.0}, {"settings": {"x": 1}, "value": 4.0}]
 TUNING = {
     "sweep": "s", "arm": "sfm-adc", "metric": "psnr", "direction": 1, "wanted": 3, "seeds": [0], "scenes": ["garden"],
-    "ranges": {"x": "0,1"}, "log": ["x"], "as_it_is": False, "points": [*POINTS, {"settings": {}, "value": None}],
+    "ranges": {"x": "0,1"}, "log": ["x"], "points": [*POINTS, {"settings": {}, "value": None}],
 }  # fmt: skip
 
 
@@ -57,7 +57,7 @@ def test_the_folder_of_an_experiment_is_made_but_no_link(tmp_path: Path) -> None
 
 def tuning(tmp_path: Path, **changes: Any) -> Any:
     (tmp_path / "tuning.json").write_text(json.dumps(TUNING | changes))
-    return read_tuning(tmp_path)
+    return read_typed(tmp_path / "tuning.json", TuningRecord)
 
 
 def test_the_best_point_is_the_one_with_the_best_value(tmp_path: Path) -> None:

@@ -38,6 +38,7 @@ from gsbench.runs.keys import (
     user_modules,
 )
 from gsbench.system.own_modules import allow_modules, allowed_modules
+from tests.conftest import script
 from tests.test_architecture import modules, reached
 
 SOURCE = '"""A module."""\nX = 0.8  # weight\n\n\ndef loss(a):\n    """The loss."""\n    return X * a\n'
@@ -144,7 +145,7 @@ def test_an_edit_is_seen_by_the_next_process_and_a_comment_is_not(package: Path)
 
 def test_where_all_is_as_released_nothing_is_in_the_key(package: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert edited(states_of(ROOMS["train"])) == states_of(ROOMS["train"])  # before the first release
-    keys.main()
+    script("released").main()
     again()
     with monkeypatch.context() as patch:
         patch.setattr(keys, "syntax_of", lambda source: pytest.fail("a released room is parsed"))
@@ -156,7 +157,9 @@ def test_where_all_is_as_released_nothing_is_in_the_key(package: Path, monkeypat
     (package / "eval" / "ssim.py").write_text("C1 = 2\n")
     again()
     assert list(edited(states_of(ROOMS["train"]))) == changed_rooms(released) == ["eval/ssim.py"]
-    keys.main()  # of the next release, where the version of the stage is bumped by hand, or the numbers are the same
+    script(
+        "released"
+    ).main()  # of the next release, where the version of the stage is bumped by hand, or the numbers are the same
     again()
     assert changed_rooms(released) == []
 

@@ -161,7 +161,6 @@ def run_app(words: Sequence[str], multirun: bool, task: TrialTask) -> None:
         raise InputError(f"{swept[0]} lists several values: add -m to run one trial for each")
     with compose.explained(words):
         check_sweep_settings(config, multirun)
-        check_launcher(config, multirun)
     task.allowed = tuple(config[PERMISSIONS])
     task.grids = OmegaConf.to_container(config.hydra.sweeper, resolve=False).get("grids")  # type: ignore[union-attr]
     # The grids are taken out: Hydra would resolve their ${…} when it makes the sweeper, before each trial's values.
@@ -184,7 +183,7 @@ def list_trials(trials: Sequence[Trial]) -> list[Outcome]:
 
 
 def check_sweep_settings(config: DictConfig, multirun: bool) -> None:
-    """Refuse settings of a sweep without a sweep, and parameters of a sweep that are no mapping."""
+    """Refuse settings of a sweep without a sweep, parameters that are no mapping, and a second launcher."""
     sweeper = config.hydra.sweeper
     params = sweeper.get("params")
     if not multirun and config.hydra.mode is None and (params or sweeper.get("grids")):
@@ -193,16 +192,10 @@ def check_sweep_settings(config: DictConfig, multirun: bool) -> None:
         raise InputError(f"hydra.sweeper.params={params} must map settings to values; seed=0,1 can be typed itself")
     if config.launch.stop_when_decided and not multirun:
         raise InputError("launch.stop_when_decided adds seeds to a sweep: add -m, two densifiers and seed=0,1,2,3")
-
-
-def check_launcher(config: DictConfig, multirun: bool) -> None:
-    """Refuse another launcher than gsbench's without a sweep, or beside a launcher that ``launch`` names."""
     launcher = config.hydra.runtime.choices["hydra/launcher"]
-    if launcher == OWN_LAUNCHER:
-        return
-    if not multirun:
+    if launcher != OWN_LAUNCHER and not multirun:
         raise InputError(f"hydra/launcher={launcher} launches sweeps: add -m, or leave it out")
-    if config.launch.name != "serial":
+    if launcher != OWN_LAUNCHER and config.launch.name != "serial":
         raise InputError(f"hydra/launcher={launcher} and launch={config.launch.name} are two launchers: choose one")
 
 

@@ -260,7 +260,6 @@ def _plan(
             scenes=list(dict.fromkeys(trial.values["scene"]["name"] for trial in trials)),
             ranges={key: str(interval.input_line).partition("=")[2] for key, interval in arm_intervals.items()},
             log=[key for key, values in ranges.items() if getattr(values, "log", False)],
-            as_it_is=first is not None,
             points=[],
         )
         own_home = home.with_name(f"{home.name}-tune-{arm}")

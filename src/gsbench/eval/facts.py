@@ -28,7 +28,6 @@ class MetricFacts:
     worthwhile: PositiveFloat | None = (
         None  # the smallest difference worth resolving, about what papers claim as improvements
     )
-    perceptual: bool = False  # meant to agree with human vision
     setting: str = ""  # the setting that requests it; empty: it is always computed
     lowest: float | None = None  # lower bound of its values; None: none or unknown
     highest: float | None = None  # upper bound
@@ -41,25 +40,23 @@ class MetricFacts:
 
 
 def _lpips(variant: str, label: str, words: str) -> MetricFacts:
-    return MetricFacts(f"{LPIPS}{variant}", label, -1, 3, "", 0.005, True, "eval.lpips", 0.0, words=words)
+    return MetricFacts(f"{LPIPS}{variant}", label, -1, 3, "", 0.005, "eval.lpips", 0.0, words=words)
 
 
 def _structural(key: str, label: str, direction: Literal[-1, 1], highest: float, words: str) -> MetricFacts:
     """A metric of structure without weights, computed if ``eval.more`` names it."""
-    return MetricFacts(key, label, direction, 4, "", 0.002, True, MORE, 0.0, highest, words)
+    return MetricFacts(key, label, direction, 4, "", 0.002, MORE, 0.0, highest, words)
 
 
 METRICS = (  # `gsbench.eval.evaluator.MEASURES` has the class of each
     MetricFacts("psnr", "PSNR", 1, 2, "dB", 0.1, lowest=0.0, words="mean squared error, logarithmic"),
-    MetricFacts(
-        "ssim", "SSIM", 1, 3, "", 0.005, False, "", -1.0, 1.0, "means, contrast and structure in windows of 11 px"
-    ),
+    MetricFacts("ssim", "SSIM", 1, 3, "", 0.005, "", -1.0, 1.0, "means, contrast and structure in windows of 11 px"),
     _lpips("vgg_raw", "LPIPS VGG raw", "distance of what vgg sees, fed [0, 1]"),
     _lpips("vgg", "LPIPS VGG", "distance of what vgg sees"),
     _lpips("alex", "LPIPS Alex", "distance of what alex sees"),
     _lpips("squeeze", "LPIPS Squeeze", "distance of what squeeze sees"),
     MetricFacts(
-        "flip", "FLIP", -1, 3, "", 0.005, True, "eval.flip", 0.0, 1.0, "difference one sees when two images alternate"
+        "flip", "FLIP", -1, 3, "", 0.005, "eval.flip", 0.0, 1.0, "difference one sees when two images alternate"
     ),
     _structural("ms_ssim", "MS-SSIM", 1, 1.0, "SSIM's structure at five scales"),
     _structural("iw_ssim", "IW-SSIM", 1, 1.0, "the same, weighted by the information that a place carries"),
@@ -68,7 +65,7 @@ METRICS = (  # `gsbench.eval.evaluator.MEASURES` has the class of each
 )
 # A fact about the trained model instead of its pictures, measured separately in the evaluation.
 FPS = MetricFacts(
-    "fps", "speed", 1, 2, "frames/s", None, False, "eval.fps", 0.0, words="renders of the test views at one size"
+    "fps", "speed", 1, 2, "frames/s", None, "eval.fps", 0.0, words="renders of the test views at one size"
 )
 ALL = (*METRICS, FPS)  # in the order of tables
 

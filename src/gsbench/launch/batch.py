@@ -34,14 +34,12 @@ def run_batch(trials: Sequence[Trial]) -> list[Outcome]:
             raise InputError("; ".join(missing))
         outcomes, unfinished = _skip_finished(trials)
         _begin(trials, unfinished)
-        return outcomes + (_run(unfinished, launcher) if unfinished else [])
-
-
-def _run(trials: Sequence[Trial], launcher: str) -> list[Outcome]:
-    if launcher == "slurm":
-        return run_slurm(trials)
-    with Mirror() as mirror:
-        return (run_serial if launcher == "serial" else run_local)(trials, mirror)
+        if unfinished and launcher == "slurm":
+            outcomes += run_slurm(unfinished)
+        elif unfinished:
+            with Mirror() as mirror:
+                outcomes += (run_serial if launcher == "serial" else run_local)(unfinished, mirror)
+        return outcomes
 
 
 def begin_for_another_launcher(trials: Sequence[Trial]) -> None:

@@ -101,7 +101,7 @@ def _state(folder: Path, planned: float | None, queue: Queue | None) -> TrialSta
         since, process = (None, "process ? on ?") if holder is None else (holder.since, holder.description)
         return TrialState(folder, state, since, f"{_progress(folder)} {process}".strip())
     if state == "damaged":
-        return TrialState(folder, state, _changed(folder / RESULTS), _damage(folder))
+        return TrialState(folder, state, _changed(folder / RESULTS), TrialFolder(folder).why_not_done({}))
     submission = read_submission(folder)
     lost = ""
     if submission:
@@ -116,14 +116,6 @@ def _state(folder: Path, planned: float | None, queue: Queue | None) -> TrialSta
     if state == "partial":
         return TrialState(folder, state, _changed(folder / CONFIG), f"stopped {_progress(folder)}".strip() + lost)
     return TrialState(folder, state, planned, "never started" + lost)
-
-
-def _damage(folder: Path) -> str:
-    try:
-        TrialFolder(folder).record()
-    except (FileNotFoundError, DamagedError) as error:
-        return f"{error.path.name} {error.reason}" if isinstance(error, DamagedError) else ""
-    return ""
 
 
 def _progress(folder: Path) -> str:

@@ -80,8 +80,7 @@ class TuningRecord(Record):
     """The search for the settings of ``arm`` (INIT-DENSIFY), which the experiment ``sweep`` then trains.
 
     ``ranges`` are the searched ranges as given, those in ``log`` on a logarithmic scale. ``wanted`` is the number of
-    points, each judged by trials of ``seeds`` on validation views of ``scenes``. ``as_it_is`` says whether the first
-    point has the arm's own settings.
+    points, each judged by trials of ``seeds`` on validation views of ``scenes``.
     """
 
     sweep: Text
@@ -93,7 +92,6 @@ class TuningRecord(Record):
     scenes: list[str]
     ranges: dict[str, str]
     log: list[str]
-    as_it_is: bool
     points: list[SearchPoint]
 
     def __post_init__(self) -> None:

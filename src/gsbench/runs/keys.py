@@ -22,7 +22,6 @@ from pathlib import Path
 from typing import Any
 
 from gsbench.errors import InputError
-from gsbench.files import write_json
 from gsbench.parsing import DamagedError, read_json
 from gsbench.settings import option_fields
 
@@ -296,14 +295,11 @@ def syntax_of(source: bytes) -> bytes:
     return ast.dump(tree).encode("utf-8", "surrogatepass")
 
 
-def main() -> None:
-    """Write ``released.json`` with the digests of all rooms (docs/releasing.md)."""
-    digests = {}
-    for room in sorted({room for rooms in ROOMS.values() for room in rooms}):
-        contents = _contents(room)
-        syntax = {name: syntax_of(content) for name, content in contents.items()}
-        digests[room] = {"bytes": _digest(contents), "syntax": _digest(syntax)}
-    write_json(PACKAGE / RELEASED, digests)
+def room_digests(room: str) -> dict[str, str]:
+    """The digests of a room's files, and of their syntax, as `RELEASED` records them for each room."""
+    contents = _contents(room)
+    syntax = {name: syntax_of(content) for name, content in contents.items()}
+    return {"bytes": _digest(contents), "syntax": _digest(syntax)}
 
 
 # ---- the user's code
@@ -408,7 +404,3 @@ def _is_installed(spec: ModuleSpec) -> bool:
         path is None or INSTALLED & set(Path(path).parts) or any(Path(path).is_relative_to(one) for one in library)
         for path in paths
     )
-
-
-if __name__ == "__main__":
-    main()

@@ -184,7 +184,7 @@ def bench(argv: Sequence[str], _runs: Path | None = None) -> int:
         raise InputError(f"--raster {AUTO} is a choice among executors: name those to time")
     allow_modules([raster for raster in rasters if "." in raster])  # the user typed them, which allows them
 
-    from gsbench.bench import run_bench
+    from gsbench.bench.measure import run_bench
 
     rows = run_bench(
         rasters, sizes, counts, options.ply, options.repeats, options.threads, not options.no_memory, options.scene
