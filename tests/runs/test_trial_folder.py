@@ -251,5 +251,6 @@ def test_a_metric_that_can_be_computed_by_now_is_a_reason(trial: Path) -> None:
     assert (folder.why_not_done(values, unavailable), asked) == ("", [values["eval"]])
     folder.write_finished(values, replace(record, awaited=["lpips_vgg", "flip"]))
     assert folder.why_not_done(values, unavailable) == "it lacks lpips_vgg, which can be computed now"
+    assert folder.why_not_done(values) == "it lacks lpips_vgg, flip"
     (trial / "results.json").unlink()
     assert folder.why_not_done(values) == "results.json is not there, or not complete"

@@ -242,14 +242,13 @@ class TrialFolder:
         return before is not None
 
     def why_not_done(
-        self,
-        values: dict[str, Any],
-        unavailable_now: Callable[[dict[str, Any]], Collection[str]] = lambda options: (),
+        self, values: dict[str, Any], unavailable_now: Callable[[dict[str, Any]], Collection[str]] | None = None
     ) -> str:
         """The reason to run or check the trial with the resolved configuration ``values``; "" if it is done.
 
         It is done if none of its inputs has changed. If it lacks a metric whose weights or packages were missing, it is
-        done only if ``unavailable_now``, called with the ``eval`` settings, still contains that metric.
+        done only if ``unavailable_now``, called with the ``eval`` settings, still contains that metric. Without
+        ``unavailable_now``, it is not known whether the metric can be computed, so the trial is to be checked.
         """
         try:
             record, made_of = self.record(), self.made_of()
@@ -263,6 +262,8 @@ class TrialFolder:
             return change
         if not record.awaited:  # asking loads torch
             return ""
+        if unavailable_now is None:
+            return f"it lacks {', '.join(record.awaited)}"
         available = sorted(set(record.awaited) - set(unavailable_now(values["eval"])))
         return f"it lacks {', '.join(available)}, which can be computed now" if available else ""
 

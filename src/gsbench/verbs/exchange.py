@@ -129,13 +129,16 @@ def check_form(out: Path) -> None:
 def export_init(entry: Path, out: Path) -> None:
     """Copy the COLMAP model of the stage result ``entry`` to `MODEL_FOLDER` of ``out``, as 3DGS trainers read it.
 
-    Raises FileExistsError if ``out`` has a model.
+    Raises InputError if ``out`` has a folder of models.
     """
     from gsbench.init.base import MODEL_FOLDER
 
     model = entry / MODEL_FOLDER
     if not model.is_dir():
         raise InputError(f"the initial model is no longer in the store ({model}): run the trial again")
+    first = out / MODEL_FOLDER.parts[0]
+    if first.exists():
+        raise InputError(f"{first} exists already: give another --out")
     shutil.copytree(model, out / MODEL_FOLDER)
 
 
