@@ -22,7 +22,7 @@ from gsbench.init.colmap.database import (
 from gsbench.init.colmap.mapping import map_images
 from gsbench.init.colmap.reconstruct import verification_options
 from gsbench.init.colmap.sift import extract_sift, match_sift
-from gsbench.init.networks.extract_and_match import build_extractor, extract_features
+from gsbench.init.networks.extract_and_match import EXTRACTORS, extract_features
 from gsbench.init.networks.features import Features, FeatureSettings
 from gsbench.logs import no_progress
 from gsbench.scene.types import Capture
@@ -82,7 +82,7 @@ def test_kornia_keypoints_coincide_with_colmaps(
     name = bare_photos.image_names[0]
     with pycolmap.Database.open(own_path[0]) as database:
         colmap = database.read_keypoints(database.read_image_with_name(name).image_id)[:, :2]
-    extractor = build_extractor(SIFT, None, torch.device("cpu"))
+    extractor = EXTRACTORS[SIFT.extractor](SIFT, None, torch.device("cpu"))
     features = extract_features(bare_photos.images / name, extractor, max_image_size, 2000, torch.device("cpu"))
     assert features.network_size == (max_image_size, round(max_image_size * 0.75))
     ours = features.colmap_keypoints
@@ -99,7 +99,7 @@ def test_a_blob_is_found_at_its_centre(tmp_path: Path, center: tuple[float, floa
     x, y = np.meshgrid(np.arange(100) + 0.5, np.arange(80) + 0.5)
     blob = 40 + 200 * np.exp(-((x - center[0]) ** 2 + (y - center[1]) ** 2) / (2 * 4.0**2))
     Image.fromarray(np.repeat(blob[..., None], 3, axis=2).round().astype(np.uint8)).save(tmp_path / "blob.png")
-    extractor = build_extractor(SIFT, None, torch.device("cpu"))
+    extractor = EXTRACTORS[SIFT.extractor](SIFT, None, torch.device("cpu"))
     features = extract_features(tmp_path / "blob.png", extractor, 1600, 10, torch.device("cpu"))
     np.testing.assert_allclose(features.colmap_keypoints[0], center, atol=0.05)
 

@@ -73,7 +73,7 @@ def functions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
 
 
 def test_result_comes_back_from_another_process(functions):
-    assert run_isolated(functions.add, 1, 2, scale=3) == 9
+    assert run_isolated(functions.add, 1, 2, 3) == 9
     array = np.arange(1_000_000.0).reshape(1000, 1000)
     doubled, pid = run_isolated(functions.double, array)
     assert pid != os.getpid()

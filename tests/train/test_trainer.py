@@ -26,7 +26,7 @@ from gsbench.train import trainer
 from gsbench.train.checkpoint import CheckpointWriter
 from gsbench.train.options import TrainConfig
 from gsbench.train.trainer import Status, Trainer, snapshot_file
-from gsbench.train.views import STREAMS, CameraOrder, generator, generators
+from gsbench.train.views import STREAMS, CameraOrder, generators
 
 CPU = torch.device("cpu")
 
@@ -254,7 +254,7 @@ def test_as_on_a_device_that_is_behind(
 
 
 def test_every_view_is_used_once_before_any_is_used_again() -> None:
-    order = CameraOrder(7, generator(0, 0))
+    order = CameraOrder(7, generators(0)["cameras"])
     drawn = [order.next() for _ in range(21)]
     assert [sorted(drawn[i : i + 7]) for i in (0, 7, 14)] == [list(range(7))] * 3
     assert drawn[:7] != drawn[7:14]
@@ -477,4 +477,4 @@ def test_a_model_without_gaussians_or_out_of_range_ends_the_training(
 def test_every_stream_of_random_numbers_is_seeded_by_numpy() -> None:
     for stream, name in enumerate(STREAMS):
         seed = int(np.random.SeedSequence([3, stream]).generate_state(1, np.uint64)[0]) // 2
-        assert generators(3)[name].initial_seed() == generator(3, stream).initial_seed() == seed
+        assert generators(3)[name].initial_seed() == seed

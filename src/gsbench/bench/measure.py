@@ -16,9 +16,9 @@ from gsbench.logs import Progress, progress
 from gsbench.pipeline.parts import build_own_rasterizer
 from gsbench.raster import Rasterizer, create_rasterizer
 from gsbench.raster.executors import find_executor
+from gsbench.system.device import disable_tf32
 from gsbench.system.isolate import run_isolated
 from gsbench.system.resources import peak_memory_mb, reset_peak_memory
-from gsbench.train.device import disable_tf32
 from gsbench.train.options import TrainConfig
 from gsbench.train.trainer import Trainer
 

@@ -71,12 +71,12 @@ def choose_switches(declared: Mapping[str, Switch], names: Sequence[str], densif
 
 def effective_run(run: Run, switches: Mapping[str, Switch]) -> Run:
     """The run without the switches that have no effect in it, because the switch that they depend on is off."""
-    return frozenset(name for name in run if _acts(name, run, switches))
 
+    def acts(name: str) -> bool:
+        within = switches[name].within
+        return within not in switches or (within in run and acts(within))
 
-def _acts(name: str, run: Run, switches: Mapping[str, Switch]) -> bool:
-    within = switches[name].within
-    return within not in switches or (within in run and _acts(within, run, switches))
+    return frozenset(filter(acts, run))
 
 
 def runs_to_train(switches: Mapping[str, Switch]) -> list[Run]:

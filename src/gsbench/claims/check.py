@@ -263,7 +263,7 @@ def make_page(
         lines.append(
             f"The chance that {which} is false is at most {100 * file.error_rate:g} %, over all looks, if trainings "
             "differ about normally (docs/verdict.md). A verdict is about these scenes at this size. From six scenes on "
-            "there is also a statement about scenes like these, with its own error rate.",
+            "there is also a statement about scenes like these, with its own error rate."
         )
     lines.append(_declared_line(declared, declarations))
     judged = list({trial.path: trial for one in verdicts for trial in one.verdict.pairs.trials}.values())

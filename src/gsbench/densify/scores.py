@@ -109,11 +109,7 @@ def _normalized(values: Tensor, average: Callable[[Tensor], Tensor]) -> Tensor:
 
 
 def edge_scores(
-    views: TrainingViews,
-    indices: Sequence[int],
-    gaussians: Gaussians,
-    step: int,
-    normalize: Callable[[Tensor], Tensor],
+    views: TrainingViews, indices: Sequence[int], gaussians: Gaussians, step: int, normalize: Callable[[Tensor], Tensor]
 ) -> Tensor:
     """Scores [N] by the edges in photographs that each Gaussian covers.
 

@@ -197,10 +197,7 @@ class Evaluator:
         self._metrics |= extra
 
     def evaluate_view(
-        self,
-        render: NDArray[Any] | Tensor,
-        ground_truth: NDArray[Any] | Tensor,
-        mask: NDArray[np.bool_] | None = None,
+        self, render: NDArray[Any] | Tensor, ground_truth: NDArray[Any] | Tensor, mask: NDArray[np.bool_] | None = None
     ) -> dict[str, float]:
         """The metrics of one view; images are [H, W, 3], uint8 or floating point in [0, 1].
 

@@ -158,11 +158,7 @@ class Lpips:
     """
 
     def __init__(
-        self,
-        net: str,
-        features: Mapping[str, Tensor],
-        heads: Mapping[str, Tensor],
-        device: torch.device | str = "cpu",
+        self, net: str, features: Mapping[str, Tensor], heads: Mapping[str, Tensor], device: torch.device | str = "cpu"
     ) -> None:
         self.net = net
         self.backbone = BACKBONES[net]

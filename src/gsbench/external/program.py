@@ -28,11 +28,7 @@ class ProgramResult:
 
 
 def run_program(
-    command: Sequence[str],
-    log: Path,
-    folder: Path,
-    environment: Mapping[str, str],
-    limit: float | None,
+    command: Sequence[str], log: Path, folder: Path, environment: Mapping[str, str], limit: float | None
 ) -> ProgramResult:
     """Run ``command`` in ``folder`` with ``environment``, its output in the file ``log``; ``limit`` is in seconds.
 

@@ -166,7 +166,9 @@ class Random(PlacedCloud):
         extent = report.training_extent(model, capture)
         if extent == 0:
             raise InputError(f"init=random: the training cameras of scene {capture.name} are all at one place")
-        return random_cloud(np.mean(centers, axis=0), self.size * extent, self.count, self.seed)
+        generator = np.random.default_rng(self.seed)
+        points = np.mean(centers, axis=0) + self.size * extent * generator.uniform(-1.0, 1.0, (self.count, 3))
+        return PointCloud(points, generator.integers(0, 256, (self.count, 3), dtype=np.uint8))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -193,13 +195,6 @@ class Carved(Random):
                 f"{capture.name}; take more (init.count), a smaller box (init.size) or fewer cameras (init.seen_by)"
             )
         return PointCloud(cloud.points[kept], cloud.colors[kept])
-
-
-def random_cloud(center: np.ndarray, half_edge: float, count: int, seed: int) -> PointCloud:
-    """``count`` points uniform in the cube of edge ``2 * half_edge`` around ``center`` [3], with uniform colours."""
-    generator = np.random.default_rng(seed)
-    points = center + half_edge * generator.uniform(-1.0, 1.0, (count, 3))
-    return PointCloud(points, generator.integers(0, 256, (count, 3), dtype=np.uint8))
 
 
 def points_in_view(points: Array, name: str, model: pycolmap.Reconstruction) -> tuple[NDArray[np.int64], Array, Array]:

@@ -43,11 +43,6 @@ class TrialState:
     since: float | None
     note: str
 
-    @property
-    def label(self) -> str:
-        """Scene, arm, seed and hash, for messages."""
-        return TrialFolder(self.folder).label
-
 
 def states_of_experiment(home: Path) -> list[TrialState]:
     """The states of all trials of the experiment in ``home``, planned or with a folder."""

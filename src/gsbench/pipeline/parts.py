@@ -35,8 +35,8 @@ from gsbench.runs.experiments import metric_and_question
 from gsbench.runs.keys import OWN, UserCode, module_digest, targets_in, unnamed_modules, user_modules
 from gsbench.scene.options import SceneConfig
 from gsbench.settings import check_values, unknown_setting
+from gsbench.system.device import select_device
 from gsbench.system.resources import available_threads
-from gsbench.train.device import select_device
 from gsbench.train.options import TrainConfig
 from gsbench.words import did_you_mean
 

@@ -25,11 +25,4 @@ def create_rasterizer(name: str, device: torch.device, threads: int | None = Non
     return rasterizer
 
 
-__all__ = [
-    "CONSTANTS",
-    "EXECUTORS",
-    "RasterConstants",
-    "Rasterizer",
-    "RenderOutput",
-    "create_rasterizer",
-]
+__all__ = ["CONSTANTS", "EXECUTORS", "RasterConstants", "Rasterizer", "RenderOutput", "create_rasterizer"]

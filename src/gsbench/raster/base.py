@@ -185,12 +185,7 @@ class Rasterizer(Protocol):
     name: str
 
     def render(
-        self,
-        gaussians: Gaussians,
-        camera: Camera,
-        sh_degree: int,
-        background: Tensor,
-        absolute_gradient: bool = False,
+        self, gaussians: Gaussians, camera: Camera, sh_degree: int, background: Tensor, absolute_gradient: bool = False
     ) -> RenderOutput:
         """Render ``gaussians`` from ``camera`` with harmonics up to ``sh_degree`` (0 to 3) over ``background`` [3].
 

@@ -51,9 +51,7 @@ class Executor:
             needed = " or ".join(self.devices)
             alternatives = ", ".join(other.name for other in EXECUTORS if other.runs_on(device_type))
             return f"runs on device={needed}, not on {device_type}; choose from {alternatives}, or set device={needed}"
-        if not self.is_installed:
-            return f"needs {self.package}: {self.install}"
-        return None
+        return None if self.is_installed else f"needs {self.package}: {self.install}"
 
 
 EXECUTORS = (  # ``auto`` takes the first that is made for the type of device and installed
@@ -123,8 +121,7 @@ def resolve(name: str, device_type: str) -> Executor:
     if name == AUTO:
         return _automatic(device_type)
     executor = find_executor(name)
-    obstacle = executor.obstacle(device_type)
-    if obstacle is not None:
+    if (obstacle := executor.obstacle(device_type)) is not None:
         raise InputError(f"raster={name} {obstacle}")
     return executor
 

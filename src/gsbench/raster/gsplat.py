@@ -56,12 +56,7 @@ class GsplatRasterizer:
         self._cameras: WeakKeyDictionary[Camera, _DeviceCamera] = WeakKeyDictionary()
 
     def render(
-        self,
-        gaussians: Gaussians,
-        camera: Camera,
-        sh_degree: int,
-        background: Tensor,
-        absolute_gradient: bool = False,
+        self, gaussians: Gaussians, camera: Camera, sh_degree: int, background: Tensor, absolute_gradient: bool = False
     ) -> RenderOutput:
         """See `gsbench.raster.base.Rasterizer`. Raises ValueError that names a parameter that cannot be used."""
         check_settings(gaussians, camera, sh_degree, background)

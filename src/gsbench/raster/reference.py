@@ -234,11 +234,7 @@ def composite(
 
 
 def blending_weights(
-    pixels: Tensor,
-    means: Tensor,
-    conics: Tensor,
-    opacities: Tensor,
-    image_probe: Tensor | None = None,
+    pixels: Tensor, means: Tensor, conics: Tensor, opacities: Tensor, image_probe: Tensor | None = None
 ) -> Tensor:
     """Alpha times transmittance, [P, K], for the arguments of ``composite``; 0 where a Gaussian is not blended.
 

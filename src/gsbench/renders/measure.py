@@ -40,9 +40,9 @@ from gsbench.runs.trial_record import FROM_RENDERS, RENDERS_ALONE, Code, TrialRe
 from gsbench.scene.images import image_size, png_name, read_image
 from gsbench.scene.readers import fingerprint, list_images
 from gsbench.settings import is_folder_name
+from gsbench.system.device import select_device
 from gsbench.system.own_modules import allow_modules
 from gsbench.system.resources import available_threads
-from gsbench.train.device import select_device
 from gsbench.view.trials import find_trial
 from gsbench.words import counted, did_you_mean, some_of
 

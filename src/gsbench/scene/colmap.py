@@ -41,15 +41,11 @@ def _normalize_quaternions(model: pycolmap.Reconstruction) -> None:
     for rig in model.rigs.values():
         for sensor, pose in rig.non_ref_sensors.items():
             if pose is not None and abs(pose.rotation.norm() - 1) > UNIT_TOLERANCE:
-                rig.set_sensor_from_rig(sensor, _with_unit_quaternion(pose))
+                pose.rotation.normalize()
+                rig.set_sensor_from_rig(sensor, pose)
     for frame in model.frames.values():
         if frame.has_pose() and abs(frame.rig_from_world.rotation.norm() - 1) > UNIT_TOLERANCE:
-            frame.rig_from_world = _with_unit_quaternion(frame.rig_from_world)
-
-
-def _with_unit_quaternion(pose: pycolmap.Rigid3d) -> pycolmap.Rigid3d:
-    quaternion = np.asarray(pose.rotation.quat)
-    return pycolmap.Rigid3d(pycolmap.Rotation3d(quaternion / np.linalg.norm(quaternion)), pose.translation)
+            frame.rig_from_world.rotation.normalize()
 
 
 def registered_names(model: pycolmap.Reconstruction) -> list[str]:

@@ -145,12 +145,7 @@ class Scene:
     @cached_property
     def extent(self) -> float:
         """3DGS's ``cameras_extent`` of the training cameras, in world units."""
-        return scene_extent([view.camera for view in self.train])
-
-
-def scene_extent(cameras: Sequence[Camera]) -> float:
-    """3DGS's ``cameras_extent`` of ``cameras``, in world units."""
-    return extent_of_centers(np.stack([camera.center for camera in cameras]))
+        return extent_of_centers(np.stack([view.camera.center for view in self.train]))
 
 
 def extent_of_centers(centers: NDArray[np.float64]) -> float:

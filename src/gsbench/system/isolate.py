@@ -25,7 +25,7 @@ import traceback
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, BinaryIO, ParamSpec, TypeVar
+from typing import Any, BinaryIO, TypeVar
 
 from gsbench.errors import GsbenchError
 from gsbench.logs import Progress
@@ -109,8 +109,6 @@ def _control(option: int, value: int) -> None:
             ctypes.CDLL(None).prctl(option, value, 0, 0, 0)
 
 
-P = ParamSpec("P")
-R = TypeVar("R")
 T = TypeVar("T")
 
 _BOOTSTRAP = (
@@ -128,14 +126,8 @@ class CrashError(GsbenchError):
     """An isolated function has no result: its process crashed, was killed, or ran out of memory."""
 
 
-def run_isolated(
-    function: Callable[..., R],
-    *args: Any,
-    what: str | None = None,
-    log: Path | None = None,
-    **kwargs: Any,
-) -> R:
-    """Return ``function(*args, **kwargs)``, computed in a fresh child process.
+def run_isolated(function: Callable[..., T], *args: Any, what: str | None = None, log: Path | None = None) -> T:
+    """Return ``function(*args)``, computed in a fresh child process.
 
     ``function`` must be a top-level function of a module other than ``__main__``. It, its arguments and its result are
     pickled. ``what`` names the work in errors ("undistortion"). The output of the child, also of native libraries, is
@@ -147,7 +139,7 @@ def run_isolated(
     what = what or function.__name__
     with tempfile.TemporaryDirectory(prefix="gsbench-isolate-") as folder:
         call, result = Path(folder, "call.pickle"), Path(folder, "result.pickle")
-        call.write_bytes(pickle.dumps((function, args, kwargs)))
+        call.write_bytes(pickle.dumps((function, args)))
         output = log if log is not None else Path(folder, "output.txt")
         with output.open("ab") as stream:
             start = stream.seek(0, os.SEEK_END)
@@ -250,9 +242,9 @@ def _child() -> None:
     if not continue_in_child():
         threading.Thread(target=_end_with_parent, daemon=True).start()
     call, result = Path(sys.argv[2]), Path(sys.argv[3])
-    function, args, kwargs = pickle.loads(call.read_bytes())
+    function, args = pickle.loads(call.read_bytes())
     try:
-        outcome = (True, function(*args, **kwargs), "")
+        outcome = (True, function(*args), "")
     except Exception as error:  # noqa: BLE001  raised again in the parent
         outcome = (False, _portable(error), traceback.format_exc())
     result.write_bytes(pickle.dumps(outcome))

@@ -11,8 +11,6 @@ import functools
 import os
 import platform
 import re
-import subprocess
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -31,7 +29,6 @@ X86_LEVELS = {
     "x86-64-v3": ("avx", "avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe"),
     "x86-64-v4": ("avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"),
 }
-SECONDS_FOR_SYSCTL = 10
 NUMBA_MINIMA = {"NUMBA_NUM_THREADS": 1, "NUMBA_DISABLE_JIT": 0}  # variables that numba reads as whole numbers
 
 
@@ -61,8 +58,7 @@ def kind_of_machine(record: Mapping[str, Any]) -> str:
 @functools.cache
 def cpu_name() -> str:
     """The name of the processor from the operating system, else its architecture."""
-    name = {"linux": _linux_name, "darwin": _mac_name}.get(sys.platform, str)()
-    return " ".join((name or platform.processor() or platform.machine() or "unknown").split())
+    return " ".join((_linux_name() or platform.processor() or platform.machine() or "unknown").split())
 
 
 def _linux_name() -> str:
@@ -73,20 +69,6 @@ def _linux_name() -> str:
     if named or "CPU part" not in entries:
         return named
     return f"ARM implementer {entries.get('CPU implementer', '?')} part {entries['CPU part']}"  # no name on 64-bit ARM
-
-
-def _mac_name() -> str:
-    try:
-        answer = subprocess.run(
-            ["sysctl", "-n", "machdep.cpu.brand_string"],
-            capture_output=True,
-            text=True,
-            timeout=SECONDS_FOR_SYSCTL,
-            check=True,
-        )
-    except (OSError, subprocess.SubprocessError):
-        return ""
-    return answer.stdout
 
 
 def load_numba() -> Any:

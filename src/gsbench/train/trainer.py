@@ -31,9 +31,9 @@ from gsbench.raster.staged import Readback
 from gsbench.runs.layout import CURVES, EVENTS, HISTOGRAMS
 from gsbench.runs.trial_record import whole_lines
 from gsbench.scene.types import Scene
+from gsbench.system.device import free_bytes
 from gsbench.system.stopping import deferred, requested
 from gsbench.train.checkpoint import CheckpointWriter, load_checkpoint
-from gsbench.train.device import free_bytes
 from gsbench.train.loss import PhotometricLoss
 from gsbench.train.options import TrainConfig
 from gsbench.train.resolution import Resolution, ScaledViews

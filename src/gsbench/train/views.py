@@ -21,13 +21,10 @@ STREAMS = ("cameras", "densify")  # every random number of a training comes from
 
 def generators(seed: int) -> dict[str, torch.Generator]:
     """A CPU generator for each of `STREAMS`. Streams, also of different seeds, are independent."""
-    return {name: generator(seed, stream) for stream, name in enumerate(STREAMS)}
-
-
-def generator(seed: int, stream: int) -> torch.Generator:
-    """A CPU generator for one random stream. Streams, also of different seeds, are independent."""
-    state = np.random.SeedSequence([seed, stream]).generate_state(1, np.uint64)[0]
-    return torch.Generator().manual_seed(int(state >> np.uint64(1)))  # 63 bits: torch takes seeds below 2^63
+    states = [np.random.SeedSequence([seed, stream]).generate_state(1, np.uint64)[0] for stream in range(len(STREAMS))]
+    # 63 bits: torch takes seeds below 2^63.
+    seeds = zip(STREAMS, states, strict=True)
+    return {name: torch.Generator().manual_seed(int(state >> np.uint64(1))) for name, state in seeds}
 
 
 class CameraOrder:

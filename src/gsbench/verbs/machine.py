@@ -29,7 +29,6 @@ OPTIONAL = {  # module -> what needs it, and the extra that brings it
     "wandb": ("tracking=wandb", "wandb"),
 }
 NOT_SHOWN = ("scene", "threads", "device")  # columns that only the JSON of `bench` has
-RATIO_DIGITS = 2
 MAX_SIDE = 16_384  # px
 MAX_COUNT = 1_000_000_000
 
@@ -195,16 +194,12 @@ def bench(argv: Sequence[str], _runs: Path | None = None) -> int:
 
 def table(rows: list[dict[str, Any]]) -> str:
     """The results as aligned columns of text. Columns that no result has are left out."""
-    used = [key for key in rows[0] if key not in NOT_SHOWN and any(row[key] is not None for row in rows)]
-    cells = [used] + [[_cell(key, row[key]) for key in used] for row in rows]
-    widths = [max(len(line[k]) for line in cells) for k in range(len(used))]
-    lines = ["  ".join(text.rjust(width) for text, width in zip(line, widths, strict=True)) for line in cells]
-    return "\n".join(lines)
+    import pandas as pd  # here, for a quick answer to --help
 
-
-def _cell(key: str, value: Any) -> str:
-    digits = RATIO_DIGITS if key == "step_ratio" else 1
-    return f"{value:.{digits}f}" if isinstance(value, float) else "-" if value is None else str(value)
+    used = pd.DataFrame(rows).drop(columns=list(NOT_SHOWN)).dropna(axis="columns", how="all")
+    return used.to_string(
+        index=False, na_rep="-", formatters={"step_ratio": "{:.2f}".format}, float_format="{:.1f}".format
+    )
 
 
 def _size(text: str) -> tuple[int, int]:

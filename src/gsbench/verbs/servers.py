@@ -34,7 +34,7 @@ def view(argv: Sequence[str], runs: Path) -> int:
         raise InputError(f"the viewer needs viser: {install_command('view')}")
 
     from gsbench.raster import create_rasterizer
-    from gsbench.train.device import select_device
+    from gsbench.system.device import select_device
     from gsbench.view.server import Viewer, check_port
     from gsbench.view.trials import TrialPainter, find_trial, load_viewed
 

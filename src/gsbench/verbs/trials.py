@@ -93,7 +93,8 @@ def lines_of(trials: list[TrialState], with_done: bool) -> list[str]:
     lines = []
     for trial in sorted(trials, key=lambda trial: ORDER.index(trial.state)):
         if trial.state != "done" or with_done:
-            lines.append(f"{trial.state:<8} {trial.label:<50} {_age(trial):>12}  {trial.note}".rstrip())
+            label = TrialFolder(trial.folder).label
+            lines.append(f"{trial.state:<8} {label:<50} {_age(trial):>12}  {trial.note}".rstrip())
     lines.append(summary_of(trials))
     return lines
 
@@ -204,8 +205,7 @@ def sync(argv: Sequence[str], runs: Path) -> int:
     parser = ArgumentParser("sync")
     parser.add_argument("experiment", nargs="?", help="its name; without one, all")
     parser.add_argument(
-        "--uri",
-        help="such as http://127.0.0.1:5000; default: $MLFLOW_TRACKING_URI, or the runs folder's",
+        "--uri", help="such as http://127.0.0.1:5000; default: $MLFLOW_TRACKING_URI, or the runs folder's"
     )
     options = parser.parse_args(argv)
     names = [options.experiment] if options.experiment else list_experiments(runs)

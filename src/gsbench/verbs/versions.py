@@ -105,13 +105,13 @@ def _seeds(baseline: Mapping[str, Sequence[TrialResult]], most: int | None) -> l
 def _done(home: Path, trials: Sequence[Trial]) -> list[TrialResult]:
     """The results of those ``trials`` that are done. Results of earlier code do not count as done."""
     by_folder = {trial.folder: trial for trial in trials}
-    done = []
-    for result in read_experiment(home).trials:
+
+    def is_done(result: TrialResult) -> bool:
         trial, awaited = by_folder.get(result.path), result.record.awaited
         # A metric whose weights are missing does not make a trial unfinished.
-        if trial is not None and not trial.files.why_not_done(trial.values, lambda options: awaited):  # noqa: B023
-            done.append(result)
-    return done
+        return trial is not None and not trial.files.why_not_done(trial.values, lambda options: awaited)
+
+    return list(filter(is_done, read_experiment(home).trials))
 
 
 def bisect(argv: Sequence[str], runs: Path) -> int:

@@ -78,7 +78,7 @@ def build_report(experiment: Experiment, baseline: str = BASELINE) -> str:
         contradictions=[] if paper_table is None else load_paper().contradictions,
         search=search_summary(experiment.folder),
         say=verdicts,
-        signed=_signed,
+        signed=lambda value, decimals: "unknown" if value is None else signed(value, f".{decimals}f"),
         training=training_charts(trials, arms),
         event_table=event_table(trials, arms),
         events=event_charts(trials, arms),
@@ -102,10 +102,6 @@ def trial_figures(trials: Sequence[TrialResult]) -> list[tuple[str, str]]:
             key = path.stem.replace("_", " "), trial.scene, png_uri(read_image(path))
             sources.setdefault(key, []).append(f"{trial.init}-{trial.densify}, seed {trial.seed}")
     return [(f"{name}: {scene}, {'; '.join(arms)}", uri) for (name, scene, uri), arms in sources.items()]
-
-
-def _signed(value: float | None, decimals: int) -> str:
-    return "unknown" if value is None else signed(value, f".{decimals}f")
 
 
 def compare_arms(trials: Sequence[TrialResult], judged: PairVerdicts) -> dict[str, Any]:
@@ -180,10 +176,8 @@ def event_charts(trials: Sequence[TrialResult], arms: Sequence[Arm]) -> list[str
     """Events by cause over the iterations of each arm."""
     means = {arm: _mean_curves(_trials_of(trials, arm), layout.EVENTS, EVENT_CAUSES) for arm in arms}
     causes = [cause for cause in EVENT_CAUSES if any(count for own in means.values() for _, count in own[cause])]
-    charts = []
-    for arm, own in means.items():
-        series = [(cause.replace("_", " "), own[cause]) for cause in causes]
-        charts.append(line_chart(f"Refinement over time: {arm}", series, "iteration", "Gaussians"))
+    series = {arm: [(cause.replace("_", " "), own[cause]) for cause in causes] for arm, own in means.items()}
+    charts = [line_chart(f"Refinement over time: {arm}", own, "iteration", "Gaussians") for arm, own in series.items()]
     return [chart for chart in charts if chart]
 
 

@@ -95,13 +95,7 @@ class MatchingJob:
     sift: Sfm
 
 
-def match_sift(
-    database: Path,
-    pairs: Sequence[tuple[str, str]],
-    sift: Sfm,
-    processes: int,
-    progress: Progress,
-) -> None:
+def match_sift(database: Path, pairs: Sequence[tuple[str, str]], sift: Sfm, processes: int, progress: Progress) -> None:
     """Match ``pairs`` of image names and verify them.
 
     The result does not depend on the number of processes or on the division into parts: a pair's matches depend on its

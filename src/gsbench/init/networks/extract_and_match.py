@@ -25,6 +25,7 @@ from gsbench.logs import Progress
 from gsbench.scene.images import read_image, read_mask, resize_image
 from gsbench.scene.options import downscaled_size
 from gsbench.scene.types import Capture
+from gsbench.system.device import select_device
 from gsbench.system.install import install_command
 from gsbench.weights import MissingWeightsError, load_state
 from gsbench.words import some_of
@@ -42,14 +43,6 @@ LIGHTGLUE_DETECTOR_PREFIX = "keypoint_detector."  # of SuperPoint's tensors in a
 Extractor = Callable[[torch.Tensor], tuple[torch.Tensor, torch.Tensor, torch.Tensor]]
 # Matches two images: indices [M, 2] of keypoints in the first and the second.
 Matcher = Callable[[Features, Features], NDArray[np.uint32]]
-
-
-def build_extractor(settings: FeatureSettings, weights: Path | None, device: torch.device) -> Extractor:
-    """The extractor with its network on ``device``; ``weights`` is the checked file, or None if it needs none.
-
-    Raises ``MissingWeightsError`` if the file does not fit the network.
-    """
-    return _BUILDERS[settings.extractor](settings, weights, device)
 
 
 def extract_features(
@@ -192,7 +185,9 @@ def _gray(image: torch.Tensor) -> torch.Tensor:
     return (image * weights).sum(dim=1, keepdim=True).expand(-1, 3, -1, -1)
 
 
-_BUILDERS: dict[str, Callable[[FeatureSettings, Path | None, torch.device], Extractor]] = {
+# Each makes an extractor with its network on a device; the path is the checked file of weights, None if it needs none.
+# They raise ``MissingWeightsError`` if the file does not fit the network.
+EXTRACTORS: dict[str, Callable[[FeatureSettings, Path | None, torch.device], Extractor]] = {
     "superpoint": _superpoint,
     "aliked": _aliked,
     "disk": _disk,
@@ -301,7 +296,7 @@ def extract_and_match(job: NetworkJob, progress: Progress) -> Preparation:
     """
     options, capture = job.options, job.capture
     torch.set_num_threads(options.num_threads)
-    device = choose_device(options.device)
+    device = select_device(options.device, "init.device")
     reference = load_reference(capture, job.reference)
     names = options.select_images(capture, reference)
     pairs = select_pairs(names, options)
@@ -363,18 +358,6 @@ def at_low_resolution(job: NetworkJob) -> NetworkJob:
     return replace(job, settings=settings)
 
 
-def choose_device(name: str) -> torch.device:
-    """The torch device ``name``; ``auto`` is the GPU if there is one. Raises ``InputError`` for a missing device."""
-    if name == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    try:
-        device = torch.device(name)
-        torch.empty(1, device=device)
-    except (RuntimeError, AssertionError) as error:
-        raise InputError(f"init.device={name}: no such device here (use auto, cpu or cuda)") from error
-    return device
-
-
 def _extract_all(job: NetworkJob, names: Sequence[str], device: torch.device, progress: Progress) -> list[str]:
     """Store the features of all images; returns the names of images without features."""
     store, settings, empty, extractor = open_store(job), job.settings, [], None
@@ -382,7 +365,7 @@ def _extract_all(job: NetworkJob, names: Sequence[str], device: torch.device, pr
     for done, name in enumerate(names, start=1):
         features = store.read_features(name)
         if features is None:
-            extractor = extractor or build_extractor(settings, job.extractor_weights, device)
+            extractor = extractor or EXTRACTORS[settings.extractor](settings, job.extractor_weights, device)
             path = job.capture.images / name
             features = extract_features(path, extractor, settings.max_image_size, settings.max_keypoints, device)
             if name in job.capture.masks:

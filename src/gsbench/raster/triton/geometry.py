@@ -158,11 +158,7 @@ def _coefficients(sh_rest, index, k: tl.constexpr, mask):
 
 @triton.jit
 def _add(sums, coefficients, factor):
-    return (
-        sums[0] + coefficients[0] * factor,
-        sums[1] + coefficients[1] * factor,
-        sums[2] + coefficients[2] * factor,
-    )
+    return (sums[0] + coefficients[0] * factor, sums[1] + coefficients[1] * factor, sums[2] + coefficients[2] * factor)
 
 
 @triton.jit

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from gsbench.errors import InputError
-from gsbench.train.device import free_bytes, select_device
+from gsbench.system.device import free_bytes, select_device
 
 
 @pytest.fixture

@@ -1,22 +1,27 @@
-"""The device of a training: its choice, its precision and its memory."""
+"""The torch device that a setting names, its precision and its memory."""
 
 import torch
 
 from gsbench.errors import InputError
 
 
-def select_device(name: str) -> torch.device:
-    """Return the device called ``name``; ``auto`` is the GPU if torch can use one, else the CPU."""
+def select_device(name: str, setting: str = "device") -> torch.device:
+    """Return the device called ``name``; ``auto`` is the GPU if torch can use one, else the CPU.
+
+    Raises InputError, which names the ``setting``, for a device that is not there.
+    """
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     try:
         device = torch.device(name)
     except RuntimeError as error:
-        raise InputError(f"device={name} is not known to torch; use auto, cpu, cuda or cuda:1") from error
+        raise InputError(f"{setting}={name} is not known to torch; use auto, cpu, cuda or cuda:1") from error
     if device.type == "cuda" and not torch.cuda.is_available():
-        raise InputError(f"device={name}: torch finds no CUDA device here; use device=cpu, or install torch for CUDA")
+        raise InputError(
+            f"{setting}={name}: torch finds no CUDA device here; use {setting}=cpu, or install torch for CUDA"
+        )
     if device.type == "cuda" and device.index is not None and device.index >= torch.cuda.device_count():
-        raise InputError(f"device={name}: there are {torch.cuda.device_count()} CUDA devices, numbered from 0")
+        raise InputError(f"{setting}={name}: there are {torch.cuda.device_count()} CUDA devices, numbered from 0")
     if device.type == "cuda":
         disable_tf32()
     return device
