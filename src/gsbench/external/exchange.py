@@ -12,8 +12,9 @@ from gsbench.errors import InputError, TrainingError
 from gsbench.eval.pictures import match_by_order, match_pictures
 from gsbench.files import write_json
 from gsbench.gaussians.model import Gaussians
-from gsbench.gaussians.ply import read_ply
+from gsbench.gaussians.ply import read_ply, write_ply
 from gsbench.init.base import MODEL_FOLDER, PointCloud
+from gsbench.normalization import IDENTITY, Normalization
 from gsbench.scene.colmap import write_model
 from gsbench.scene.images import check_picture_names, png_name, read_image
 from gsbench.scene.types import Camera, View
@@ -25,8 +26,12 @@ OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenCV's camera axes (y down, z forw
 FAST_PNG = 1  # zlib level; the files are deleted after the training
 
 
-def write_training_views(folder: Path, views: Sequence[View], cloud: PointCloud) -> None:
+def write_training_views(
+    folder: Path, views: Sequence[View], cloud: PointCloud, normalization: Normalization = IDENTITY
+) -> None:
     """Write ``views`` as a COLMAP folder: PNG files, PINHOLE cameras of their size, and ``cloud`` as its points.
+
+    ``normalization`` is undone: programs get the coordinates in which the scene was given.
 
     The points have no observations, which would reveal what test views saw.
     """
@@ -34,21 +39,22 @@ def write_training_views(folder: Path, views: Sequence[View], cloud: PointCloud)
     (folder / IMAGES).mkdir(parents=True)
     for view in views:
         Image.fromarray(view.image).save(folder / IMAGES / png_name(view.name), compress_level=FAST_PNG)
-    write_model(folder / MODEL_FOLDER, _cameras(views), cloud=(cloud.points, cloud.colors))
+    points = cloud.points if normalization.is_identity else normalization.undo(cloud.points)
+    write_model(folder / MODEL_FOLDER, _cameras(views, normalization), cloud=(points, cloud.colors))
 
 
-def write_test_cameras(folder: Path, views: Sequence[View]) -> None:
+def write_test_cameras(folder: Path, views: Sequence[View], normalization: Normalization = IDENTITY) -> None:
     """Write the cameras of ``views``, without images, as a COLMAP model and as nerfstudio's ``transforms.json``.
 
     Renders are expected under the names in these files.
     """
-    cameras = _cameras(views)
+    cameras = _cameras(views, normalization)
     write_model(folder / MODEL_FOLDER, cameras)
     write_json(folder / TRANSFORMS, {"camera_model": "OPENCV", "frames": [_frame(*item) for item in cameras.items()]})
 
 
-def _cameras(views: Sequence[View]) -> dict[str, Camera]:
-    return {png_name(view.name): view.camera for view in views}
+def _cameras(views: Sequence[View], normalization: Normalization) -> dict[str, Camera]:
+    return {png_name(view.name): view.camera.in_own_coordinates(normalization) for view in views}
 
 
 def _frame(name: str, camera: Camera) -> dict[str, Any]:
@@ -59,8 +65,8 @@ def _frame(name: str, camera: Camera) -> dict[str, Any]:
     return {"file_path": name} | intrinsics | {"cx": camera.cx, "cy": camera.cy} | pose
 
 
-def collect_model(output: Path, pattern: str, target: Path) -> Gaussians:
-    """Copy the one file below ``output`` that fits ``pattern`` to ``target``, and return its Gaussians.
+def collect_model(output: Path, pattern: str, target: Path, normalization: Normalization = IDENTITY) -> Gaussians:
+    """Copy the one file below ``output`` that fits ``pattern`` to ``target``, normalised; return its Gaussians.
 
     Raises `TrainingError` if there is not exactly one such file, or if it is not a valid 3DGS PLY.
     """
@@ -70,10 +76,13 @@ def collect_model(output: Path, pattern: str, target: Path) -> Gaussians:
             f"{counted(len(files), 'file')} fit densify.result ({_named(files, output)}): it must name one"
         )
     try:
-        gaussians = read_ply(files[0])
+        gaussians = read_ply(files[0], normalization=normalization)
     except InputError as error:
         raise TrainingError(str(error)) from error
-    shutil.copyfile(files[0], target)
+    if normalization.is_identity:
+        shutil.copyfile(files[0], target)
+    else:
+        write_ply(gaussians, target)
     return gaussians
 
 

@@ -1,5 +1,6 @@
 """The PLY file of 3DGS, which viewers and other trainers read."""
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,10 +12,12 @@ from plyfile import PlyData, PlyElement, PlyParseError
 from gsbench.errors import InputError
 from gsbench.files import atomic, require_regular
 from gsbench.gaussians.model import MAX_SH_DEGREE, NUM_SH_REST, Gaussians
+from gsbench.normalization import IDENTITY, Normalization
 
 NUM_REST = 3 * NUM_SH_REST  # f_rest is stored channel by channel: 15 of red, 15 of green, 15 of blue
+POSITION = ["x", "y", "z"]
 COLUMNS = (
-    ["x", "y", "z", "nx", "ny", "nz"]
+    [*POSITION, "nx", "ny", "nz"]
     + [f"f_dc_{i}" for i in range(3)]
     + [f"f_rest_{i}" for i in range(NUM_REST)]
     + ["opacity"]
@@ -30,8 +33,12 @@ SIZES = {"short": 2, "ushort": 2, "int16": 2, "uint16": 2, "int": 4, "uint": 4, 
 SIZES |= {"float": 4, "float32": 4, "double": 8, "float64": 8}  # bytes; all other types have 1
 
 
-def write_ply(gaussians: Gaussians, path: Path) -> None:
-    """Write raw parameters as binary little-endian float32 in 3DGS's column order, with zero normals; atomic."""
+def write_ply(gaussians: Gaussians, path: Path, normalization: Normalization = IDENTITY) -> None:
+    """Write raw parameters as binary little-endian float32 in 3DGS's column order, with zero normals; atomic.
+
+    ``normalization`` is undone. Positions that it moves are written as float64, because float32 has steps of half a
+    unit at UTM coordinates.
+    """
     raw = gaussians.detach().map(lambda tensor: tensor.float().cpu())
     table = torch.cat(
         [
@@ -40,12 +47,17 @@ def write_ply(gaussians: Gaussians, path: Path) -> None:
             raw.sh_dc,
             raw.sh_rest.transpose(1, 2).reshape(len(raw), NUM_REST),
             raw.opacity_logits.unsqueeze(-1),
-            raw.log_scales,
+            raw.log_scales - math.log(normalization.scale),
             raw.quaternions,
         ],
         dim=1,
     ).numpy()  # [N, 62]
     vertices = np.ascontiguousarray(table, dtype="<f4").view([(name, "<f4") for name in COLUMNS]).reshape(len(raw))
+    if not normalization.is_identity:
+        vertices = vertices.astype([(name, "<f8" if name in POSITION else "<f4") for name in COLUMNS])
+        own = normalization.undo(raw.means.numpy())  # [N, 3]
+        for axis, name in enumerate(POSITION):
+            vertices[name] = own[:, axis]
     with atomic(path, sync=False) as temporary:
         PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(str(temporary))
 
@@ -88,8 +100,10 @@ def _check_length(path: Path) -> None:
         raise ValueError(f"it is cut short: its header promises {announced} bytes or more")
 
 
-def read_ply(path: Path, device: torch.device | str = "cpu") -> Gaussians:
+def read_ply(path: Path, device: torch.device | str = "cpu", normalization: Normalization = IDENTITY) -> Gaussians:
     """Read a 3DGS PLY of SH degree 0 to 3 as float32; coefficients above its degree become zero.
+
+    ``normalization`` is applied to positions, before they become float32, and to scales.
 
     Raises InputError if the file is not a PLY, lacks a property, or has invalid values.
     """
@@ -117,13 +131,14 @@ def read_ply(path: Path, device: torch.device | str = "cpu") -> Gaussians:
     def columns(names: list[str]) -> torch.Tensor:
         return torch.from_numpy(np.stack([vertices[name].astype(np.float32) for name in names], axis=1)).to(device)
 
+    positions = np.stack([vertices[name] for name in POSITION], axis=1)  # [N, 3]
     n, stored = len(vertices), len(rest) // 3  # coefficients per channel
     sh_rest = torch.zeros(n, NUM_SH_REST, 3, device=device)
     if stored:
         sh_rest[:, :stored] = columns(rest).reshape(n, 3, stored).transpose(1, 2)
     return Gaussians(
-        means=columns(["x", "y", "z"]),
-        log_scales=columns([f"scale_{i}" for i in range(3)]),
+        means=torch.from_numpy(normalization.apply(positions).astype(np.float32)).to(device),
+        log_scales=columns([f"scale_{i}" for i in range(3)]) + math.log(normalization.scale),
         quaternions=columns([f"rot_{i}" for i in range(4)]),
         opacity_logits=columns(["opacity"]).squeeze(-1),
         sh_dc=columns([f"f_dc_{i}" for i in range(3)]),

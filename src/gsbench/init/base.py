@@ -184,6 +184,7 @@ class Initializer(ABC):
     """
 
     name: ClassVar[str]  # the name in reports
+    random_points: ClassVar[bool] = False  # places and colours are drawn at random, so they need not fit photographs
 
     def needs_reference(self, capture: Capture) -> bool:
         """Return whether `run` needs a ``reference`` model for this capture because it came without cameras."""

@@ -152,6 +152,7 @@ class Random(PlacedCloud):
     """
 
     name: ClassVar[str] = "random"
+    random_points: ClassVar[bool] = True
 
     count: Annotated[int, Interval(ge=1, le=10_000_000)] = 100_000
     size: PositiveFloat = 3.0
@@ -318,6 +319,7 @@ class Points(CloudFromFile):
 
     def cloud(self, capture: Capture, model: pycolmap.Reconstruction) -> PointCloud:
         points, colors = read_points(self.file)
+        points = capture.normalization.apply(points)
         chosen = np.sort(np.random.default_rng(self.seed).permutation(len(points))[: self.max_points])
         points, colors = points[chosen], None if colors is None else colors[chosen]
         seen = seen_colors(points, capture, model)
@@ -369,13 +371,18 @@ class Ply(CloudFromFile):
         check_ply(self.file)
 
     def set_points(self, model: pycolmap.Reconstruction, capture: Capture, output_dir: Path) -> TrainingPoints | None:
-        shutil.copyfile(self.file, output_dir / GAUSSIANS_FILE)
+        from gsbench.gaussians.ply import read_ply, write_ply
+
+        if capture.normalization.is_identity:
+            shutil.copyfile(self.file, output_dir / GAUSSIANS_FILE)
+        else:
+            write_ply(read_ply(self.file, normalization=capture.normalization), output_dir / GAUSSIANS_FILE)
         return super().set_points(model, capture, output_dir)
 
     def cloud(self, capture: Capture, model: pycolmap.Reconstruction) -> PointCloud:
         from gsbench.gaussians.model import dc_to_rgb
         from gsbench.gaussians.ply import read_ply
 
-        gaussians = read_ply(self.file)
+        gaussians = read_ply(self.file, normalization=capture.normalization)
         colors = (dc_to_rgb(gaussians.sh_dc).clamp(0, 1) * 255).round().byte().numpy()  # [N, 3]
         return PointCloud(gaussians.means.double().numpy(), colors)

@@ -17,9 +17,11 @@ from gsbench.config.compose import Trial
 from gsbench.errors import GsbenchError, InputError, TrainingError
 from gsbench.events import sum_events
 from gsbench.files import link_or_copy, remove_temporaries, require_no_links, storage_errors, write_json, write_text
+from gsbench.gaussians.ply import read_ply, write_ply
 from gsbench.init import Sfm
 from gsbench.init.base import GAUSSIANS_FILE, MODEL_FOLDER, PICTURE_FILE, REPORT_FILE
 from gsbench.logs import log_to
+from gsbench.normalization import Normalization
 from gsbench.parsing import read_json, read_typed
 from gsbench.pipeline.parts import Parts
 from gsbench.pipeline.steps.evaluate import evaluate_step
@@ -30,6 +32,8 @@ from gsbench.pipeline.steps.scene import (
     init_step,
     masked_capture,
     masking_step,
+    normalized_capture,
+    normalizing_step,
 )
 from gsbench.pipeline.steps.train import external_step, train_step
 from gsbench.runs import keys, layout
@@ -92,6 +96,10 @@ class TrialSteps:
         if masking is not None:
             yield masking
             self.capture = masked_capture(self.photographs, store.path(masking))
+        normalizing = normalizing_step(self.capture)
+        if normalizing is not None:
+            yield normalizing
+            self.capture = normalized_capture(self.capture, normalizing, store.path(normalizing))
         reference = None
         if parts.initializer.needs_reference(self.capture):
             reference = init_step(store, self.capture, Sfm(threads=parts.threads))
@@ -180,7 +188,7 @@ def _run(trial: Trial, folder: TrialFolder) -> TrialRecord:
             if step.stage is keys.INIT:
                 link_or_copy(entry.path / REPORT_FILE, folder.path / layout.INIT_REPORT)
         results = results_of(values, trial_steps.capture, trial_steps.views.scene, parts.rasterizer.name, entries, code)
-        published = _publish(folder.path, entries)
+        published = _publish(folder.path, entries, trial_steps.capture.normalization)
         made_of = {name: entry.path for name, entry in entries.items() if name != keys.CAPTURE.name}
         sources = source_files(trial_steps.photographs, store)
         was_done = folder.write_finished(values, results, sources, made_of, published)
@@ -200,8 +208,11 @@ def source_files(capture: Capture, store: Store) -> list[Path]:
     return images + ([] if capture.model is None else [path.resolve() for path in model_files(capture.model)])
 
 
-def _publish(folder: Path, entries: Mapping[str, StoredResult]) -> list[Path]:
-    """Link the steps' files into the trial's folder, or copy them; returns the new paths."""
+def _publish(folder: Path, entries: Mapping[str, StoredResult], normalization: Normalization) -> list[Path]:
+    """Link the steps' files into the trial's folder, or copy them; returns the new paths.
+
+    The model gets the coordinates in which the scene was given.
+    """
     init, trained, evaluated = (entries[stage.name].path for stage in (keys.INIT, keys.TRAIN, keys.EVALUATE))
     links = {folder / name: trained / name for name in PUBLISHED_TRAINING if (trained / name).exists()}
     links[folder / layout.PER_VIEW] = evaluated / layout.PER_VIEW
@@ -213,7 +224,10 @@ def _publish(folder: Path, entries: Mapping[str, StoredResult]) -> list[Path]:
         links[folder / layout.FIGURES / layout.INITIAL_CLOUD] = init / PICTURE_FILE
     for link, file in links.items():
         link.parent.mkdir(exist_ok=True)
-        link_or_copy(file, link)
+        if file.name == layout.POINT_CLOUD and not normalization.is_identity:
+            write_ply(read_ply(file), link, normalization)
+        else:
+            link_or_copy(file, link)
     return list(links)
 
 
@@ -272,6 +286,8 @@ def results_of(
         num_init_points=training.num_init_points,
         num_gaussians=training.num_gaussians,
         causes=training.causes,
+        one_color_psnr=evaluation.one_color_psnr,
+        initial_cloud=training.initial_cloud,
         scene_extent=training.scene_extent,
         seconds=seconds,
         peak_memory_mb=training.peak_memory_mb,
@@ -280,6 +296,7 @@ def results_of(
             cap=values["densify"].get("cap"),
             seconds=values["train"]["max_seconds"],
         ),
+        normalization=None if capture.normalization.is_identity else capture.normalization,
         train_views=len(scene.train),
         test_views=len(scene.test),
         split=split_text(keys.flatten(values)),

@@ -213,11 +213,11 @@ DIGEST_CHARACTERS = 16
 # The rooms of each stage: folders and files of gsbench that determine its numbers. Code that only reports, shows,
 # launches or reads is no room. Nor is code that makes objects from settings: keys contain the settings themselves.
 # An edit of one densifier changes the room of all densifiers; in return, the table is simple enough to check.
-MODEL = ("scene", "gaussians", "densify", "raster", "train", "events.py")
+MODEL = ("scene", "gaussians", "densify", "raster", "train", "events.py", "normalization.py")
 LOSS = ("eval/ssim.py", "eval/images.py", "eval/pictures.py")
 ROOMS = {
-    "scene": ("scene", "init", "pipeline/steps/scene.py"),
-    "init": ("scene", "init", "gaussians", "weights.py", "pipeline/steps/scene.py"),
+    "scene": ("scene", "init", "normalization.py", "pipeline/steps/scene.py"),
+    "init": ("scene", "init", "gaussians", "normalization.py", "weights.py", "pipeline/steps/scene.py"),
     "train": (*MODEL, *LOSS, "external", "pipeline/steps/train.py"),
     "ground_truth": ("scene", "pipeline/steps/scene.py"),
     "evaluate": (*MODEL, "eval", "weights.py", "pipeline/steps"),

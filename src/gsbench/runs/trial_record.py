@@ -11,6 +11,7 @@ from typing import Annotated, Any, Final, Literal
 
 from pydantic import AfterValidator, Field, ValidationError
 
+from gsbench.normalization import IDENTITY, Normalization
 from gsbench.parsing import (
     MAX_NUMBER,
     Amount,
@@ -104,6 +105,18 @@ class ExternalTrainer(Record):
 
 
 @dataclass(frozen=True, kw_only=True)
+class InitialCloud(Record):
+    """Facts of the initial points, measured before the first iteration (`gsbench.train.start`)."""
+
+    seen: Amount  # the share of points that at least two training views have in view
+    color_agreement: Number | None  # with the photographs: 1 is equal, 0 is chance; None for points of one colour
+    identical: Amount  # the share of points that share their place with another
+    far: Count  # points more than 10,000 scene extents away
+    spread: Amount  # the median distance of points from their median, in scene extents
+    warnings: list[str]  # about points and training cameras, as logged
+
+
+@dataclass(frozen=True, kw_only=True)
 class TrialRecord(Record):
     """A finished trial. A value that cannot be known is None; the file leaves out None if that is the default.
 
@@ -135,8 +148,11 @@ class TrialRecord(Record):
     awaited: list[str] = field(default_factory=list)
     metric_facts: dict[str, MetricRecord] = field(default_factory=dict)
     metrics_at: dict[Iteration, Earlier] = field(default_factory=dict)
+    one_color_psnr: Number | None = None  # dB: what a picture of the training views' mean colour would reach
     causes: dict[str, Count] = field(default_factory=dict)  # Gaussians at the end, by the cause of their creation
-    scene_extent: Amount | None = None  # world units
+    scene_extent: Amount | None = None  # units of the given coordinates
+    initial_cloud: InitialCloud | None = None
+    normalization: Normalization | None = None  # from the given coordinates to those of the training; None: the same
     budget: Budget | None = None
     train_views: Count | None = None
     test_views: Count | None = None
@@ -148,6 +164,17 @@ class TrialRecord(Record):
     renders: dict[str, str] = field(default_factory=dict)  # origin of another program's renders
     code: Code = field(default_factory=Code)
     machine: dict[str, str] | None = None
+
+    @property
+    def learnt_nothing(self) -> bool:
+        """Whether the renders are not better than one colour."""
+        psnr = self.metrics.get("psnr")
+        return psnr is not None and self.one_color_psnr is not None and psnr <= self.one_color_psnr
+
+    @property
+    def to_training(self) -> Normalization:
+        """The map from the coordinates of the model's file to those of the training."""
+        return self.normalization or IDENTITY
 
     def __post_init__(self) -> None:
         if self.num_gaussians is None and self.evaluated_from != FROM_RENDERS:
@@ -185,6 +212,7 @@ class Training(Record):
     peak_memory_mb: Amount | None
     machine: dict[str, str]
     checkout: dict[str, Any] = field(default_factory=dict)  # gsbench's commit, and whether files were edited
+    initial_cloud: InitialCloud | None = None
     evaluated_from: Literal["model", "renders"] | None = None
     trained_by: ExternalTrainer | None = None
 
@@ -193,6 +221,7 @@ class Training(Record):
 class Evaluation(Record):
     """The metrics of a trial; fields as in `TrialRecord`."""
 
+    one_color_psnr: Number | None = None
     metrics: dict[str, Number]
     unavailable: dict[str, str]
     awaited: list[str]

@@ -10,6 +10,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from gsbench.errors import InputError
+from gsbench.normalization import Normalization
 from gsbench.scene.colmap_files import check_model
 from gsbench.scene.images import check_size, image_size, match_names
 from gsbench.scene.types import Array, Camera, CameraModel, Capture, to_pinhole
@@ -51,6 +52,20 @@ def _normalize_quaternions(model: pycolmap.Reconstruction) -> None:
 def registered_names(model: pycolmap.Reconstruction) -> list[str]:
     """The sorted names of the images that have a pose."""
     return sorted(image.name for image in model.images.values() if image.has_pose)
+
+
+def camera_centers(model: pycolmap.Reconstruction) -> Array:
+    """The centres [V, 3] of the images that have a pose, in the order of their ids."""
+    posed = [image for _, image in sorted(model.images.items()) if image.has_pose]
+    return np.array([image.projection_center() for image in posed], dtype=np.float64).reshape(-1, 3)
+
+
+def normalize_model(model: pycolmap.Reconstruction, normalization: Normalization, undo: bool = False) -> None:
+    """Move ``model`` from the coordinates in which it was given to those of the training; ``undo`` moves it back."""
+    to_training = pycolmap.Sim3d(
+        normalization.scale, pycolmap.Rotation3d(), -normalization.scale * np.array(normalization.center)
+    )
+    model.transform(to_training.inverse() if undo else to_training)
 
 
 def read_reference(capture: Capture) -> pycolmap.Reconstruction:

@@ -11,6 +11,7 @@ from types import MappingProxyType
 from gsbench.datasets.catalog import how_to_get
 from gsbench.errors import InputError
 from gsbench.files import require_regular
+from gsbench.normalization import find_normalization
 from gsbench.scene.colmap_files import model_files
 from gsbench.scene.hold_out import CamerasByName, hold_out, select_images
 from gsbench.scene.images import IMAGE_SUFFIXES, check_picture_names, find_masks, match_names
@@ -43,7 +44,8 @@ def read_colmap(
 
     Raises `InputError` if a folder is missing, the model is damaged, or fewer than three photographs are usable.
     """
-    from gsbench.scene.colmap import read_model, reference_cameras, registered_names  # photos alone need no pycolmap
+    # Photographs alone need no pycolmap.
+    from gsbench.scene.colmap import camera_centers, read_model, reference_cameras, registered_names
 
     root = existing_folder(name, path)
     model_folder = _find_sparse(root, sparse)
@@ -59,10 +61,12 @@ def read_colmap(
         )
     _require_enough(len(matches), folder, f"that the model {model_folder} has a pose for")
     model_names = {file: image for image, file in matches.items()}
-    return _make_capture(
+    capture = _make_capture(
         name, folder, sorted(matches.values()), model_folder, exact_poses, max_images, split, root,
         lambda chosen: reference_cameras(model, [model_names[file] for file in chosen]), mask_folder,
     )  # fmt: skip
+    # A scene with exact poses is the courtyard, whose units are those of the paper's threshold as they are.
+    return capture if exact_poses else replace(capture, normalization=find_normalization(camera_centers(model)))
 
 
 def read_transforms(
@@ -92,7 +96,8 @@ def read_transforms(
         lambda chosen: reference_cameras(read_model(model), chosen),
         None if masks is None else _subfolder(root, masks, "scene.masks"), transforms.split,
     )  # fmt: skip
-    return replace(capture, read_from=transforms.sources)
+    centers = [-rotation.T @ translation for _, rotation, translation in transforms.images.values()]
+    return replace(capture, read_from=transforms.sources, normalization=find_normalization(centers))
 
 
 def read_photos(

@@ -13,6 +13,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from gsbench.normalization import IDENTITY, Normalization
+
 Array = NDArray[np.float64]
 
 EXTENT_MARGIN = 1.1  # 3DGS: cameras_extent = 1.1 x the largest distance of a training camera to their mean
@@ -58,6 +60,12 @@ class Camera:
         """The camera centre in world units, [3]."""
         return -self.rotation.T @ self.translation
 
+    def in_own_coordinates(self, normalization: Normalization) -> Camera:
+        """This camera of the training, as it stands in the coordinates that the scene was given in."""
+        if normalization.is_identity:
+            return self
+        return replace(self, translation=-self.rotation @ normalization.undo(self.center))
+
     def resized(self, width: int, height: int) -> Camera:
         """The same camera for the same image at another size in pixels."""
         sx, sy = width / self.width, height / self.height
@@ -95,7 +103,8 @@ class Capture:
     reference cameras, or None for bare photographs; ``exact_poses`` says that its poses are the truth (a procedural
     scene), not an estimate. ``masks`` are mask files by image name; it is empty if every pixel counts. ``fingerprint``
     is a sha256 over names and contents of the selected images, their masks and the model. ``read_from`` are further
-    files of the user that the cameras were read from.
+    files of the user that the cameras were read from. ``normalization`` maps the coordinates in which ``model`` was
+    given to those of the training.
     """
 
     name: str
@@ -108,6 +117,7 @@ class Capture:
     held_out: str = ""
     masks: Mapping[str, Path] = field(default_factory=dict)
     read_from: tuple[Path, ...] = ()
+    normalization: Normalization = IDENTITY
 
     @property
     def train_names(self) -> tuple[str, ...]:

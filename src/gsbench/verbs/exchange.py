@@ -13,6 +13,7 @@ from gsbench.analysis.results import load_experiment
 from gsbench.errors import InputError
 from gsbench.eval.protocol import PROTOCOLS
 from gsbench.files import atomic, writable_output
+from gsbench.normalization import Normalization
 from gsbench.runs.keys import INIT
 from gsbench.runs.layout import STORE
 from gsbench.settings import is_folder_name
@@ -90,7 +91,8 @@ def export(argv: Sequence[str], runs: Path) -> int:
         check_form(out)
     with writable_output(out):
         if is_init:
-            export_init(trial.path.parents[3] / STORE / INIT.name / trial.record.hashes[INIT.name], out)
+            entry = trial.path.parents[3] / STORE / INIT.name / trial.record.hashes[INIT.name]
+            export_init(entry, out, trial.record.to_training)
         else:
             with atomic(out, sync=False) as temporary:
                 shutil.copyfile(model_file(trial), temporary)
@@ -126,10 +128,10 @@ def check_form(out: Path) -> None:
         )
 
 
-def export_init(entry: Path, out: Path) -> None:
+def export_init(entry: Path, out: Path, normalization: Normalization) -> None:
     """Copy the COLMAP model of the stage result ``entry`` to `MODEL_FOLDER` of ``out``, as 3DGS trainers read it.
 
-    Raises InputError if ``out`` has a folder of models.
+    It gets the coordinates in which the scene was given. Raises InputError if ``out`` has a folder of models.
     """
     from gsbench.init.base import MODEL_FOLDER
 
@@ -140,6 +142,12 @@ def export_init(entry: Path, out: Path) -> None:
     if first.exists():
         raise InputError(f"{first} exists already: give another --out")
     shutil.copytree(model, out / MODEL_FOLDER)
+    if not normalization.is_identity:
+        from gsbench.scene.colmap import normalize_model, read_model
+
+        moved = read_model(model)
+        normalize_model(moved, normalization, undo=True)
+        moved.write_binary(out / MODEL_FOLDER)
 
 
 def pool(argv: Sequence[str], runs: Path) -> int:

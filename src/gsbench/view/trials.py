@@ -108,7 +108,8 @@ def model_file(trial: TrialResult) -> Path:
 
 def load_viewed(trial: TrialResult, device: torch.device) -> ViewedTrial:
     """Read everything that the viewer draws of ``trial``; raises InputError naming a missing or damaged file."""
-    gaussians = read_ply(model_file(trial), device)
+    # A page's numbers are float32, so the viewer works in the coordinates of the training.
+    gaussians = read_ply(model_file(trial), device, trial.record.to_training)
     model_dir = _model_folder(trial)
     background = trial.config.get("train.background", (0.0, 0.0, 0.0))
     return ViewedTrial(

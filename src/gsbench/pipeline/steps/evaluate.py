@@ -20,6 +20,7 @@ from PIL import Image, ImageDraw, ImageFont
 from gsbench.densify.volumetric import log_volume
 from gsbench.eval.evaluator import Evaluator, quantize, summarize
 from gsbench.eval.facts import to_record
+from gsbench.eval.protocol import Protocol
 from gsbench.events import Cause
 from gsbench.files import write_json
 from gsbench.gaussians.model import MAX_SH_DEGREE, Gaussians
@@ -176,8 +177,33 @@ def _write_metrics(
         facts = {view.name: facts[view.name] | {COUNTED: view.counted} for view in scene.test}
     write_per_view(folder / PER_VIEW, {view: dict(row) | facts.get(view, {}) for view, row in per_view.items()})
     summary = summary_of(evaluator, per_view)
-    summary = replace(summary, at=dict(at), unavailable=summary.unavailable | dict(unavailable))
+    summary = replace(
+        summary,
+        at=dict(at),
+        unavailable=summary.unavailable | dict(unavailable),
+        one_color_psnr=one_color_psnr(scene, evaluator.protocol),
+    )
     write_json(folder / METRICS, summary.to_json())
+
+
+def one_color_psnr(scene: Scene, protocol: Protocol) -> float | None:
+    """The mean PSNR in dB of a picture in the training views' mean colour; a trained model must beat it.
+
+    None without test views.
+    """
+    if not scene.test:
+        return None
+    sums, count = np.zeros(3), 0
+    for view in scene.train:
+        pixels = view.image.reshape(-1, 3) if view.mask is None else view.image[view.mask]  # [P, 3]
+        sums, count = sums + pixels.sum(axis=0, dtype=np.float64), count + len(pixels)
+    color = np.rint(sums / count).astype(np.uint8)
+    evaluator = Evaluator(protocol, lpips=(), flip=False)
+    values = [
+        evaluator.evaluate_view(np.broadcast_to(color, view.image.shape).copy(), view.image, view.mask)["psnr"]
+        for view in scene.test
+    ]
+    return float(np.mean(values))
 
 
 def summary_of(evaluator: Evaluator, per_view: Mapping[str, Mapping[str, float]]) -> Evaluation:

@@ -4,7 +4,7 @@ Photographs are read from the user's folder, masked, and resized to views; the t
 """
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
@@ -32,7 +32,7 @@ from gsbench.runs.keys import (
 )
 from gsbench.runs.layout import MASKS, VIEWS
 from gsbench.runs.store import Store
-from gsbench.scene.colmap import write_frames
+from gsbench.scene.colmap import normalize_model, read_model, write_frames
 from gsbench.scene.courtyard.render import render_courtyard
 from gsbench.scene.images import IMAGES, image_size, png_name, prepare_photograph, prepared_mask, read_image, write_mask
 from gsbench.scene.load import load_scene
@@ -149,6 +149,30 @@ def masked_capture(capture: Capture, folder: Path) -> Capture:
     """The capture with the images and masks that `masking_step` left in ``folder``."""
     masks = {name: prepared_mask(folder, name) for name in capture.masks}
     return replace(capture, images=folder / IMAGES, masks=masks)
+
+
+def normalizing_step(capture: Capture) -> Step | None:
+    """The step that moves the capture's model to the coordinates of the training; None if it stays where it is.
+
+    It comes before the initialisation, so triangulation and the reading of points work there too.
+    """
+    normalization, model = capture.normalization, capture.model
+    if normalization.is_identity or model is None:
+        return None
+    inputs = {"capture": capture.fingerprint, "normalization": asdict(normalization)}
+
+    def build(folder: Path) -> None:
+        moved = read_model(model)
+        normalize_model(moved, normalization)
+        (folder / MODEL_FOLDER).mkdir(parents=True)
+        moved.write_binary(folder / MODEL_FOLDER)
+
+    return step_of(CAPTURE, inputs, build)
+
+
+def normalized_capture(capture: Capture, step: Step, folder: Path) -> Capture:
+    """The capture with the model that ``step``, a `normalizing_step`, left in ``folder``."""
+    return replace(capture, model=folder / MODEL_FOLDER, fingerprint=step.key)
 
 
 class Views:

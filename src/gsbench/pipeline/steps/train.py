@@ -17,13 +17,14 @@ import numpy as np
 import torch
 
 from gsbench.densify import Densifier, Lineage
+from gsbench.densify.volumetric import Volumetric
 from gsbench.errors import InputError, TrainingError
 from gsbench.external.exchange import collect_model, collect_renders, write_test_cameras, write_training_views
 from gsbench.external.program import run_program
 from gsbench.external.settings import DATA, OUTPUT, TEST_CAMERAS, External, fill_placeholders, split_command
 from gsbench.files import write_json
 from gsbench.gaussians.initial import gaussians_from_cloud
-from gsbench.gaussians.model import Gaussians
+from gsbench.gaussians.model import Gaussians, dc_to_rgb
 from gsbench.gaussians.ply import read_ply, write_ply
 from gsbench.init import read_cloud
 from gsbench.init.base import GAUSSIANS_FILE, MODEL_FOLDER
@@ -31,12 +32,14 @@ from gsbench.logs import progress
 from gsbench.pipeline.steps.scene import Views
 from gsbench.runs.keys import TRAIN, Step, options_of, rasterizer_inputs, step_of
 from gsbench.runs.layout import EVENTS, LINEAGE, POINT_CLOUD, RENDERS, TRAINER_LOG, TRAINING
-from gsbench.runs.trial_record import FROM_MODEL, FROM_RENDERS
+from gsbench.runs.trial_record import FROM_MODEL, FROM_RENDERS, InitialCloud
+from gsbench.scene.types import Capture, Scene
 from gsbench.system.install import own_checkout
 from gsbench.system.machine import describe_machine
 from gsbench.system.own_modules import SAFE_PATH
 from gsbench.system.resources import peak_memory_mb, reset_peak_memory
 from gsbench.train.options import WITHOUT_EFFECT_ON_MODEL
+from gsbench.train.start import check_start
 from gsbench.train.trainer import Status, Trainer
 from gsbench.words import readable_time
 
@@ -70,6 +73,8 @@ def train_step(views: Views, parts: Parts) -> Step:
     def build(folder: Path) -> None:
         scene = views.scene
         initial = initial_gaussians(views.store.path(views.init), device)
+        _log_normalization(views.capture, densifier)
+        start = check_gaussians(initial, scene, parts)
         trainer = Trainer(scene, initial, densifier, rasterizer, options, seed, snapshot_at)
         reset_peak_memory(device)
         with progress("train") as report:
@@ -85,16 +90,41 @@ def train_step(views: Views, parts: Parts) -> Step:
             "iterations": trainer.step,
             "num_init_points": len(initial),
             "num_gaussians": len(gaussians),
-            "scene_extent": scene.extent,
+            "scene_extent": scene.extent / views.capture.normalization.scale,
             "seconds": trainer.seconds,
             "peak_memory_mb": peak_memory_mb(device),
         }
-        _write_training(folder, summary, densifier.lineage, device)
+        _write_training(folder, summary, densifier.lineage, device, start)
 
     return step_of(TRAIN, inputs, build, user)
 
 
-def _write_training(folder: Path, summary: Mapping[str, Any], lineage: Lineage | None, device: torch.device) -> None:
+def check_gaussians(initial: Gaussians, scene: Scene, parts: Parts) -> InitialCloud:
+    """Check the Gaussians that training starts from against the training views (`check_start`)."""
+    colors = (dc_to_rgb(initial.sh_dc).clamp(0, 1) * 255).round().byte()  # [N, 3]
+    # A user's initialiser may be of any class.
+    random_points = getattr(parts.initializer, "random_points", False)
+    return check_start(initial.means.double().cpu().numpy(), colors.cpu().numpy(), scene, random_points)
+
+
+def _log_normalization(capture: Capture, densifier: Densifier) -> None:
+    """Log the coordinates of the training if they are not those of the scene, and V_th in the scene's own units."""
+    normalization = capture.normalization
+    if normalization.is_identity:
+        return
+    log.info(
+        "scene %s: training has its cameras around the origin, at %.6g times the scale (the given centre is %s); "
+        "results get the given coordinates",
+        capture.name, normalization.scale, ", ".join(f"{value:.10g}" for value in normalization.center),
+    )  # fmt: skip
+    if isinstance(densifier, Volumetric) and densifier.threshold_mode == "absolute":
+        own = densifier.volume_threshold / normalization.scale**3
+        log.info("densify.volume_threshold=%g is %.4g cubed units of the scene", densifier.volume_threshold, own)
+
+
+def _write_training(
+    folder: Path, summary: Mapping[str, Any], lineage: Lineage | None, device: torch.device, start: InitialCloud
+) -> None:
     """Write the lineage of a trained model, and the ``summary`` of the training with further facts."""
     causes: dict[str, int] = {}
     if lineage is not None:
@@ -102,7 +132,7 @@ def _write_training(folder: Path, summary: Mapping[str, Any], lineage: Lineage |
         arrays: dict[str, Any] = {name: tensor.numpy() for name, tensor in lineage.state_dict().items()}
         np.savez_compressed(folder / LINEAGE, **arrays)
     machine = {"machine": describe_machine(device), "checkout": own_checkout()}
-    write_json(folder / TRAINING, {**summary, "causes": causes, **machine})
+    write_json(folder / TRAINING, {**summary, "causes": causes, "initial_cloud": start.to_json(), **machine})
 
 
 def initial_gaussians(init: Path, device: torch.device) -> Gaussians:
@@ -144,6 +174,8 @@ def external_step(views: Views, trainer: External, parts: Parts) -> Step:
 
     def build(folder: Path) -> None:
         scene, cloud = views.scene, read_cloud(views.store.path(views.init) / MODEL_FOLDER)
+        normalization = views.capture.normalization
+        start = check_start(cloud.points, cloud.colors, scene, getattr(parts.initializer, "random_points", False))
         executable, work, log_file = trainer.executable(), folder / WORK, folder / TRAINER_LOG
         places = {name: work / name for name in (DATA, TEST_CAMERAS, OUTPUT)}
         values = {name: str(place.resolve()) for name, place in places.items()} | trainer.options
@@ -153,9 +185,9 @@ def external_step(views: Views, trainer: External, parts: Parts) -> Step:
         environment = environment_of(trainer, values)
         version_output = check_version(trainer, values, environment)
         places[OUTPUT].mkdir(parents=True)
-        write_training_views(places[DATA], scene.train, cloud)
+        write_training_views(places[DATA], scene.train, cloud, normalization)
         if trainer.needs_test_cameras:
-            write_test_cameras(places[TEST_CAMERAS], scene.test)
+            write_test_cameras(places[TEST_CAMERAS], scene.test, normalization)
         log.info("train: %s runs; its output: %s", trainer.program, log_file)
         limit = None if trainer.time_limit_minutes is None else 60 * trainer.time_limit_minutes
         try:
@@ -168,7 +200,7 @@ def external_step(views: Views, trainer: External, parts: Parts) -> Step:
         count, lineage = None, None
         try:
             if trainer.leaves_model:
-                count = len(collect_model(places[OUTPUT], pattern, folder / POINT_CLOUD))
+                count = len(collect_model(places[OUTPUT], pattern, folder / POINT_CLOUD, normalization))
                 lineage = Lineage(count)  # without causes: which rule made a Gaussian is unknown here
             else:
                 collect_renders(places[OUTPUT], pattern, trainer.by_order, scene.test, folder / RENDERS)
@@ -181,7 +213,7 @@ def external_step(views: Views, trainer: External, parts: Parts) -> Step:
             "num_gaussians": count,
             "iterations": iterations,
             "num_init_points": len(cloud),
-            "scene_extent": scene.extent,
+            "scene_extent": scene.extent / views.capture.normalization.scale,
             "seconds": ended.seconds,
             # Only the program itself could measure its memory on a GPU.
             "peak_memory_mb": ended.peak_memory_mb if device.type == "cpu" else None,
@@ -194,7 +226,7 @@ def external_step(views: Views, trainer: External, parts: Parts) -> Step:
                 ],
             },
         }
-        _write_training(folder, summary, lineage, device)
+        _write_training(folder, summary, lineage, device, start)
 
     # Its own version: changes of gsbench's trainer do not concern it. A stopped program starts from the beginning.
     stage = replace(TRAIN, version=1, resumable=False)

@@ -1,0 +1,167 @@
+"""Checks of what a training starts from: can its views show the initial points, and do the colours agree?
+
+A cloud in other coordinates, a point far outside, or a camera far from the others still gives a number. Each of these
+is an error or a warning here, before the first iteration. The measured facts are kept with the results.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsbench.errors import InputError
+from gsbench.raster.base import CONSTANTS
+from gsbench.runs.trial_record import InitialCloud
+from gsbench.scene.types import Array, Scene, View
+from gsbench.words import counted
+
+log = logging.getLogger(__name__)
+
+MAX_POINTS = 20_000  # measured, evenly spaced in the cloud's order: the check takes about a second
+FAR = 1e4  # scene extents; no photograph tells the depth of a point so far away
+MAX_DISTANCE = 1e7  # scene extents; squares of such lengths leave the range in which float32 can train
+# Limits of the warnings. Clouds by structure from motion have .97 or more in view and an agreement of .6 to .9; one of
+# another scene or with turned axes has an agreement of -.1 to .2.
+MIN_SEEN = 0.1
+MIN_AGREEMENT = 0.25
+MAX_IDENTICAL = 0.5
+MIN_SPREAD = 0.02  # scene extents
+MIN_COLOR_SPREAD = 1.0  # levels of 255; a cloud of one colour has nothing to agree with
+FAR_CAMERA = 20.0  # times the median distance of the training cameras from their median place
+
+
+def check_start(points: Array, colors: NDArray[np.uint8], scene: Scene, random_points: bool = False) -> InitialCloud:
+    """Measure the initial ``points`` [P, 3] with ``colors`` [P, 3] against the training views; warn below the limits.
+
+    Positions are those of the training. ``random_points`` says that points and colours were drawn at random, so only
+    what nothing can be trained from is a fault. Raises InputError for a start from which nothing can be learnt.
+    """
+    if scene.extent == 0:
+        raise InputError(
+            f"scene {scene.name}: all training cameras stand at one place, so no depth can be learnt: take photographs "
+            "from several places"
+        )
+    centers = np.stack([view.camera.center for view in scene.train])  # [V, 3]
+    middle = np.median(centers, axis=0)
+    distances = np.linalg.norm(points - middle, axis=1) / scene.extent  # [P]
+    farthest = int(distances.argmax())
+    if not distances[farthest] <= MAX_DISTANCE:
+        raise InputError(
+            f"initial point {farthest} of {len(points):,} is {distances[farthest]:.3g} scene extents away from the "
+            f"cameras, at {_place(points[farthest])}: remove it from the cloud"
+        )
+    identical = _identical_share(points)
+    if identical == 1.0:
+        raise InputError(f"the initial points are all at one place, {_place(points[0])}: rebuild the cloud")
+    chosen = np.linspace(0, len(points) - 1, min(len(points), MAX_POINTS)).astype(np.int64)
+    seen_by, shown = _views_of(points[chosen], scene.train)
+    if not seen_by.any():
+        raise InputError(
+            "no training view has one of the initial points in view: the cloud lies in other coordinates than the "
+            "cameras; bring it into theirs"
+        )
+    facts = InitialCloud(
+        seen=float((seen_by >= 2).mean()),
+        color_agreement=_agreement(colors[chosen], shown),
+        identical=identical,
+        far=int((distances > FAR).sum()),
+        spread=float(np.median(np.linalg.norm(points - np.median(points, axis=0), axis=1)) / scene.extent),
+        warnings=[],
+    )
+    warnings = far_cameras(scene) + _doubts(facts, random_points)
+    for line in warnings:
+        log.warning("scene %s: %s", scene.name, line)
+    return replace(facts, warnings=warnings)
+
+
+def _doubts(facts: InitialCloud, random_points: bool) -> list[str]:
+    """The lines that warn of a cloud with these facts."""
+    lines = []
+    if facts.far:
+        lines.append(f"{counted(facts.far, 'initial point')} more than {FAR:g} scene extents away: clean the cloud")
+    if facts.identical > MAX_IDENTICAL:
+        lines.append(f"{facts.identical:.0%} of the initial points share their place with another: thin the cloud")
+    if random_points:
+        return lines
+    elsewhere = "the cloud may lie in other coordinates, or have another scale, than the cameras"
+    if facts.seen < MIN_SEEN:
+        lines.append(f"only {facts.seen:.1%} of the initial points are in view of two training views: {elsewhere}")
+    if facts.spread < MIN_SPREAD:
+        lines.append(f"half of the initial points lie within {facts.spread:.2g} scene extents: {elsewhere}")
+    if facts.color_agreement is not None and facts.color_agreement < MIN_AGREEMENT:
+        lines.append(
+            "the colours of the initial points hardly agree with the photographs (agreement "
+            f"{facts.color_agreement:.2f}; 0 is chance, 1 is equal): {elsewhere}"
+        )
+    return lines
+
+
+def far_cameras(scene: Scene) -> list[str]:
+    """A line for each training camera far from the others: it sets the scene extent, and with it all rates and sizes.
+
+    3DGS takes the extent from the farthest camera. Global structure from motion sometimes leaves such a camera.
+    """
+    centers = np.stack([view.camera.center for view in scene.train])  # [V, 3]
+    distances = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)  # [V]
+    typical = float(np.median(distances))
+    return [
+        f"the camera of {view.name} is {distance / typical:,.0f} times as far from the others as they usually are, and "
+        f"sets the scene extent to {scene.extent:.4g}: check its pose, or leave the image out"
+        for view, distance in zip(scene.train, distances, strict=True)
+        if distance > FAR_CAMERA * typical > 0
+    ]
+
+
+def _place(point: Array) -> str:
+    return f"({', '.join(f'{value:.6g}' for value in point)})"
+
+
+def _identical_share(points: Array) -> float:
+    """The share of ``points`` [P, 3] whose place, as float32, another point has too."""
+    places = np.ascontiguousarray(points.astype(np.float32)).view("V12").ravel()
+    _, counts = np.unique(places, return_counts=True)
+    return float(counts[counts > 1].sum() / len(points))
+
+
+def _views_of(points: Array, views: tuple[View, ...]) -> tuple[NDArray[np.int64], NDArray[np.int16]]:
+    """The number of views that have each point in view, [P], and its colour in the nearest of these, [P, 3], else -1.
+
+    A point is in view if it lies beyond the near plane and within the image. Occlusion is ignored; the nearest view is
+    the least likely to be occluded. Pixels that a mask ignores have no colour.
+    """
+    seen_by = np.zeros(len(points), dtype=np.int64)
+    shown = np.full((len(points), 3), -1, dtype=np.int16)
+    nearest = np.full(len(points), np.inf)
+    for view in views:
+        camera = view.camera
+        local = points @ camera.rotation.T + camera.translation  # [P, 3]
+        (ahead,) = np.nonzero(local[:, 2] > CONSTANTS.near)
+        x, y, z = local[ahead].T
+        column, row = np.floor([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy])
+        inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+        seen, column, row = ahead[inside], column[inside].astype(np.int64), row[inside].astype(np.int64)
+        seen_by[seen] += 1
+        distance = np.linalg.norm(local[seen], axis=1)
+        is_nearer = distance < nearest[seen]
+        if view.mask is not None:
+            is_nearer &= view.mask[row, column]
+        shown[seen[is_nearer]] = view.image[row[is_nearer], column[is_nearer]]
+        nearest[seen[is_nearer]] = distance[is_nearer]
+    return seen_by, shown
+
+
+def _agreement(colors: NDArray[np.uint8], shown: NDArray[np.int16]) -> float | None:
+    """Compare the points' ``colors`` [P, 3] with those ``shown`` in the photographs [P, 3], -1 where there is none.
+
+    1 minus the mean difference over that to the colour shown for another point: 1 is equal, 0 is chance. None if the
+    points or the photographs have one colour, or fewer than two points are shown.
+    """
+    is_shown = shown[:, 0] >= 0
+    own, photograph = colors[is_shown].astype(np.float64), shown[is_shown].astype(np.float64)  # [S, 3]
+    if len(own) < 2 or min(own.std(axis=0).max(), photograph.std(axis=0).max()) < MIN_COLOR_SPREAD:
+        return None
+    others = photograph[np.random.default_rng(0).permutation(len(photograph))]
+    return float(1 - np.abs(own - photograph).mean() / np.abs(own - others).mean())
