@@ -29,7 +29,18 @@ FLOORS = (
     {"gaussians", "datasets", "runs"},
     {"system"},
 )
-GROUND_FLOOR = {"downloads", "errors", "events", "files", "logs", "normalization", "parsing", "settings", "weights", "words"}
+GROUND_FLOOR = {
+    "downloads",
+    "errors",
+    "events",
+    "files",
+    "logs",
+    "normalization",
+    "parsing",
+    "settings",
+    "weights",
+    "words",
+}
 LIBRARY = ("train", "densify", "raster", "eval", "scene", "gaussians", "init", "external")  # usable without the program
 WITHOUT_TORCH = ("analysis", "runs", "datasets", "system", "config", "claims", "cli")
 KNOW_HYDRA = {"app", "config"}

@@ -18,9 +18,9 @@ from numpy.typing import ArrayLike, NDArray
 
 COLMAP_SIZE = 10.0  # units: the diagonal of the cameras' box after COLMAP's Reconstruction::Normalize
 TRIMMED = 0.1  # the share of cameras left out at each end of each axis, as COLMAP does
-MIN_TRIMMED = 3  # of up to so many cameras none is left out
-# A size within this factor of COLMAP's stays. At a third of it, the near plane is at 0.6 of COLMAP's units. None of 660,000
-# observations of two real captures (bonsai, herz_jesus_p25) is nearer than 1.
+MIN_TRIMMED = 6  # cameras; of fewer none is left out
+# A size within this factor of COLMAP's stays. At a third of it, the near plane is at 0.6 of COLMAP's units. None of
+# 660,000 observations of two real captures (bonsai, herz_jesus_p25) is nearer than 1.
 SIZE_FACTOR = 3.0
 # Distances from the origin, in sizes, that stay. float32 then resolves 1e-6 of the size, far less than a pixel.
 MAX_DISTANCE = 10.0
@@ -64,7 +64,7 @@ def find_normalization(centers: ArrayLike) -> Normalization:
     """
     ordered = np.sort(np.asarray(centers, dtype=np.float64).reshape(-1, 3), axis=0)  # [V, 3], each axis by itself
     # COLMAP leaves out none of up to ten cameras. Here a single camera far off must not decide.
-    left_out = max(1, round(TRIMMED * len(ordered))) if len(ordered) > MIN_TRIMMED else 0
+    left_out = max(1, round(TRIMMED * len(ordered))) if len(ordered) >= MIN_TRIMMED else 0
     kept = ordered[left_out : len(ordered) - left_out]
     if not len(kept):
         return IDENTITY

@@ -112,6 +112,12 @@ def _resolution(trial: TrialResult) -> str | None:
     return None if size is None else f"{size[0]}×{size[1]} px"
 
 
+def _start(trial: TrialResult, fact: str, form: str) -> str | None:
+    """A fact of the trial's initial points, formatted; None if it was not measured."""
+    value = getattr(trial.record.initial_cloud, fact, None)
+    return None if value is None else format(value, form)
+
+
 def budget_words(trial: TrialResult) -> str | None:
     """``15,000 Gaussians (governor), 600 s``; "none" without limits, None if the budget is not recorded."""
     budget = trial.record.budget
@@ -137,6 +143,8 @@ MEASURED: dict[str, Callable[[Sequence[TrialResult]], str]] = {
     "pictures": _distinct(_resolution),
     "photographs (hash)": _distinct(lambda trial: trial.record.hashes.get("data", "")[:12]),
     "initial points": _span(lambda trial: trial.record.num_init_points),
+    "initial points in two training views": _distinct(lambda trial: _start(trial, "seen", ".1%")),
+    "agreement of their colours with photographs": _distinct(lambda trial: _start(trial, "color_agreement", ".2f")),
     "initial cloud (hash)": _distinct(lambda trial: trial.cloud[:12]),
     "iterations": _span(lambda trial: trial.record.iterations),
     "rounds of the densifier": _span(lambda trial: len(trial.folder.curves(EVENTS)) or None),

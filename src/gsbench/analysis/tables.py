@@ -106,6 +106,9 @@ def build_table(
     return Table(title or f"Experiment {experiment.name}", tuple(rows), tuple(headings), tuple(shown), tuple(notes))
 
 
+LEARNT_NOTHING = "(!)"  # marks means over a trial that is not better than one colour
+
+
 def format_cell(cell: Cell, quantity: Quantity) -> str:
     """``27.10 ± 0.05``, with the number of trials if it is not the expected one."""
     if cell.mean is None:
@@ -113,6 +116,8 @@ def format_cell(cell: Cell, quantity: Quantity) -> str:
     text = quantity.format(cell.mean)
     if cell.std is not None:
         text += f" ± {quantity.format(cell.std)}"
+    if not quantity.cost and any(trial.record.learnt_nothing for trial in cell.trials):
+        text += f" {LEARNT_NOTHING}"
     return text if cell.count == cell.expected else f"{text} ({cell.count}/{cell.expected})"
 
 
@@ -237,6 +242,7 @@ def _natural(key: Labels) -> tuple[tuple[int, float, str], ...]:
 def trials_notes(experiment: Experiment, trials: Sequence[TrialResult]) -> list[str]:
     """All notes on ``trials`` of an experiment and on its comparisons."""
     return [
+        *doubt_notes(trials),
         *origin_notes(trials),
         *comparison_notes(experiment),
         *held_out_notes(trials),
@@ -244,6 +250,19 @@ def trials_notes(experiment: Experiment, trials: Sequence[TrialResult]) -> list[
         *machine_notes(trials),
         *cloud_notes(trials),
     ]
+
+
+def doubt_notes(trials: Sequence[TrialResult]) -> list[str]:
+    """Lines on results that are worth little: renders not better than one colour, and doubts about initial points."""
+    notes = []
+    for trial in trials:
+        if line := trial.record.learnt_nothing:
+            notes.append(f"{LEARNT_NOTHING} {trial.label} is {line}.")
+    for trial in trials:
+        cloud = trial.record.initial_cloud
+        lines = [] if cloud is None else cloud.warnings
+        notes += [f"Before training, {trial.scene} {trial.init}: {line}." for line in lines]
+    return list(dict.fromkeys(notes))  # trials of one cloud have the same lines
 
 
 def origin_notes(trials: Sequence[TrialResult]) -> list[str]:

@@ -196,6 +196,8 @@ def _run(trial: Trial, folder: TrialFolder) -> TrialRecord:
     metrics = "  ".join(f"{key} {value:.4g}" for key, value in results.metrics.items())
     size = "" if results.num_gaussians is None else f"  {results.num_gaussians} Gaussians"
     log.info("%s: %s%s%s", folder.label, metrics, size, "  (was done)" if was_done else "")
+    if results.learnt_nothing:
+        log.warning("%s: %s", folder.label, results.learnt_nothing)
     return results
 
 

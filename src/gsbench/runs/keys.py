@@ -219,7 +219,7 @@ ROOMS = {
     "scene": ("scene", "init", "normalization.py", "pipeline/steps/scene.py"),
     "init": ("scene", "init", "gaussians", "normalization.py", "weights.py", "pipeline/steps/scene.py"),
     "train": (*MODEL, *LOSS, "external", "pipeline/steps/train.py"),
-    "ground_truth": ("scene", "pipeline/steps/scene.py"),
+    "ground_truth": ("scene", "normalization.py", "pipeline/steps/scene.py"),
     "evaluate": (*MODEL, "eval", "weights.py", "pipeline/steps"),
 }
 VIEWS_ROOMS = ("scene",)  # rooms of the prepared photographs beside the store

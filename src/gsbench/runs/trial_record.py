@@ -111,8 +111,8 @@ class InitialCloud(Record):
     seen: Amount  # the share of points that at least two training views have in view
     color_agreement: Number | None  # with the photographs: 1 is equal, 0 is chance; None for points of one colour
     identical: Amount  # the share of points that share their place with another
-    far: Count  # points more than 10,000 scene extents away
-    spread: Amount  # the median distance of points from their median, in scene extents
+    far: Count  # points more than 10,000 times as far from the cameras' median place as cameras usually are
+    spread: Amount  # the median distance of points from their median place, over that of the training cameras
     warnings: list[str]  # about points and training cameras, as logged
 
 
@@ -166,10 +166,12 @@ class TrialRecord(Record):
     machine: dict[str, str] | None = None
 
     @property
-    def learnt_nothing(self) -> bool:
-        """Whether the renders are not better than one colour."""
-        psnr = self.metrics.get("psnr")
-        return psnr is not None and self.one_color_psnr is not None and psnr <= self.one_color_psnr
+    def learnt_nothing(self) -> str:
+        """A line that the renders are not better than one colour; "" if they are, or if that is not known."""
+        psnr, one_color = self.metrics.get("psnr"), self.one_color_psnr
+        if psnr is None or one_color is None or psnr > one_color:
+            return ""
+        return f"not better than one colour: PSNR {psnr:.2f} dB, the training views' mean colour has {one_color:.2f}"
 
     @property
     def to_training(self) -> Normalization:

@@ -10,7 +10,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from gsbench.errors import InputError
-from gsbench.normalization import Normalization
+from gsbench.normalization import IDENTITY, Normalization
 from gsbench.scene.colmap_files import check_model
 from gsbench.scene.images import check_size, image_size, match_names
 from gsbench.scene.types import Array, Camera, CameraModel, Capture, to_pinhole
@@ -58,6 +58,21 @@ def camera_centers(model: pycolmap.Reconstruction) -> Array:
     """The centres [V, 3] of the images that have a pose, in the order of their ids."""
     posed = [image for _, image in sorted(model.images.items()) if image.has_pose]
     return np.array([image.projection_center() for image in posed], dtype=np.float64).reshape(-1, 3)
+
+
+def normalize_capture(capture: Capture, folder: Path) -> Capture:
+    """The capture in its advised normalisation, with the model that this writes to ``folder``.
+
+    Returns the same capture if none is advised.
+    """
+    normalization = capture.advised_normalization
+    if normalization.is_identity or capture.model is None:
+        return capture
+    model = read_model(capture.model)
+    normalize_model(model, normalization)
+    folder.mkdir(parents=True, exist_ok=True)
+    model.write_binary(folder)
+    return replace(capture, model=folder, normalization=normalization, advised_normalization=IDENTITY)
 
 
 def normalize_model(model: pycolmap.Reconstruction, normalization: Normalization, undo: bool = False) -> None:

@@ -66,7 +66,7 @@ def read_colmap(
         lambda chosen: reference_cameras(model, [model_names[file] for file in chosen]), mask_folder,
     )  # fmt: skip
     # A scene with exact poses is the courtyard, whose units are those of the paper's threshold as they are.
-    return capture if exact_poses else replace(capture, normalization=find_normalization(camera_centers(model)))
+    return capture if exact_poses else replace(capture, advised_normalization=find_normalization(camera_centers(model)))
 
 
 def read_transforms(
@@ -97,7 +97,7 @@ def read_transforms(
         None if masks is None else _subfolder(root, masks, "scene.masks"), transforms.split,
     )  # fmt: skip
     centers = [-rotation.T @ translation for _, rotation, translation in transforms.images.values()]
-    return replace(capture, read_from=transforms.sources, normalization=find_normalization(centers))
+    return replace(capture, read_from=transforms.sources, advised_normalization=find_normalization(centers))
 
 
 def read_photos(

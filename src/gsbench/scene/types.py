@@ -103,8 +103,9 @@ class Capture:
     reference cameras, or None for bare photographs; ``exact_poses`` says that its poses are the truth (a procedural
     scene), not an estimate. ``masks`` are mask files by image name; it is empty if every pixel counts. ``fingerprint``
     is a sha256 over names and contents of the selected images, their masks and the model. ``read_from`` are further
-    files of the user that the cameras were read from. ``normalization`` maps the coordinates in which ``model`` was
-    given to those of the training.
+    files of the user that the cameras were read from. ``advised_normalization`` maps the given coordinates to those in
+    which the scene should be trained (`gsbench.scene.colmap.normalize_capture`). ``normalization`` is the map that was
+    applied to ``model`` already.
     """
 
     name: str
@@ -117,6 +118,7 @@ class Capture:
     held_out: str = ""
     masks: Mapping[str, Path] = field(default_factory=dict)
     read_from: tuple[Path, ...] = ()
+    advised_normalization: Normalization = IDENTITY
     normalization: Normalization = IDENTITY
 
     @property

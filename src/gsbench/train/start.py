@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsbench.errors import InputError
+from gsbench.normalization import IDENTITY, Normalization
 from gsbench.raster.base import CONSTANTS
 from gsbench.runs.trial_record import InitialCloud
 from gsbench.scene.types import Array, Scene, View
@@ -21,41 +22,52 @@ from gsbench.words import counted
 log = logging.getLogger(__name__)
 
 MAX_POINTS = 20_000  # measured, evenly spaced in the cloud's order: the check takes about a second
-FAR = 1e4  # scene extents; no photograph tells the depth of a point so far away
-MAX_DISTANCE = 1e7  # scene extents; squares of such lengths leave the range in which float32 can train
+# Lengths are in sizes of the ring of cameras (`camera_size`).
+FAR = 1e4  # no photograph tells the depth of a point so far away
+MAX_DISTANCE = 1e7  # squares of such lengths leave the range in which float32 can train
 # Limits of the warnings. Clouds by structure from motion have .97 or more in view and an agreement of .6 to .9; one of
 # another scene or with turned axes has an agreement of -.1 to .2.
 MIN_SEEN = 0.1
 MIN_AGREEMENT = 0.25
 MAX_IDENTICAL = 0.5
-MIN_SPREAD = 0.02  # scene extents
+MIN_SPREAD = 0.02
 MIN_COLOR_SPREAD = 1.0  # levels of 255; a cloud of one colour has nothing to agree with
 FAR_CAMERA = 20.0  # times the median distance of the training cameras from their median place
 
 
-def check_start(points: Array, colors: NDArray[np.uint8], scene: Scene, random_points: bool = False) -> InitialCloud:
+def check_start(
+    points: Array,
+    colors: NDArray[np.uint8],
+    scene: Scene,
+    random_points: bool = False,
+    normalization: Normalization = IDENTITY,
+) -> InitialCloud:
     """Measure the initial ``points`` [P, 3] with ``colors`` [P, 3] against the training views; warn below the limits.
 
-    Positions are those of the training. ``random_points`` says that points and colours were drawn at random, so only
-    what nothing can be trained from is a fault. Raises InputError for a start from which nothing can be learnt.
+    Positions are those of the training; messages undo ``normalization``. ``random_points`` says that points and colours
+    were drawn at random, so they need not fit the photographs.
+
+    Raises InputError for a start from which nothing can be learnt.
     """
     if scene.extent == 0:
         raise InputError(
             f"scene {scene.name}: all training cameras stand at one place, so no depth can be learnt: take photographs "
             "from several places"
         )
-    centers = np.stack([view.camera.center for view in scene.train])  # [V, 3]
-    middle = np.median(centers, axis=0)
-    distances = np.linalg.norm(points - middle, axis=1) / scene.extent  # [P]
+    middle, from_middle = camera_distances(scene)
+    # A camera far off sets the extent, but not the median distance. That is 0 if most cameras stand at one place.
+    size = float(np.median(from_middle)) or scene.extent
+    distances = np.linalg.norm(points - middle, axis=1) / size  # [P]
     farthest = int(distances.argmax())
     if not distances[farthest] <= MAX_DISTANCE:
         raise InputError(
-            f"initial point {farthest} of {len(points):,} is {distances[farthest]:.3g} scene extents away from the "
-            f"cameras, at {_place(points[farthest])}: remove it from the cloud"
+            f"initial point {farthest} of {len(points):,} is {distances[farthest]:.3g} times as far from the cameras "
+            f"as they are from each other, at {_place(points[farthest], normalization)}: remove it from the cloud"
         )
     identical = _identical_share(points)
     if identical == 1.0:
-        raise InputError(f"the initial points are all at one place, {_place(points[0])}: rebuild the cloud")
+        place = _place(points[0], normalization)
+        raise InputError(f"the initial points are all at one place, {place}: rebuild the cloud")
     chosen = np.linspace(0, len(points) - 1, min(len(points), MAX_POINTS)).astype(np.int64)
     seen_by, shown = _views_of(points[chosen], scene.train)
     if not seen_by.any():
@@ -68,7 +80,7 @@ def check_start(points: Array, colors: NDArray[np.uint8], scene: Scene, random_p
         color_agreement=_agreement(colors[chosen], shown),
         identical=identical,
         far=int((distances > FAR).sum()),
-        spread=float(np.median(np.linalg.norm(points - np.median(points, axis=0), axis=1)) / scene.extent),
+        spread=float(np.median(np.linalg.norm(points - np.median(points, axis=0), axis=1)) / size),
         warnings=[],
     )
     warnings = far_cameras(scene) + _doubts(facts, random_points)
@@ -81,7 +93,8 @@ def _doubts(facts: InitialCloud, random_points: bool) -> list[str]:
     """The lines that warn of a cloud with these facts."""
     lines = []
     if facts.far:
-        lines.append(f"{counted(facts.far, 'initial point')} more than {FAR:g} scene extents away: clean the cloud")
+        far = counted(facts.far, "initial point")
+        lines.append(f"{far} more than {FAR:,.0f} times as far off as the cameras: clean the cloud")
     if facts.identical > MAX_IDENTICAL:
         lines.append(f"{facts.identical:.0%} of the initial points share their place with another: thin the cloud")
     if random_points:
@@ -90,7 +103,7 @@ def _doubts(facts: InitialCloud, random_points: bool) -> list[str]:
     if facts.seen < MIN_SEEN:
         lines.append(f"only {facts.seen:.1%} of the initial points are in view of two training views: {elsewhere}")
     if facts.spread < MIN_SPREAD:
-        lines.append(f"half of the initial points lie within {facts.spread:.2g} scene extents: {elsewhere}")
+        lines.append(f"half of the initial points lie within {facts.spread:.2g} of the cameras' distances: {elsewhere}")
     if facts.color_agreement is not None and facts.color_agreement < MIN_AGREEMENT:
         lines.append(
             "the colours of the initial points hardly agree with the photographs (agreement "
@@ -104,8 +117,7 @@ def far_cameras(scene: Scene) -> list[str]:
 
     3DGS takes the extent from the farthest camera. Global structure from motion sometimes leaves such a camera.
     """
-    centers = np.stack([view.camera.center for view in scene.train])  # [V, 3]
-    distances = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)  # [V]
+    _, distances = camera_distances(scene)
     typical = float(np.median(distances))
     return [
         f"the camera of {view.name} is {distance / typical:,.0f} times as far from the others as they usually are, and "
@@ -115,8 +127,16 @@ def far_cameras(scene: Scene) -> list[str]:
     ]
 
 
-def _place(point: Array) -> str:
-    return f"({', '.join(f'{value:.6g}' for value in point)})"
+def camera_distances(scene: Scene) -> tuple[Array, Array]:
+    """The median place [3] of the training cameras, and the distance of each from it [V]."""
+    centers = np.stack([view.camera.center for view in scene.train])  # [V, 3]
+    middle = np.median(centers, axis=0)
+    return middle, np.linalg.norm(centers - middle, axis=1)
+
+
+def _place(point: Array, normalization: Normalization) -> str:
+    """The position of a point of the training, in the scene's own coordinates, for a message."""
+    return f"({', '.join(f'{value:.9g}' for value in normalization.undo(point))})"
 
 
 def _identical_share(points: Array) -> float:
@@ -156,12 +176,17 @@ def _views_of(points: Array, views: tuple[View, ...]) -> tuple[NDArray[np.int64]
 def _agreement(colors: NDArray[np.uint8], shown: NDArray[np.int16]) -> float | None:
     """Compare the points' ``colors`` [P, 3] with those ``shown`` in the photographs [P, 3], -1 where there is none.
 
-    1 minus the mean difference over that to the colour shown for another point: 1 is equal, 0 is chance. None if the
-    points or the photographs have one colour, or fewer than two points are shown.
+    1 minus the mean difference over the mean difference to the colours shown for all points: 1 is equal, 0 is chance.
+    None if the points or the photographs have one colour, or fewer than two points are shown.
     """
     is_shown = shown[:, 0] >= 0
-    own, photograph = colors[is_shown].astype(np.float64), shown[is_shown].astype(np.float64)  # [S, 3]
+    own, photograph = colors[is_shown].astype(np.int64), shown[is_shown].astype(np.int64)  # [S, 3]
     if len(own) < 2 or min(own.std(axis=0).max(), photograph.std(axis=0).max()) < MIN_COLOR_SPREAD:
         return None
-    others = photograph[np.random.default_rng(0).permutation(len(photograph))]
-    return float(1 - np.abs(own - photograph).mean() / np.abs(own - others).mean())
+    levels = np.arange(256)
+    apart = np.abs(levels[:, None] - levels)  # [256, 256]
+    chance = 0.0  # the mean over all pairs of a point and a shown colour, by histograms of the channels
+    for channel in range(3):
+        counts, counts_shown = (np.bincount(x[:, channel], minlength=256) / len(own) for x in (own, photograph))
+        chance += counts @ apart @ counts_shown / 3
+    return float(1 - np.abs(own - photograph).mean() / chance)

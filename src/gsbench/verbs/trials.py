@@ -89,10 +89,10 @@ def progress_with_superseded(home: Path) -> list[TrialState]:
 
 
 def lines_of(trials: list[TrialState], with_done: bool) -> list[str]:
-    """A line for each trial that is not done (or for each, ``with_done``), and a summary."""
+    """A line for each trial that is not done, or whose result is in doubt (or for each, ``with_done``); a summary."""
     lines = []
     for trial in sorted(trials, key=lambda trial: ORDER.index(trial.state)):
-        if trial.state != "done" or with_done:
+        if trial.state != "done" or trial.note or with_done:
             label = TrialFolder(trial.folder).label
             lines.append(f"{trial.state:<8} {label:<50} {_age(trial):>12}  {trial.note}".rstrip())
     lines.append(summary_of(trials))

@@ -20,7 +20,9 @@ from gsbench.densify import ADC
 from gsbench.errors import InputError, TrainingError
 from gsbench.external.settings import External
 from gsbench.gaussians.ply import read_ply, write_ply
+from gsbench.init import Random
 from gsbench.init.base import GAUSSIANS_FILE, MODEL_FOLDER
+from gsbench.normalization import Normalization
 from gsbench.pipeline.steps import scene as scene_steps
 from gsbench.pipeline.steps import train as train_steps
 from gsbench.pipeline.steps.scene import init_step
@@ -28,7 +30,7 @@ from gsbench.pipeline.steps.train import external_step, train_step
 from gsbench.raster.reference import ReferenceRasterizer
 from gsbench.runs.keys import INIT, Step, UserCode
 from gsbench.runs.store import Store
-from gsbench.scene.colmap import write_model
+from gsbench.scene.colmap import model_points, read_model, write_model
 from gsbench.scene.types import Capture, Scene, View
 from gsbench.system.own_modules import SAFE_PATH
 from gsbench.train.options import WITHOUT_EFFECT_ON_MODEL, TrainConfig
@@ -54,7 +56,7 @@ def views(tmp_path: Path) -> Any:
     rng = np.random.default_rng(0)
     made = [View(f"{k}.png", orbit_camera(0.1 * k), rng.integers(0, 256, (32, 40, 3), np.uint8)) for k in range(6)]
     store = Store(tmp_path / "store")
-    cloud = (rng.normal(size=(7, 3)), rng.integers(0, 256, (7, 3), np.uint8))
+    cloud = (rng.normal((0, 0, 4), size=(7, 3)), rng.integers(0, 256, (7, 3), np.uint8))
     write_model(store.path(CLOUD_STEP) / MODEL_FOLDER, {view.name: view.camera for view in made}, cloud=cloud)
     scene = Scene("made", tuple(made[2:]), tuple(made[:2]))
     capture = Capture("made", tmp_path, (), (), None, False, "0")
@@ -64,7 +66,7 @@ def views(tmp_path: Path) -> Any:
 def parts_of(seed: int = 5) -> Any:
     return SimpleNamespace(
         values={"densify": {"name": "other"}}, train=SimpleNamespace(iterations=900), seed=seed, threads=3,
-        device=torch.device("cpu"),
+        device=torch.device("cpu"), initializer=Random(),
     )  # fmt: skip
 
 
@@ -111,6 +113,30 @@ def test_a_program_is_given_the_training_views_and_the_settings(
     assert step.key in keys
 
 
+def test_a_program_works_in_the_given_coordinates_and_its_model_is_normalized(views: Any, tmp_path: Path) -> None:
+    normalization = Normalization((5e5, 5.4e6, 300.0), 0.01)
+    views.capture = replace(views.capture, normalization=normalization)
+    given = tmp_path / "given.ply"
+    write_ply(random_gaussians(9, dtype=torch.float32), given, normalization)
+    copied = tmp_path / "copied"
+    code = (
+        f"import shutil, sys; shutil.copytree(sys.argv[1], {str(copied)!r}); shutil.copy({str(given)!r}, sys.argv[2])"
+    )
+    program = External(command=[sys.executable, "-c", code, "{data}", "{output}"], result="*.ply", version="7")
+    folder = tmp_path / "built"
+    folder.mkdir()
+    external_step(views, program, parts_of()).build(folder)
+    seen, inside = read_model(copied / MODEL_FOLDER), read_model(views.store.path(CLOUD_STEP) / MODEL_FOLDER)
+    for view in views.scene.train:
+        center = seen.find_image_with_name(view.name).projection_center()
+        np.testing.assert_allclose(center, np.array(normalization.center) + view.camera.center / 0.01, atol=1e-6)
+    wanted_points = np.array(normalization.center) + model_points(inside)[0] / 0.01
+    np.testing.assert_allclose(model_points(seen)[0], wanted_points, atol=1e-6)
+    kept, wanted = read_ply(folder / "point_cloud.ply"), random_gaussians(9, dtype=torch.float32)
+    torch.testing.assert_close(kept.means, wanted.means, atol=1e-6, rtol=0)
+    torch.testing.assert_close(kept.log_scales, wanted.log_scales, atol=1e-5, rtol=0)
+
+
 @pytest.mark.parametrize(("minutes", "limit"), [(2.5, 150.0), (None, None)])
 def test_a_program_has_the_time_that_is_set(
     views: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, minutes: float | None, limit: float | None
@@ -147,7 +173,7 @@ def test_a_training_leaves_its_model_its_lineage_and_its_summary(
     cpu = torch.device("cpu")
     parts: Any = SimpleNamespace(
         trainer=ADC(), rasterizer=ReferenceRasterizer(), train=TrainConfig(iterations=2), seed=5, device=cpu,
-        measured_earlier=[1], user_code=UserCode(),
+        measured_earlier=[1], user_code=UserCode(), initializer=Random(),
     )  # fmt: skip
     step = train_step(views, parts)
     assert step.inputs["snapshots"] == [1]

@@ -211,8 +211,7 @@ def volume_charts(trials: Sequence[TrialResult], arms: Sequence[Arm]) -> tuple[l
     notes = []
     for arm in arms:
         try:
-            models = [trial.path / layout.POINT_CLOUD for trial in _trials_of(trials, arm)]
-            volumes = np.concatenate([log10_volumes(model) for model in models])
+            volumes = np.concatenate([_volumes_in_training(trial) for trial in _trials_of(trials, arm)])
         except InputError as error:
             notes.append(f"{arm}: no histogram, {error}")
             continue
@@ -226,6 +225,11 @@ def volume_charts(trials: Sequence[TrialResult], arms: Sequence[Arm]) -> tuple[l
         title = f"Volumes during training: {arm}"
         charts.append(line_chart(title, logged, *VOLUME_AXES, log=True, marker=threshold))
     return [chart for chart in charts if chart], notes
+
+
+def _volumes_in_training(trial: TrialResult) -> NDArray[np.float64]:
+    """log10 of the volumes [N] of a trial's Gaussians, in cubed units of its training, as V_th is."""
+    return log10_volumes(trial.path / layout.POINT_CLOUD) + 3 * math.log10(trial.record.to_training.scale)
 
 
 def log10_volumes(path: Path) -> NDArray[np.float64]:

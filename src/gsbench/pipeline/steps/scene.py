@@ -16,6 +16,7 @@ from gsbench.files import file_sha256
 from gsbench.init.base import MODEL_FOLDER, Initializer
 from gsbench.init.placed import GREY, read_points
 from gsbench.logs import Progress, progress
+from gsbench.normalization import IDENTITY
 from gsbench.runs.keys import (
     CAPTURE,
     GROUND_TRUTH,
@@ -32,7 +33,7 @@ from gsbench.runs.keys import (
 )
 from gsbench.runs.layout import MASKS, VIEWS
 from gsbench.runs.store import Store
-from gsbench.scene.colmap import normalize_model, read_model, write_frames
+from gsbench.scene.colmap import normalize_capture, write_frames
 from gsbench.scene.courtyard.render import render_courtyard
 from gsbench.scene.images import IMAGES, image_size, png_name, prepare_photograph, prepared_mask, read_image, write_mask
 from gsbench.scene.load import load_scene
@@ -156,23 +157,25 @@ def normalizing_step(capture: Capture) -> Step | None:
 
     It comes before the initialisation, so triangulation and the reading of points work there too.
     """
-    normalization, model = capture.normalization, capture.model
-    if normalization.is_identity or model is None:
+    if capture.advised_normalization.is_identity:
         return None
-    inputs = {"capture": capture.fingerprint, "normalization": asdict(normalization)}
+    inputs = {"capture": capture.fingerprint, "normalization": asdict(capture.advised_normalization)}
 
     def build(folder: Path) -> None:
-        moved = read_model(model)
-        normalize_model(moved, normalization)
-        (folder / MODEL_FOLDER).mkdir(parents=True)
-        moved.write_binary(folder / MODEL_FOLDER)
+        normalize_capture(capture, folder / MODEL_FOLDER)
 
     return step_of(CAPTURE, inputs, build)
 
 
 def normalized_capture(capture: Capture, step: Step, folder: Path) -> Capture:
     """The capture with the model that ``step``, a `normalizing_step`, left in ``folder``."""
-    return replace(capture, model=folder / MODEL_FOLDER, fingerprint=step.key)
+    return replace(
+        capture,
+        model=folder / MODEL_FOLDER,
+        fingerprint=step.key,
+        normalization=capture.advised_normalization,
+        advised_normalization=IDENTITY,
+    )
 
 
 class Views:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from gsbench.densify import Densifier, Lineage
 from gsbench.densify.volumetric import Volumetric
@@ -29,6 +30,7 @@ from gsbench.gaussians.ply import read_ply, write_ply
 from gsbench.init import read_cloud
 from gsbench.init.base import GAUSSIANS_FILE, MODEL_FOLDER
 from gsbench.logs import progress
+from gsbench.normalization import Normalization
 from gsbench.pipeline.steps.scene import Views
 from gsbench.runs.keys import TRAIN, Step, options_of, rasterizer_inputs, step_of
 from gsbench.runs.layout import EVENTS, LINEAGE, POINT_CLOUD, RENDERS, TRAINER_LOG, TRAINING
@@ -74,7 +76,7 @@ def train_step(views: Views, parts: Parts) -> Step:
         scene = views.scene
         initial = initial_gaussians(views.store.path(views.init), device)
         _log_normalization(views.capture, densifier)
-        start = check_gaussians(initial, scene, parts)
+        start = check_gaussians(initial, scene, parts, views.capture.normalization)
         trainer = Trainer(scene, initial, densifier, rasterizer, options, seed, snapshot_at)
         reset_peak_memory(device)
         with progress("train") as report:
@@ -99,12 +101,18 @@ def train_step(views: Views, parts: Parts) -> Step:
     return step_of(TRAIN, inputs, build, user)
 
 
-def check_gaussians(initial: Gaussians, scene: Scene, parts: Parts) -> InitialCloud:
+def check_gaussians(initial: Gaussians, scene: Scene, parts: Parts, normalization: Normalization) -> InitialCloud:
     """Check the Gaussians that training starts from against the training views (`check_start`)."""
     colors = (dc_to_rgb(initial.sh_dc).clamp(0, 1) * 255).round().byte()  # [N, 3]
+    return check_points(initial.means.double().cpu().numpy(), colors.cpu().numpy(), scene, parts, normalization)
+
+
+def check_points(
+    points: NDArray[np.float64], colors: NDArray[np.uint8], scene: Scene, parts: Parts, normalization: Normalization
+) -> InitialCloud:
+    """Check the points that training starts from against the training views (`check_start`)."""
     # A user's initialiser may be of any class.
-    random_points = getattr(parts.initializer, "random_points", False)
-    return check_start(initial.means.double().cpu().numpy(), colors.cpu().numpy(), scene, random_points)
+    return check_start(points, colors, scene, getattr(parts.initializer, "random_points", False), normalization)
 
 
 def _log_normalization(capture: Capture, densifier: Densifier) -> None:
@@ -175,7 +183,7 @@ def external_step(views: Views, trainer: External, parts: Parts) -> Step:
     def build(folder: Path) -> None:
         scene, cloud = views.scene, read_cloud(views.store.path(views.init) / MODEL_FOLDER)
         normalization = views.capture.normalization
-        start = check_start(cloud.points, cloud.colors, scene, getattr(parts.initializer, "random_points", False))
+        start = check_points(cloud.points, cloud.colors, scene, parts, normalization)
         executable, work, log_file = trainer.executable(), folder / WORK, folder / TRAINER_LOG
         places = {name: work / name for name in (DATA, TEST_CAMERAS, OUTPUT)}
         values = {name: str(place.resolve()) for name, place in places.items()} | trainer.options

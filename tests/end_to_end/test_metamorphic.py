@@ -1,0 +1,212 @@
+"""What leaves a capture as it is must leave its result: place, scale, rotation, names, formats, order.
+
+A similarity may change a result as another seed does. Other names, or another format of the same values, may not
+change one bit.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+import statistics
+import tempfile
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from hypothesis import Phase, given, settings
+from hypothesis import strategies as st
+from PIL import Image
+from plyfile import PlyData
+from scipy.spatial.transform import Rotation
+
+from gsbench.cli import run
+from gsbench.files import file_sha256
+from gsbench.scene.colmap import write_model
+from gsbench.scene.courtyard.render import courtyard_cameras, render_courtyard
+from gsbench.scene.types import Camera
+from tests.end_to_end.conftest import trial_of
+
+pytestmark = pytest.mark.slow
+
+QUICK = [
+    "densify=adc", "train.iterations=400", "train.position_steps=400", "train.densify_start=100",
+    "train.densify_interval=100", "train.densify_stop=350", "eval.lpips=[]", "eval.flip=false", "tracking=none",
+    "threads=1", "raster=cpu", "init=dataset",
+]  # fmt: skip
+train = partial(trial_of, QUICK)
+COLMAP = "scene=colmap"
+VIEWS, WIDTH, HEIGHT = 14, 96, 72
+SEEDS = 4
+Change = Callable[[Path, pycolmap.Reconstruction], None]
+
+
+@pytest.fixture(scope="module")
+def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A COLMAP folder of the courtyard with exact cameras, and a cloud in the photographs' colours."""
+    folder = tmp_path_factory.mktemp("made") / "good"
+    render_courtyard(folder, VIEWS, WIDTH, HEIGHT)
+    cameras = courtyard_cameras(VIEWS, WIDTH, HEIGHT)
+    shutil.rmtree(folder / "sparse")
+    write_model(folder / "sparse/0", cameras, cloud=surroundings(cameras, folder / "images"))
+    return folder
+
+
+def surroundings(cameras: dict[str, Camera], images: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Points [P, 3] of the ground, z = 0, and of a round wall, each in the colour of the last camera with it in view."""
+    random = np.random.default_rng(0)
+    angles, heights = random.uniform(0, 2 * np.pi, 1500), random.uniform(0, 6, 1500)
+    wall = np.stack([7 * np.cos(angles), 7 * np.sin(angles), heights], axis=1)
+    points = np.concatenate([random.uniform(-4, 4, (1500, 3)) * [1, 1, 0], wall])
+    colors = np.full(points.shape, 128, dtype=np.uint8)
+    for name, camera in cameras.items():
+        x, y, z = camera.rotation @ points.T + camera.translation[:, None]
+        columns, rows = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+        inside = (z > 0.5) & (columns > 0) & (columns < camera.width) & (rows > 0) & (rows < camera.height)
+        picture = np.asarray(Image.open(images / name))
+        colors[inside] = picture[rows[inside].astype(int), columns[inside].astype(int)]
+    return points, colors
+
+
+@pytest.fixture(scope="module")
+def original(good: Path, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Trials of the capture as it is, one for each seed."""
+    runs = tmp_path_factory.mktemp("runs")
+    return [train(runs / str(seed), good, COLMAP, f"seed={seed}") for seed in range(SEEDS)]
+
+
+def psnr_of(trial: Path) -> float:
+    return float(json.loads((trial / "results.json").read_text())["metrics"]["psnr"])
+
+
+def require_same_up_to_a_seed(trial: Path, original: list[Path]) -> None:
+    values = [psnr_of(one) for one in original]
+    assert abs(psnr_of(trial) - statistics.fmean(values)) < 4 * statistics.stdev(values), values
+
+
+def copy_of(good: Path, folder: Path, change: Change, text: bool = False) -> Path:
+    """A copy of the capture ``good`` whose photographs and model ``change`` has changed."""
+    shutil.copytree(good / "images", folder / "images")
+    model = pycolmap.Reconstruction(good / "sparse/0")
+    change(folder, model)
+    (folder / "sparse/0").mkdir(parents=True, exist_ok=True)
+    (model.write_text if text else model.write_binary)(folder / "sparse/0")
+    return folder
+
+
+@settings(max_examples=6, phases=[Phase.generate])  # each example trains, so none is made simpler
+@given(st.floats(-4, 4), st.floats(0, 7), st.integers(0, 10**6))
+def test_a_similarity_changes_a_result_no_more_than_a_seed_does(
+    good: Path, original: list[Path], log_scale: float, log_shift: float, rotation_seed: int
+) -> None:
+    random = Rotation.random(random_state=rotation_seed)
+    shift = 10**log_shift * random.apply([0.6, -0.7, 0.39])
+    similarity = pycolmap.Sim3d(10**log_scale, pycolmap.Rotation3d(random.as_quat()), shift)
+    with tempfile.TemporaryDirectory() as scratch:
+        moved = copy_of(good, Path(scratch) / "moved", lambda _, model: model.transform(similarity))
+        trial = train(Path(scratch) / "runs", moved, COLMAP)
+        require_same_up_to_a_seed(trial, original)
+        require_given_coordinates(trial, original[0], similarity, Path(scratch) / "exported", moved)
+
+
+def require_given_coordinates(
+    trial: Path, untouched: Path, similarity: pycolmap.Sim3d, exported: Path, capture: Path
+) -> None:
+    """Check that the trial's Gaussians and cameras lie where the given model lies."""
+    own, before = (PlyData.read(str(one / "point_cloud.ply"))["vertex"].data for one in (trial, untouched))
+    back = similarity.inverse()
+    positions, positions_before = (np.column_stack([table[axis] for axis in "xyz"]) for table in (own, before))
+    restored = np.array([back * point for point in positions.astype(np.float64)])
+    # Trainings differ as two seeds do, so their clouds have the same middle and spread, within a tenth of a unit.
+    for share in (0.1, 0.5, 0.9):
+        np.testing.assert_allclose(
+            np.quantile(restored, share, axis=0), np.quantile(positions_before, share, axis=0), atol=0.5
+        )
+    sizes, sizes_before = (np.median(table["scale_0"]) for table in (own, before))
+    assert sizes - math.log(similarity.scale) == pytest.approx(sizes_before, abs=0.5)
+    assert run(["export", "init", str(trial), "--out", str(exported)]) == 0
+    given_model, exported_model = (pycolmap.Reconstruction(folder / "sparse/0") for folder in (capture, exported))
+    resolution = 1e-8 * similarity.scale + 1e-15 * np.abs(similarity.translation).max()
+    for image in given_model.images.values():
+        center = exported_model.find_image_with_name(image.name).projection_center()
+        np.testing.assert_allclose(center, image.projection_center(), atol=100 * resolution)
+
+
+def rename(folder: Path, model: pycolmap.Reconstruction) -> None:
+    """Give each image another name of the same order, in a folder of its own."""
+    (folder / "images/a").mkdir()
+    for image in model.images.values():
+        new = f"a/IMG {image.name}"
+        (folder / "images" / image.name).rename(folder / "images" / new)
+        image.name = new
+
+
+def convert(suffix: str, folder: Path, model: pycolmap.Reconstruction) -> None:
+    """Write each photograph in another lossless format; the model keeps its names."""
+    for file in sorted((folder / "images").iterdir()):
+        Image.open(file).save(file.with_suffix(suffix), **({"lossless": True} if suffix == ".webp" else {}))
+        file.unlink()
+
+
+def as_opencv(folder: Path, model: pycolmap.Reconstruction) -> None:
+    """Write PINHOLE cameras as OPENCV with zero distortion, as many exporters do."""
+    for camera in model.cameras.values():
+        params = [*camera.params, 0.0, 0.0, 0.0, 0.0]
+        camera.model, camera.params = pycolmap.CameraModelId.OPENCV, params
+
+
+def as_distorted(name: str, zeros: int, folder: Path, model: pycolmap.Reconstruction) -> None:
+    """Write cameras with one focal length under a model with zero coefficients."""
+    for camera in model.cameras.values():
+        fx, _, cx, cy = camera.params
+        camera.model, camera.params = pycolmap.CameraModelId.__members__[name], [fx, cx, cy, *[0.0] * zeros]
+
+
+def other_place(folder: Path, model: pycolmap.Reconstruction) -> None:
+    """Put files into the folder that are no part of the capture."""
+    (folder / "notes.txt").write_text("not a photograph")
+    (folder / "images/.DS_Store").write_text("")
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        pytest.param(other_place, True, id="a text model"),
+        pytest.param(rename, False, id="other names"),
+        pytest.param(partial(convert, ".bmp"), False, id="BMP"),
+        pytest.param(partial(convert, ".tif"), True, id="TIFF"),
+        pytest.param(partial(convert, ".webp"), False, id="WebP"),
+        pytest.param(as_opencv, False, id="OPENCV"),
+        pytest.param(partial(as_distorted, "SIMPLE_RADIAL", 1), False, id="SIMPLE_RADIAL"),
+        pytest.param(partial(as_distorted, "RADIAL", 2), True, id="RADIAL"),
+        pytest.param(partial(as_distorted, "SIMPLE_PINHOLE", 0), True, id="SIMPLE_PINHOLE"),
+    ],
+)
+def test_another_name_or_format_changes_no_bit(
+    good: Path, original: list[Path], tmp_path: Path, change: Change, text: bool
+) -> None:
+    trial = train(tmp_path / "runs", copy_of(good, tmp_path / "copy", change, text), COLMAP)
+    assert file_sha256(trial / "point_cloud.ply") == file_sha256(original[0] / "point_cloud.ply")
+    renders, before = (sorted((one / "renders").iterdir()) for one in (trial, original[0]))
+    assert [file_sha256(file) for file in renders] == [file_sha256(file) for file in before]
+
+
+def test_transforms_json_gives_the_result_of_the_colmap_model(good: Path, original: list[Path], tmp_path: Path) -> None:
+    folder = tmp_path / "frames"
+    shutil.copytree(good / "images", folder / "images")
+    model = pycolmap.Reconstruction(good / "sparse/0")
+    frames = []
+    for image in model.images.values():
+        world_from_camera = np.eye(4)
+        world_from_camera[:3] = image.cam_from_world().inverse().matrix()
+        matrix = world_from_camera @ np.diag([1.0, -1.0, -1.0, 1.0])
+        frames.append({"file_path": f"images/{image.name}", "transform_matrix": matrix.tolist()})
+    fx, fy, cx, cy = next(iter(model.cameras.values())).params
+    model.export_PLY(folder / "points.ply")
+    shared = {"w": WIDTH, "h": HEIGHT, "fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, "ply_file_path": "points.ply"}
+    (folder / "transforms.json").write_text(json.dumps(shared | {"frames": frames}))
+    require_same_up_to_a_seed(train(tmp_path / "runs", folder, "scene=transforms"), original)

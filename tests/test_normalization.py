@@ -1,0 +1,81 @@
+"""The frame of a training: none for models as COLMAP leaves them, COLMAP's own for all others."""
+
+from __future__ import annotations
+
+import numpy as np
+import pycolmap
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from gsbench.normalization import COLMAP_SIZE, IDENTITY, Normalization, find_normalization
+
+SEEDS = st.integers(0, 10**6)
+
+
+def cameras(seed: int, count: int) -> np.ndarray:
+    """Centres [V, 3] on a ring, on a plane, or in a box, of size about 1."""
+    rng = np.random.default_rng(seed)
+    if seed % 3 == 0:
+        angles = np.sort(rng.uniform(0, 2 * np.pi, count))
+        return np.stack([np.cos(angles), np.sin(angles), 0.1 * rng.normal(size=count)], axis=1)
+    return rng.uniform(-1, 1, (count, 3)) * ([1, 1, 0.05] if seed % 3 == 1 else [1, 1, 1])
+
+
+def as_colmap_leaves(centers: np.ndarray) -> np.ndarray:
+    """The centres after COLMAP's own normalisation of a model."""
+    model = pycolmap.Reconstruction()
+    model.add_camera_with_trivial_rig(pycolmap.Camera.create_from_model_name(1, "PINHOLE", 50.0, 40, 30))
+    for index, center in enumerate(centers):
+        image = pycolmap.Image(name=f"{index}.png", camera_id=1, image_id=index + 1)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(np.column_stack([np.eye(3), -center])))
+    model.normalize()
+    return np.array([image.projection_center() for _, image in sorted(model.images.items())])
+
+
+@given(SEEDS, st.integers(8, 200))
+def test_models_as_colmap_leaves_them_are_not_touched(seed: int, count: int) -> None:
+    assert find_normalization(as_colmap_leaves(cameras(seed, count))) is IDENTITY
+
+
+@given(SEEDS, st.integers(3, 60), st.floats(-4, 4), st.floats(0, 7))
+def test_a_similarity_leaves_the_normalized_cameras_as_they_are(
+    seed: int, count: int, log_scale: float, log_shift: float
+) -> None:
+    centers = cameras(seed, count)
+    normalization = find_normalization(centers)  # a size of about 1 is not ordinary
+    assert not normalization.is_identity
+    moved = 10**log_scale * centers + 10**log_shift * np.array([0.6, -0.7, 0.4])
+    again = find_normalization(moved)
+    own, other = normalization.apply(centers), again.apply(moved)
+    if again.scale != 1:
+        np.testing.assert_allclose(other, own, atol=2e-3)  # float64 at 1e7 resolves 2e-9, and the size may be 1e-4
+        assert COLMAP_SIZE / 4 < np.ptp(other, axis=0).max() < 6 * COLMAP_SIZE
+    np.testing.assert_allclose(again.undo(other), moved, rtol=1e-12, atol=1e-12 * np.abs(moved).max())
+
+
+@given(SEEDS, st.integers(8, 40), st.floats(3, 12))
+def test_one_camera_far_off_does_not_decide(seed: int, count: int, log_distance: float) -> None:
+    centers = as_colmap_leaves(cameras(seed, count))
+    before = find_normalization(centers)
+    centers[seed % count] += 10**log_distance * np.array([0.2, -0.9, 0.4])
+    after = find_normalization(centers)
+    assert 0.2 < after.scale / before.scale < 5
+
+
+def test_a_rotation_changes_the_scale_by_less_than_two() -> None:
+    centers = cameras(3, 30)
+    scales = [find_normalization(Rotation.random(random_state=k).apply(centers)).scale for k in range(20)]
+    assert max(scales) / min(scales) < 2
+
+
+@pytest.mark.parametrize("centers", [np.zeros((0, 3)), np.ones((5, 3)), np.full((3, 3), 5.4e6)])
+def test_cameras_at_one_place_have_no_size_to_go_by(centers: np.ndarray) -> None:
+    assert find_normalization(centers) is IDENTITY
+
+
+@pytest.mark.parametrize(("center", "scale"), [((0, 0, 0), 0), ((0, 0, 0), -1), ((0, float("nan"), 0), 1)])
+def test_a_normalization_from_a_file_must_make_sense(center: tuple, scale: float) -> None:
+    with pytest.raises(ValueError, match="positive scale"):
+        Normalization(center, scale)
