@@ -14,7 +14,8 @@ from PIL import Image
 
 from gsbench.errors import InputError
 from gsbench.logs import no_progress
-from gsbench.scene.colmap import read_model
+from gsbench.scene.colmap import plain_camera, read_model
+from gsbench.scene.distortion import largest_distortion
 from gsbench.scene.load import Downscaling, ImageToPrepare, load_scene, prepare_all, undistort
 from gsbench.scene.options import SplitRule
 from gsbench.scene.readers import read_colmap
@@ -70,6 +71,50 @@ def test_spots_land_where_a_pinhole_sees_them(name: str):
         np.testing.assert_allclose(center / window.sum(), [x, y], atol=0.12)
         found += 1
     assert found == len(SPOTS)
+
+
+PERSPECTIVE = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "FOV", "SIMPLE_DIVISION", "DIVISION", "EUCM")
+
+
+@pytest.mark.parametrize("amount", [0.0, 1e-7, 1.0])
+@pytest.mark.parametrize("name", MODELS)
+def test_a_point_is_seen_at_the_pixel_where_pycolmap_undistorts_it(make_scene, tmp_path: Path, name: str, amount):
+    """Zero and tiny coefficients leave pixels alone in perspective models, and in no fisheye."""
+    plain = pycolmap.Camera.create_from_model_name(1, name, 150.0, WIDTH, HEIGHT)
+    params = np.array(MODELS[name], dtype=float)
+    neutral = {"EUCM": [0.0, 1.0], "FOV": [0.0]}.get(name, np.zeros(len(plain.extra_params_idxs())))
+    extra = list(plain.extra_params_idxs())
+    params[extra] = np.array(neutral) + amount * (params[extra] - neutral)
+    capture = read_colmap("toy", make_scene(size=(WIDTH, HEIGHT), model=name, params=params))
+    scene = load_scene(capture, capture.model, tmp_path / "cache")
+    model = pycolmap.Reconstruction(capture.model)
+    source = model.cameras[1]
+    for view in (scene.train[0], scene.test[0]):
+        image = model.find_image_with_name(view.name)
+        stored = np.asarray(Image.open(capture.images / view.name))
+        if amount < 1.0 and name in PERSPECTIVE:
+            np.testing.assert_array_equal(view.image, stored)
+            wanted = source
+        else:
+            assert "FISHEYE" in name or name in PERSPECTIVE
+            wanted = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), source)
+            assert view.image.shape[:2] == (wanted.height, wanted.width)
+        for point in np.random.default_rng(0).uniform((-1, -1, 4), (1, 1, 6), (20, 3)):
+            x, y, z = view.camera.rotation @ point + view.camera.translation
+            seen = [view.camera.fx * x / z + view.camera.cx, view.camera.fy * y / z + view.camera.cy]
+            np.testing.assert_allclose(seen, wanted.img_from_cam(image.cam_from_world() * point), atol=1e-3)
+
+
+def test_distortion_below_a_twentieth_of_a_pixel_is_ignored_and_above_it_is_not():
+    corner = np.hypot(WIDTH, HEIGHT) / 2  # px from the centre; f = 1 in these units, so k moves it by k r^3
+    for moved, ignored in ((0.049, True), (-0.049, True), (0.051, False), (-0.051, False)):
+        params = [150.0, WIDTH / 2, HEIGHT / 2, moved / 150.0 / (corner / 150.0) ** 3]
+        camera = pycolmap.Camera(model="SIMPLE_RADIAL", width=WIDTH, height=HEIGHT, params=params)
+        assert largest_distortion(camera) == pytest.approx(abs(moved))
+        assert plain_camera(camera).distorted is not ignored
+    cancelling = [150, 150, 100, 75, 0.1, 0, 0, 0, 0, 0.1, 0, 0]  # (1 + .1 r^2) / (1 + .1 r^2)
+    camera = pycolmap.Camera(model="FULL_OPENCV", width=WIDTH, height=HEIGHT, params=cancelling)
+    assert plain_camera(camera) == CameraModel("PINHOLE", WIDTH, HEIGHT, (150.0, 150.0, 100.0, 75.0))
 
 
 def test_panoramas_are_refused(tmp_path: Path):

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from gsbench.errors import InputError
 from gsbench.normalization import IDENTITY, Normalization
 from gsbench.scene.colmap_files import check_model
+from gsbench.scene.distortion import without_distortion
 from gsbench.scene.images import check_size, image_size, match_names
 from gsbench.scene.types import Array, Camera, CameraModel, Capture, to_pinhole
 
@@ -129,9 +130,10 @@ def read_reference(capture: Capture) -> pycolmap.Reconstruction:
 def rescaled_camera(camera: pycolmap.Camera, width: int, height: int, camera_id: int) -> pycolmap.Camera:
     """The same camera for the same image at another size in px.
 
-    SIMPLE_PINHOLE becomes PINHOLE, because rounded sides scale the focal length differently in x and y. Other models
-    with one focal length scale it by the mean of both scales, as COLMAP does.
+    SIMPLE_PINHOLE becomes PINHOLE, because rounded sides scale the focal length differently in x and y, and so does a
+    camera without distortion. Other models with one focal length scale it by the mean of both scales, as COLMAP does.
     """
+    camera = without_distortion(camera)
     params = list(camera.params)
     model = camera.model
     if model == pycolmap.CameraModelId.SIMPLE_PINHOLE:
@@ -145,7 +147,8 @@ def rescaled_camera(camera: pycolmap.Camera, width: int, height: int, camera_id:
 
 
 def plain_camera(camera: pycolmap.Camera) -> CameraModel:
-    """A COLMAP camera as plain values."""
+    """A COLMAP camera as plain values, as PINHOLE if it has no distortion."""
+    camera = without_distortion(camera)
     return CameraModel(camera.model_name, camera.width, camera.height, tuple(map(float, camera.params)))
 
 

@@ -51,7 +51,7 @@ from gsbench.words import some_of
 log = logging.getLogger(__name__)
 
 PrincipalPoint = Literal["used", "centred"]
-CACHE_VERSION = 1  # to be raised when prepared pixels or the form of cameras.json change
+CACHE_VERSION = 2  # to be raised when prepared pixels or the form of cameras.json change
 CAMERAS_FILE = "cameras.json"
 INTRINSICS = ("width", "height", "fx", "fy", "cx", "cy")
 _CHUNK = 16  # images per isolated process: limits what a crash loses, and progress is reported after each chunk
