@@ -57,7 +57,7 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def surroundings(cameras: dict[str, Camera], images: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Points [P, 3] of the ground, z = 0, and of a round wall, each in the colour of the last camera with it in view."""
+    """Points [P, 3] of the ground, z = 0, and of a round wall, in the colours of a camera with them in view."""
     random = np.random.default_rng(0)
     angles, heights = random.uniform(0, 2 * np.pi, 1500), random.uniform(0, 6, 1500)
     wall = np.stack([7 * np.cos(angles), 7 * np.sin(angles), heights], axis=1)

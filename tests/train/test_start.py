@@ -81,7 +81,7 @@ def test_the_share_in_view_is_that_of_a_loop_over_points_and_views(scene: Scene)
 @pytest.mark.parametrize(
     ("change", "doubt"),
     [
-        (lambda points: points + [1.4, 0.3, 0], "hardly agree"),
+        (lambda points: points - [1.4, 0.3, 0], "hardly agree"),
         (lambda points: (points - [0, 0, 4]) * [-1, -1, 1] + [0, 0, 4], "hardly agree"),
         (lambda points: points / 100 + [0, 0, 3.96], "half of the initial points lie within"),
         (lambda points: points / 100 + [0, 0, 3.96], "hardly agree"),
