@@ -5,6 +5,7 @@ followed; a user's own file is read by its `resolved` path. The content has at m
 values.
 """
 
+import codecs
 import logging
 import math
 import os
@@ -69,6 +70,13 @@ def read_tail(path: Path, count: int) -> bytes:
     with _opened(path) as descriptor:
         os.lseek(descriptor, max(0, os.fstat(descriptor).st_size - count), os.SEEK_SET)
         return os.read(descriptor, count)
+
+
+def without_byte_order_mark(content: bytes) -> bytes:
+    """The content of a text file without UTF-8's byte order mark; raises InputError for UTF-16 and UTF-32."""
+    if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE, codecs.BOM_UTF32_BE)):
+        raise InputError("it is UTF-16 or UTF-32: save it as UTF-8")
+    return content.removeprefix(codecs.BOM_UTF8)
 
 
 def resolved(path: Path) -> Path:

@@ -1,5 +1,7 @@
 """Reading COLMAP models safely, fitting them to the image files, converting their cameras, and writing models."""
 
+import codecs
+import tempfile
 import zlib  # noqa: F401  must be loaded before pycolmap, whose own zlib otherwise crashes Pillow's PNG code
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
@@ -10,7 +12,8 @@ import pycolmap
 from numpy.typing import NDArray
 
 from gsbench.errors import InputError
-from gsbench.scene.colmap_files import check_model
+from gsbench.parsing import without_byte_order_mark
+from gsbench.scene.colmap_files import check_model, model_files, text_names
 from gsbench.scene.distortion import without_distortion
 from gsbench.scene.images import check_size, image_size, match_names
 from gsbench.scene.types import Array, Camera, CameraModel, Capture, to_pinhole
@@ -26,7 +29,7 @@ def read_model(folder: Path) -> pycolmap.Reconstruction:
     """
     check_model(folder)
     try:
-        model = pycolmap.Reconstruction(folder)
+        model = _read(folder)
         _normalize_quaternions(model)
         for image in model.images.values():
             if image.has_pose and not np.isfinite(image.cam_from_world().matrix()).all():
@@ -34,6 +37,23 @@ def read_model(folder: Path) -> pycolmap.Reconstruction:
     except (ValueError, IndexError, RuntimeError, TypeError, MemoryError) as error:
         reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
         raise InputError(f"{folder}: the COLMAP model cannot be read ({reason}): export it again") from error
+    return model
+
+
+def _read(folder: Path) -> pycolmap.Reconstruction:
+    """Read a model that has been checked, and mend what pycolmap's reader of text gets wrong."""
+    files = model_files(folder)
+    if files[0].suffix == ".bin":
+        return pycolmap.Reconstruction(folder)
+    if any(file.read_bytes().startswith(codecs.BOM_UTF8) for file in files):  # pycolmap takes the mark for a record
+        with tempfile.TemporaryDirectory() as copy:
+            for file in files:
+                (Path(copy) / file.name).write_bytes(without_byte_order_mark(file.read_bytes()))
+            return _read(Path(copy))
+    model = pycolmap.Reconstruction(folder)
+    for image_id, name in text_names(folder).items():
+        if image_id in model.images:
+            model.images[image_id].name = name  # pycolmap cuts names at a blank
     return model
 
 

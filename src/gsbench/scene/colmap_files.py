@@ -8,11 +8,13 @@ Layouts: COLMAP's ``src/colmap/scene/reconstruction_io_binary.cc`` and ``reconst
 from __future__ import annotations
 
 import math
+import re
 import struct
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from pathlib import Path
 
 from gsbench.errors import InputError
+from gsbench.parsing import without_byte_order_mark
 
 REQUIRED = ("cameras", "images", "points3D")
 OPTIONAL = ("rigs", "frames")  # since COLMAP 3.12
@@ -128,35 +130,64 @@ def _binary_rig(data: bytes, offset: int, checks: ModelChecks) -> int:
     return offset
 
 
-Lines = Iterator[list[str]]  # the words of each line
+Lines = Iterator[str]
+DECIMAL_COMMA = re.compile(r"(?:^|(?<=\s))-?\d+,\d+(?=\s|$)", re.MULTILINE)
 
 
-def _walk_text(file: Path, record: Callable[[list[str], Lines, ModelChecks], None], checks: ModelChecks) -> None:
-    """Check a file line by line, without comments; ``record`` gets the words of a line and the lines after it."""
-    lines = (line.split() for line in file.read_text(encoding="utf-8").split("\n") if not line.lstrip().startswith("#"))
-    for words in lines:
-        if words:
-            record(words, lines, checks)
+def _walk_text(file: Path, record: Callable[[str, Lines, ModelChecks], None], checks: ModelChecks) -> None:
+    """Check a file line by line, without comments; ``record`` gets a line and the lines after it."""
+    text = without_byte_order_mark(file.read_bytes()).decode()
+    lines = (line.strip() for line in text.split("\n") if not line.lstrip().startswith("#"))
+    try:
+        for line in filter(None, lines):
+            record(line, lines, checks)
+    except ValueError as error:
+        if comma := DECIMAL_COMMA.search(text):
+            raise InputError(f"it has decimal commas ({comma[0].strip()}), where COLMAP writes points") from error
+        raise
+
+
+def text_names(folder: Path) -> dict[int, str]:
+    """The names of the images of the text model in ``folder`` by their ids, with the blanks that they may contain."""
+    checks = _NamesOnly()
+    _walk_text(folder / "images.txt", _text_image, checks)
+    return checks.names
+
+
+def count_images(folder: Path) -> int:
+    """The number of images with a pose in the model in ``folder``; raises `InputError` if it cannot be read."""
+    file = next(file for file in model_files(folder) if file.stem == "images")
+    try:
+        if file.suffix == ".txt":
+            return len(text_names(folder))
+        with file.open("rb") as stream:
+            (count,) = _COUNT.unpack(stream.read(_COUNT.size))
+    except (struct.error, ValueError, IndexError, OSError) as error:
+        raise InputError(f"{file}: its images cannot be counted: export it again, or set scene.sparse") from error
+    return int(count)
 
 
 def _numbers(words: Sequence[str]) -> list[float]:
     return [float(word) for word in words]
 
 
-def _text_camera(words: list[str], _: Lines, checks: ModelChecks) -> None:
+def _text_camera(line: str, _: Lines, checks: ModelChecks) -> None:
+    words = line.split()
     if dict(_MODELS.values()).get(words[1]) != len(words) - 4:
         raise InputError(f"camera {words[0]} is of an unknown model or lacks parameters")
     checks.camera(int(words[0]), words[1], int(words[2]), int(words[3]), _numbers(words[4:]))
 
 
-def _text_image(words: list[str], lines: Lines, checks: ModelChecks) -> None:
-    points = next(lines, [])  # the line after an image holds its 2D points, and may be empty
+def _text_image(line: str, lines: Lines, checks: ModelChecks) -> None:
+    words = line.split(maxsplit=9)  # the name comes last, and may contain blanks
+    points = next(lines, "").split()  # the line after an image holds its 2D points, and may be empty
     if len(words) < 10 or len(points) % 3 or not all(map(math.isfinite, _numbers(points))):
         raise InputError(f"image {words[0]} lacks numbers")
     checks.image(int(words[0]), _numbers(words[1:8]), int(words[8]), words[9], len(points) // 3)
 
 
-def _text_point(words: list[str], _: Lines, checks: ModelChecks) -> None:
+def _text_point(line: str, _: Lines, checks: ModelChecks) -> None:
+    words = line.split()
     track = [int(word) for word in words[8:]]
     if len(words) < 8 or len(track) % 2 or not all(0 <= int(word) <= 255 for word in words[4:7]):
         raise InputError(f"point {words[0]} lacks numbers or has no colour")
@@ -164,7 +195,8 @@ def _text_point(words: list[str], _: Lines, checks: ModelChecks) -> None:
     checks.point(int(words[0]), (x, y, z), zip(track[::2], track[1::2], strict=True))
 
 
-def _text_rig(words: list[str], _: Lines, checks: ModelChecks) -> None:
+def _text_rig(line: str, _: Lines, checks: ModelChecks) -> None:
+    words = line.split()
     at = 4
     for _sensor in range(1, int(words[1])):
         has_pose = int(words[at + 2])
@@ -173,7 +205,8 @@ def _text_rig(words: list[str], _: Lines, checks: ModelChecks) -> None:
         at += 10 if has_pose else 3
 
 
-def _text_frame(words: list[str], _: Lines, checks: ModelChecks) -> None:
+def _text_frame(line: str, _: Lines, checks: ModelChecks) -> None:
+    words = line.split()
     checks.pose(f"frame {words[0]}", _numbers(words[2:9]))
 
 
@@ -237,6 +270,17 @@ class ModelChecks:
                 raise InputError(
                     f"point {point_id} is seen by 2D point {index} of image {image_id}, which is not there"
                 )
+
+
+class _NamesOnly(ModelChecks):
+    """Collects the names of images, and checks nothing."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.names: dict[int, str] = {}
+
+    def image(self, image_id: int, pose: Sequence[float], camera_id: int, name: str, num_points: int) -> None:
+        self.names[image_id] = name
 
 
 def _check_id(number: int, earlier: Collection[int], what: str, largest: int) -> None:

@@ -46,21 +46,30 @@ def match_names(wanted: Iterable[str], files: Iterable[str]) -> dict[str, str]:
     """Map each wanted image name to its file; names without a file are left out.
 
     A file of the same name comes first, then the only file whose path differs in the extension alone (``a.png`` for
-    ``a.JPG``). There is no match if several such files fit a name, or if several names fit such a file.
+    ``a.JPG``), then the only one that differs in capitals too (``IMG_1.JPG`` for ``img_1.jpg``). Raises `InputError` if
+    several such files fit a name, or if several names fit such a file.
     """
-    files = set(files)
-    by_stem: dict[str, list[str]] = defaultdict(list)
-    for file in files:
-        by_stem[stem_of(file)].append(file)
-    matches: dict[str, str] = {}
-    claims: dict[str, list[str]] = defaultdict(list)
-    for name in wanted:
-        if name in files:
-            matches[name] = name
-        elif len(by_stem[stem_of(name)]) == 1:
-            claims[by_stem[stem_of(name)][0]].append(name)
-    exact = set(matches.values())
-    matches.update({names[0]: file for file, names in claims.items() if len(names) == 1 and file not in exact})
+    unmatched, free = dict.fromkeys(wanted), set(files)
+    matches = {name: name for name in unmatched if name in free}
+    for key_of in (stem_of, lambda path: path.casefold(), lambda path: stem_of(path).casefold()):
+        # Better matches come first and take their files, so that a name is never matched to another one's file.
+        free -= set(matches.values())
+        by_key: dict[str, list[str]] = defaultdict(list)
+        for file in free:
+            by_key[key_of(file)].append(file)
+        names_by_key: dict[str, list[str]] = defaultdict(list)
+        for name in unmatched:
+            if name not in matches and key_of(name) in by_key:
+                names_by_key[key_of(name)].append(name)
+        for key, names in names_by_key.items():
+            found = sorted(by_key[key])
+            if len(found) > 1:
+                raise InputError(
+                    f"{names[0]} may be {' or '.join(found)}: keep one of these files, or name one exactly"
+                )
+            if len(names) > 1:
+                raise InputError(f"{found[0]} may be {' or '.join(sorted(names))}: give each image a file of its own")
+            matches[names[0]] = found[0]
     return matches
 
 

@@ -11,7 +11,8 @@ from types import MappingProxyType
 from gsbench.datasets.catalog import how_to_get
 from gsbench.errors import InputError
 from gsbench.files import require_regular
-from gsbench.scene.colmap_files import model_files
+from gsbench.parsing import without_byte_order_mark
+from gsbench.scene.colmap_files import count_images, model_files
 from gsbench.scene.hold_out import CamerasByName, hold_out, select_images
 from gsbench.scene.images import IMAGE_SUFFIXES, check_picture_names, find_masks, match_names
 from gsbench.scene.options import EVERY_NTH, MAX_IMAGES, MIN_IMAGES, TEST_LIST, TRAIN_LIST, SplitRule
@@ -22,7 +23,7 @@ from gsbench.words import counted, some_of
 log = logging.getLogger(__name__)
 
 HEIC_SUFFIXES = frozenset({".heic", ".heif"})  # photographs of telephones; neither Pillow nor COLMAP reads them
-SPARSE_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0")
+SPARSE_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0")  # what a message names; see `_find_sparse` for the others
 
 
 def read_colmap(
@@ -46,7 +47,12 @@ def read_colmap(
     from gsbench.scene.colmap import read_model, reference_cameras, registered_names  # photos alone need no pycolmap
 
     root = existing_folder(name, path)
-    model_folder = _find_sparse(root, sparse)
+    model_folder, others = _find_sparse(root, sparse)
+    if others:
+        log.warning(
+            "%s has %s; %s is read because it has the most images (%s); scene.sparse chooses another",
+            root, counted(len(others) + 1, "COLMAP model"), model_folder.relative_to(root), ", ".join(others),
+        )  # fmt: skip
     folder = _subfolder(root, images or "images", "scene.images")
     model = read_model(model_folder)
     wanted = registered_names(model)
@@ -281,8 +287,8 @@ def _read_list(root: Path, file: str | None, key: str) -> list[str] | None:
     path = root / file  # an absolute path stays as it is
     require_regular(path)
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
+        lines = without_byte_order_mark(path.read_bytes()).decode().splitlines()
+    except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise InputError(f"{key}: {path} cannot be read ({reason}): name a text file of image names") from error
     return [line.strip() for line in lines if line.strip() and not line.startswith("#")]
@@ -298,18 +304,35 @@ def _subfolder(root: Path, folder: str, key: str) -> Path:
     return path
 
 
-def _find_sparse(root: Path, sparse: str | None) -> Path:
+def _find_sparse(root: Path, sparse: str | None) -> tuple[Path, list[str]]:
+    """The folder of the COLMAP model, and the others that were found, each with its number of images.
+
+    COLMAP writes a folder sparse/0, sparse/1, … for each part that it could not connect, in no order of size. The model
+    with the most images is taken, and of equal ones the first.
+    """
     if sparse is not None:
-        folder = root / sparse
-        model_files(folder)
-        return folder
-    for candidate in SPARSE_FOLDERS:
-        try:
-            model_files(root / candidate)
-        except InputError:
-            continue
-        return root / candidate
+        model_files(root / sparse)
+        return root / sparse, []
+    for parent in (root / "sparse", root / "colmap" / "sparse"):
+        numbered = [folder for folder in parent.glob("*") if folder.name.isdecimal() and folder.is_dir()]
+        found = [folder for folder in (*sorted(numbered, key=lambda path: int(path.name)), parent) if _is_model(folder)]
+        if len(found) == 1:
+            return found[0], []
+        if found:
+            counts = {folder: count_images(folder) for folder in found}
+            largest = max(found, key=counts.__getitem__)
+            others = [
+                f"{path.relative_to(root)}: {counted(counts[path], 'image')}" for path in found if path != largest
+            ]
+            return largest, others
     raise InputError(f"{root}: no COLMAP model in {' or '.join(SPARSE_FOLDERS)}: set scene.sparse, or use scene=photos")
+
+
+def _is_model(folder: Path) -> bool:
+    try:
+        return bool(model_files(folder))
+    except InputError:
+        return False
 
 
 def _require_enough(count: int, folder: Path, which: str) -> None:
