@@ -13,9 +13,9 @@ from PIL import Image
 from gsbench.errors import InputError
 from gsbench.scene.colmap import read_model
 from gsbench.scene.hold_out import select_images, split_names
-from gsbench.scene.images import match_names
+from gsbench.scene.images import list_images, match_names
 from gsbench.scene.options import SceneConfig, SplitRule
-from gsbench.scene.readers import list_images, missing_model, read_colmap, read_photos
+from gsbench.scene.readers import missing_model, read_colmap, read_photos
 
 
 @pytest.mark.parametrize("text", [False, True])
