@@ -18,18 +18,8 @@ log = logging.getLogger(__name__)
 
 # Keys that change no photograph, camera or initial point: how another program frames, thins or samples the scene.
 # The box, axes and scale in which instant-ngp and nerfstudio train; gsbench keeps the coordinates of the file.
-FRAMING = (
-    "aabb",
-    "aabb_scale",
-    "render_aabb",
-    "scale",
-    "offset",
-    "up",
-    "from_na",
-    "orientation_override",
-    "near",
-    "far",
-)
+BOX = ("aabb", "aabb_scale", "render_aabb", "near", "far")
+AXES = ("scale", "offset", "up", "from_na", "orientation_override")
 # Data besides photographs, which gsbench does not train on.
 DEPTH = ("depth_file_path", "depth_path", "integer_depth_scale", "enable_depth_loading", "depth_unit_scale_factor")
 OTHER_DATA = ("enable_ray_loading", "normal_file_path", "envmap")
