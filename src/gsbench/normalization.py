@@ -40,7 +40,7 @@ class Normalization:
 
     @property
     def is_identity(self) -> bool:
-        """Whether the scene is trained in its own coordinates."""
+        """Return whether the scene is trained in its own coordinates."""
         return self == IDENTITY
 
     def apply(self, points: ArrayLike) -> NDArray[np.float64]:

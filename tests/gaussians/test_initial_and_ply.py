@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import gzip
 import math
 import os
+import re
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +17,7 @@ from gsbench.errors import InputError
 from gsbench.gaussians.initial import gaussians_from_cloud
 from gsbench.gaussians.model import dc_to_rgb, rgb_to_dc
 from gsbench.gaussians.ply import check_ply, read_ply, write_ply
+from gsbench.init.placed import read_points
 from tests.gaussians.helpers import random_gaussians
 
 
@@ -218,3 +221,99 @@ def test_a_model_without_gaussians_or_without_a_property_is_refused(tmp_path: Pa
         read_ply(tmp_path / "b.ply")
     with pytest.raises(InputError, match=r"missing or odd properties: opacity$"):
         read_ply(rewritten(tmp_path / "a.ply", b" opacity\n", b" opaqueness\n"))
+
+
+def table_of(path: Path, count: int = 4) -> np.ndarray:
+    write_ply(random_gaussians(count), path)
+    return PlyData.read(str(path))["vertex"].data.copy()
+
+
+def save(table: np.ndarray, path: Path) -> Path:
+    PlyData([PlyElement.describe(table, "vertex")]).write(str(path))
+    return path
+
+
+@pytest.mark.parametrize("text", [False, True])
+@pytest.mark.parametrize("change", ["utf-8", "latin-1", "mark", "crlf"])
+def test_headers_of_other_programs_are_read(tmp_path: Path, change: str, text: bool) -> None:
+    table = table_of(tmp_path / "a.ply")
+    PlyData([PlyElement.describe(table, "vertex")], text=text, comments=["made by hand"]).write(str(tmp_path / "b.ply"))
+    header, end, body = (tmp_path / "b.ply").read_bytes().partition(b"end_header\n")
+    if change == "mark":
+        changed = b"\xef\xbb\xbf" + header + end + body
+    elif change == "crlf":
+        changed = (header + end).replace(b"\n", b"\r\n") + (body.replace(b"\n", b"\r\n") if text else body)
+    else:
+        changed = header.replace(b"made by", "gemäß".encode(change)) + end + body
+    (tmp_path / "b.ply").write_bytes(changed)
+    wanted = read_ply(tmp_path / "a.ply")
+    for one, other in zip(read_ply(tmp_path / "b.ply").tensors().values(), wanted.tensors().values(), strict=True):
+        assert torch.equal(one, other)
+    np.testing.assert_array_equal(read_points(tmp_path / "b.ply")[0], wanted.means.double())
+
+
+COMPRESSED = b"ply\nformat binary_little_endian 1.0\nelement chunk 1\nproperty float min_x\nelement vertex 1\n"
+COMPRESSED += b"property uint packed_position\nproperty uint packed_rotation\nend_header\n" + bytes(12)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        ("a.compressed.ply", COMPRESSED, "a compressed PLY, as SuperSplat writes it"),
+        ("a.ply", gzip.compress(b"NGSP"), "the format SPZ"),
+        ("a.ply", b"NGSP" + bytes(9), "the format SPZ"),
+        ("a.ply", b"PK\3\4" + bytes(9), "the format SOG"),
+        ("meta.json", b'{"version": 2}', "the format SOG"),
+        ("a.splat", bytes(32), "the format splat"),
+        ("a.KSPLAT", bytes(32), "the format ksplat"),
+    ],
+)
+def test_other_formats_are_named_with_the_command_that_unpacks_them(tmp_path: Path, name, content, said: str) -> None:
+    (tmp_path / name).write_bytes(content)
+    for read in (read_ply, check_ply, *((read_points,) if name.endswith("ply") else ())):
+        with pytest.raises(InputError, match=f"{said}: unpack it with npx @playcanvas/splat-transform {name} out.ply"):
+            read(tmp_path / name)
+
+
+@pytest.mark.parametrize("kind", ["f4", "f8"])
+def test_opacities_of_zero_and_one_are_read(tmp_path: Path, kind: str, caplog: pytest.LogCaptureFixture) -> None:
+    table = table_of(tmp_path / "a.ply")
+    table = table.astype([(name, kind if name == "opacity" else "f4") for name in table.dtype.names])
+    table["opacity"] = [np.inf, -np.inf, 0.3, np.inf]
+    opacities = torch.sigmoid(read_ply(save(table, tmp_path / "b.ply")).opacity_logits)
+    assert opacities.tolist() == pytest.approx([1, 0, 1 / (1 + np.exp(-0.3)), 1], abs=2e-7)
+    assert ((opacities > 0) & (opacities < 1)).all()  # so that they can be trained
+    assert "3 Gaussians have an opacity of exactly 0 or 1" in caplog.text
+    table["opacity"][2] = np.nan
+    with pytest.raises(InputError, match="opacity is not a finite number everywhere: it is nan in row 2 and in 0 more"):
+        read_ply(save(table, tmp_path / "b.ply"))
+
+
+def test_what_float32_cannot_hold_is_refused(tmp_path: Path) -> None:
+    table = table_of(tmp_path / "a.ply")
+    table = table.astype([(name, "f8" if name == "x" else "f4") for name in table.dtype.names])
+    table["x"][1] = 1e300
+    with pytest.raises(InputError, match=r"x is not a finite number everywhere: it is 1e\+300 in row 1"):
+        read_ply(save(table, tmp_path / "b.ply"))
+
+
+@pytest.mark.parametrize(
+    ("prefix", "values", "said"),
+    [
+        ("scale_", (0.001, 0.5), "all scales are positive"),
+        ("scale_", (-0.001, 0.5), ""),
+        ("opacity", (0.0, 1.0), r"all opacities lie in \[0, 1\]"),
+        ("opacity", (-0.01, 1.0), ""),
+        ("opacity", (0.0, 1.01), ""),
+    ],
+)
+def test_values_that_look_activated_are_warned_of(tmp_path: Path, prefix, values, said: str, caplog) -> None:
+    table = table_of(tmp_path / "a.ply")
+    for name in table.dtype.names:
+        if name.startswith(("scale_", "opacity")):
+            table[name] = -3.0
+        if name.startswith(prefix):
+            table[name] = np.linspace(*values, len(table))
+    read_ply(save(table, tmp_path / "b.ply"))
+    assert bool(caplog.text) is bool(said)
+    assert re.search(said, caplog.text)

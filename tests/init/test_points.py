@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 from dataclasses import replace
 from pathlib import Path
 
@@ -65,6 +66,28 @@ def test_tables(tmp_path: Path, suffix: str, colored: bool):
         np.testing.assert_array_equal(colors, RGB)
     else:
         assert colors is None
+
+
+@pytest.mark.parametrize("suffix", [".xyz", ".csv"])
+def test_a_table_may_have_a_mark_and_line_ends_of_windows(tmp_path: Path, suffix: str):
+    path = tmp_path / f"cloud{suffix}"
+    np.savetxt(path, XYZ, fmt="%.17g", delimiter="," if suffix == ".csv" else " ", newline="\r\n")
+    path.write_bytes(codecs.BOM_UTF8 + path.read_bytes())
+    np.testing.assert_array_equal(read_points(path)[0], XYZ)
+    path.write_text("1 2 3\n", encoding="utf-16")
+    with pytest.raises(InputError, match="UTF-16 or UTF-32: save it as UTF-8"):
+        read_points(path)
+
+
+def test_colours_of_gaussians_are_those_of_their_constant_harmonic(tmp_path: Path):
+    """RGB = .5 + f_dc / (2 sqrt(pi)), clipped: the colour that 3DGS gives a Gaussian without view dependence."""
+    properties = [(name, "f4") for name in (*"xyz", "f_dc_0", "f_dc_1", "f_dc_2")]
+    dc = (RGB / 255 - 0.5) * 2 * np.sqrt(np.pi)
+    dc[0], dc[1] = 9.0, -9.0
+    values = dict(zip("xyz", XYZ.T, strict=True)) | {f"f_dc_{k}": dc[:, k] for k in range(3)}
+    points, colors = read_points(write(tmp_path / "model.ply", properties, values, False, "<"))
+    np.testing.assert_array_equal(points, XYZ)
+    np.testing.assert_array_equal(colors, [[255] * 3, [0] * 3, *RGB[2:]])
 
 
 def test_colours_are_those_of_the_nearest_photograph(courtyard: Capture):

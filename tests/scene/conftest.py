@@ -51,7 +51,7 @@ def make_scene(tmp_path: Path) -> Callable[..., Path]:
         for j, corner in enumerate(corners):
             track = pycolmap.Track([pycolmap.TrackElement(k + 1, j) for k in range(len(names))])
             rec.add_point3D(corner, track, np.array([10 * j, 20, 30], dtype=np.uint8))
-        (folder / sparse).mkdir(parents=True)
+        (folder / sparse).mkdir(parents=True, exist_ok=True)
         (rec.write_text if text else rec.write_binary)(folder / sparse)
         return folder
 

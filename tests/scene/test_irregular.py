@@ -17,9 +17,16 @@ from gsbench.gaussians.ply import check_ply, read_ply
 from gsbench.init.placed import read_points
 from gsbench.scene.colmap import read_model
 from gsbench.scene.colmap_files import check_model
-from gsbench.scene.images import IMAGE_SUFFIXES, check_picture_names, exif_orientation, image_size, read_image
+from gsbench.scene.images import (
+    IMAGE_SUFFIXES,
+    check_picture_names,
+    exif_orientation,
+    image_size,
+    list_images,
+    read_image,
+)
 from gsbench.scene.options import SplitRule
-from gsbench.scene.readers import fingerprint, list_images, read_photos
+from gsbench.scene.readers import fingerprint, read_photos
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes and links of a POSIX system")
 SECONDS = 20

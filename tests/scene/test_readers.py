@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import logging
 import shutil
 from pathlib import Path
@@ -10,10 +11,11 @@ import pytest
 from PIL import Image
 
 from gsbench.errors import InputError
+from gsbench.scene.colmap import read_model
 from gsbench.scene.hold_out import select_images, split_names
-from gsbench.scene.images import match_names
+from gsbench.scene.images import list_images, match_names
 from gsbench.scene.options import SceneConfig, SplitRule
-from gsbench.scene.readers import list_images, missing_model, read_colmap, read_photos
+from gsbench.scene.readers import missing_model, read_colmap, read_photos
 
 
 @pytest.mark.parametrize("text", [False, True])
@@ -58,11 +60,98 @@ def test_files_with_another_extension_and_missing_ones(make_scene, caplog):
     assert "1 of 6 images of the model have no file: cam/5.JPG" in caplog.text
 
 
-def test_match_names_refuses_what_is_ambiguous():
-    assert match_names(["a.JPG", "b.JPG"], ["a.png", "a.tif", "b.png"]) == {"b.JPG": "b.png"}
-    assert match_names(["a.JPG", "a.jpeg"], ["a.png"]) == {}
-    assert match_names(["a.png", "a.JPG"], ["a.png"]) == {"a.png": "a.png"}
-    assert match_names(["frame.001"], ["frame.001.png"]) == {"frame.001": "frame.001.png"}
+@pytest.mark.parametrize(
+    ("wanted", "files", "matches"),
+    [
+        (["b.JPG"], ["b.png"], {"b.JPG": "b.png"}),
+        (["img_1.jpg"], ["IMG_1.JPG"], {"img_1.jpg": "IMG_1.JPG"}),
+        (["cam/img_1.jpg"], ["Cam/IMG_1.PNG", "IMG_1.PNG"], {"cam/img_1.jpg": "Cam/IMG_1.PNG"}),
+        (["img.jpg", "IMG.jpg"], ["IMG.jpg", "img.png"], {"IMG.jpg": "IMG.jpg", "img.jpg": "img.png"}),
+        (["IMG.jpg", "img.jpg"], ["img.png"], {"img.jpg": "img.png"}),
+        (["img.jpg"], ["IMG.JPG", "IMG.png"], {"img.jpg": "IMG.JPG"}),
+        (["ä.jpg"], ["Ä.JPG"], {"ä.jpg": "Ä.JPG"}),
+        (["a.png", "a.JPG"], ["a.png"], {"a.png": "a.png"}),
+        (["b.png", "b.png"], ["b.jpg"], {"b.png": "b.jpg"}),
+        (["frame.001"], ["frame.001.png"], {"frame.001": "frame.001.png"}),
+        (["a.JPG"], ["a.png", "a.tif"], "a.JPG may be a.png or a.tif: keep one"),
+        (["A.JPG"], ["a.png", "a.tif"], "A.JPG may be a.png or a.tif: keep one"),
+        (["a.JPG", "a.jpeg"], ["a.png"], "a.png may be a.JPG or a.jpeg: give each"),
+    ],
+)
+def test_names_match_their_files_or_an_error_names_both(wanted, files, matches):
+    if isinstance(matches, dict):
+        assert match_names(wanted, files) == matches
+        return
+    with pytest.raises(InputError, match=matches):
+        match_names(wanted, files)
+
+
+@pytest.mark.parametrize("text", [False, True])
+@pytest.mark.parametrize(
+    ("models", "chosen"),
+    [
+        ({"sparse/0": 2, "sparse/1": 6}, "sparse/1"),
+        ({"sparse/0": 4, "sparse/1": 4}, "sparse/0"),
+        ({"sparse/0": 4, "sparse": 6}, "sparse"),
+        ({f"sparse/{k}": 3 + (k == 10) for k in range(11)}, "sparse/10"),
+        ({"colmap/sparse/0": 3, "colmap/sparse/2": 5}, "colmap/sparse/2"),
+        ({"sparse/3": 3}, "sparse/3"),
+        ({"sparse/0": 4, "colmap/sparse/0": 6}, "sparse/0"),
+    ],
+)
+def test_of_several_models_the_one_with_the_most_images_is_read(make_scene, caplog, models, chosen, text: bool):
+    for sparse, count in models.items():
+        root = make_scene(names=[f"{k}.png" for k in range(count)], sparse=sparse, text=text)
+    capture = read_colmap("toy", root)
+    assert capture.model == root / chosen
+    assert len(capture.image_names) == models[chosen]
+    others = [sparse for sparse in models if sparse != chosen and sparse.split("/")[0] == chosen.split("/")[0]]
+    assert ("scene.sparse chooses another" in caplog.text) is bool(others)
+    assert all(f"{other}: {models[other]} image" in caplog.text for other in others)
+    assert read_colmap("toy", root, sparse=chosen).model == root / chosen
+    assert missing_model("toy", root, None) == ""
+
+
+def test_a_model_beside_others_whose_images_cannot_be_counted_is_named(make_scene):
+    root = make_scene()
+    make_scene(sparse="sparse/1")
+    (root / "sparse/0/images.bin").write_bytes(b"\1")
+    with pytest.raises(InputError, match=r"sparse/0/images\.bin: its images cannot be counted.*scene\.sparse"):
+        read_colmap("toy", root)
+    assert read_colmap("toy", root, sparse="sparse/1").model == root / "sparse/1"
+
+
+@pytest.mark.parametrize("text", [False, True])
+@pytest.mark.parametrize("mark", [b"", codecs.BOM_UTF8])
+@pytest.mark.parametrize("line_end", [b"\n", b"\r\n"])
+def test_names_with_blanks_are_read_whole_after_any_mark_and_line_end(make_scene, text: bool, mark, line_end):
+    names = [f"my  photo {k}.png" for k in range(6)]
+    root = make_scene(names=names, text=text)
+    for file in (root / "sparse/0").glob("*.txt"):
+        file.write_bytes(mark + file.read_bytes().replace(b"\n", line_end))
+    capture = read_colmap("toy", root)
+    assert list(capture.image_names) == names
+    model = read_model(root / "sparse/0")
+    assert sorted(image.name for image in model.images.values()) == names
+    (root / "tests.txt").write_bytes(mark + names[3].encode() + line_end)
+    assert read_colmap("toy", root, split=SplitRule(test_list="tests.txt")).test_names == (names[3],)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda text: text.encode("utf-16"), "UTF-16 or UTF-32: save it as UTF-8"),
+        (lambda text: text.encode("utf-32"), "UTF-16 or UTF-32: save it as UTF-8"),
+        (lambda text: text.replace(".", ",").encode(), r"decimal commas \(.*\), where COLMAP writes points"),
+    ],
+)
+@pytest.mark.parametrize("stem", ["cameras", "images", "points3D"])
+def test_text_that_colmap_does_not_write_is_named(make_scene, change, said: str, stem: str):
+    root = make_scene(text=True, params=[50.5, 50.5, 20, 15])
+    file = root / f"sparse/0/{stem}.txt"
+    file.write_bytes(change(file.read_text().replace(" 5 ", " 5.5 ")))
+    with pytest.raises(InputError, match=rf"{stem}\.txt: .*{said}"):
+        read_colmap("toy", root)
 
 
 def test_selection_is_even_and_comes_before_the_split(make_scene):

@@ -19,6 +19,7 @@ from gsbench.scene import transforms
 from gsbench.scene.colmap import read_model
 from gsbench.scene.options import SceneConfig
 from gsbench.scene.transforms import read_transforms
+from gsbench.scene.transforms_keys import HARMLESS, REFUSED
 from gsbench.scene.types import Capture
 
 SHARED = {"w": 40, "h": 30, "fl_x": 50.0, "fl_y": 51.0, "cx": 19.5, "cy": 15.5}
@@ -218,8 +219,22 @@ def test_the_file_is_among_what_a_trial_is_made_of(tmp_path: Path) -> None:
         ),
         (lambda d: d.update(applied_scale=0), "applied_scale must be positive"),
         (lambda d: d.update(camera_model="EQUIRECTANGULAR"), "camera_model EQUIRECTANGULAR is not known here"),
-        (lambda d: d.update(k4=0.1), "k3 and k4 are read of OPENCV_FISHEYE alone"),
-        (lambda d: d.pop("fl_x"), "no focal length"),
+        *(
+            (lambda d, key=key: d.update({key: 0.1}), "k4, k5 and k6 are read of OPENCV_FISHEYE and FULL_OPENCV alone")
+            for key in ("k4", "k5", "k6")
+        ),
+        (lambda d: d.update(is_fisheye=True, p1=0.1), "OPENCV_FISHEYE has k1 to k4 alone"),
+        (lambda d: (d.pop("fl_x"), d.pop("fl_y")), "no focal length"),
+        (lambda d: (d.pop("fl_y"), d.update(y_fov=180)), "no focal length"),
+        (lambda d: d.update(fl_y=0), "no focal length"),
+        *(
+            (lambda d, key=key, value=value: d.update({key: value}), f"{key}: {REFUSED[key]}")
+            for key in REFUSED
+            for value in ([0.0, 0.5],)
+        ),
+        (lambda d: d["frames"][2].update(rolling_shutter=[0, 0, 0.1, 0]), r"rolling_shutter \(frame 2\): "),
+        (lambda d: d.update(train_filenames=["images/1.png"], test_filenames=["images/9.png"]), "held-out filenames"),
+        (lambda d: d.update(train_filenames=["images/1.png"], val_filenames=["images/1.png"]), "trained and tested on"),
         (lambda d: (d.pop("fl_x"), d.update(camera_angle_x=4.0)), "no focal length"),
         (lambda d: (d.pop("fl_x"), d.update(camera_angle_x=0)), "no focal length"),
         (lambda d: d.update(fl_x=0), "no focal length"),
@@ -262,7 +277,7 @@ def test_no_file_and_a_name_without_a_decision(tmp_path: Path) -> None:
     document = json.loads((folder / "transforms.json").read_text())
     document["frames"][0]["file_path"] = "images/0"
     (folder / "transforms.json").write_text(json.dumps(document))
-    with pytest.raises(InputError, match=r"images/0 may be images/0\.jpg or images/0\.png: add the extension"):
+    with pytest.raises(InputError, match=r"images/0 may be images/0\.jpg or images/0\.png: keep one"):
         read_transforms(folder)
 
 
@@ -275,9 +290,111 @@ def test_images_without_a_file_are_left_out(tmp_path: Path, caplog: pytest.LogCa
 
 def test_the_file_is_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     source = CaptureSource(SceneConfig(name="t", kind="transforms", path=str(write(tmp_path / "in"))))
-    read, files = transforms.read_typed, []
-    monkeypatch.setattr(transforms, "read_typed", lambda path, kind: files.append(path) or read(path, kind))
+    read, files = transforms.read_bytes, []
+    monkeypatch.setattr(transforms, "read_bytes", lambda path: files.append(path) or read(path))
     assert source.step is not None
     source.step.build(tmp_path / "made")
     source.read(tmp_path / "made")
     assert files == [tmp_path / "in" / "transforms.json"]
+
+
+def focal(side: float, degrees: float) -> float:
+    return 0.5 * side / math.tan(math.radians(degrees) / 2)
+
+
+@pytest.mark.parametrize(
+    ("said", "focal_x", "focal_y"),
+    [
+        ({"x_fov": 70.0}, focal(40, 70), focal(40, 70)),
+        ({"y_fov": 50.0}, focal(30, 50), focal(30, 50)),
+        ({"x_fov": 70.0, "y_fov": 50.0}, focal(40, 70), focal(30, 50)),
+        ({"camera_angle_x": 1.2}, focal(40, math.degrees(1.2)), focal(40, math.degrees(1.2))),
+        ({"camera_angle_y": 0.9}, focal(30, math.degrees(0.9)), focal(30, math.degrees(0.9))),
+        ({"camera_angle_x": 1.2, "camera_angle_y": 0.9}, focal(40, math.degrees(1.2)), focal(30, math.degrees(0.9))),
+        ({"fl_y": 51.0}, 51.0, 51.0),
+        ({"fl_x": 50.0, "camera_angle_y": 0.9}, 50.0, focal(30, math.degrees(0.9))),
+        ({"fl_x": 50.0, "fl_y": 51.0, "x_fov": 70.0, "camera_angle_y": 0.9}, 50.0, 51.0),
+    ],
+)
+@pytest.mark.parametrize("of_each_frame", [False, True])
+def test_every_way_to_give_a_field_of_view(tmp_path: Path, said, focal_x, focal_y, of_each_frame: bool) -> None:
+    folder = write(tmp_path / "in", **({"fl_x": None, "fl_y": None} | ({} if of_each_frame else said)))
+    if of_each_frame:
+        document = json.loads((folder / "transforms.json").read_text())
+        document["frames"] = [frame | said for frame in document["frames"]]
+        (folder / "transforms.json").write_text(json.dumps(document))
+    for camera, *_ in read_transforms(folder).images.values():
+        assert camera.params[:2] == pytest.approx((focal_x, focal_y))
+
+
+@pytest.mark.parametrize("said", [{"k3": 0.05}, {"camera_model": "FULL_OPENCV", "k3": 0.05, "k4": 0.02, "k6": 0.01}])
+def test_higher_coefficients_distort_as_in_opencv(tmp_path: Path, said: dict[str, Any]) -> None:
+    """OpenCV's documented formula: (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6)."""
+    capture = capture_of(write(tmp_path / "in", k1=0.1, k2=-0.02, **said), tmp_path / "made")
+    model = read_model(capture.model)  # type: ignore[arg-type]
+    k = {key: said.get(key, 0.0) for key in ("k3", "k4", "k6")}
+    for x, y in ((0.3, -0.2), (-0.6, 0.5)):
+        r2 = x * x + y * y
+        factor = (1 + 0.1 * r2 - 0.02 * r2**2 + k["k3"] * r2**3) / (1 + k["k4"] * r2 + k["k6"] * r2**3)
+        seen = next(iter(model.cameras.values())).img_from_cam(np.array([x, y, 1.0]))
+        np.testing.assert_allclose(seen, [19.5 + 50 * x * factor, 15.5 + 51 * y * factor], atol=1e-9)
+
+
+@pytest.mark.parametrize("key", sorted(HARMLESS | set(REFUSED)))
+def test_what_says_nothing_changes_nothing_in_silence(tmp_path: Path, key: str, caplog) -> None:
+    wanted = read_transforms(write(tmp_path / "in")).images
+    values = (None,) if key.startswith("transform_matrix") else (None, 0, False, [0.0, 0.0])
+    for value in (*values, *([1.5, "text", [1.0]] if key in HARMLESS else [])):
+        found = read_transforms(write(tmp_path / "in", **{key: value})).images
+        assert [camera for camera, *_ in found.values()] == [camera for camera, *_ in wanted.values()]
+    assert not caplog.text
+
+
+def test_unknown_keys_are_named_in_one_line(tmp_path: Path, caplog) -> None:
+    folder = write(tmp_path / "in", exporter="x", fl_X=3.0)
+    document = json.loads((folder / "transforms.json").read_text())
+    for frame in document["frames"]:
+        frame["lens"] = "wide"
+    (folder / "transforms.json").write_text(json.dumps(document))
+    read_transforms(folder)
+    (record,) = caplog.records
+    assert record.getMessage().endswith("3 keys are not known and not used: exporter, fl_X, lens")
+
+
+@pytest.mark.parametrize(
+    ("lists", "train", "test"),
+    [
+        ({"train_filenames": [0, 1, 2], "val_filenames": [3], "test_filenames": [4, 5]}, (0, 1, 2), (4, 5)),
+        ({"train_filenames": [0, 1, 2], "val_filenames": [3]}, (0, 1, 2), (3,)),
+        ({"test_filenames": [4]}, (0, 1, 2, 3, 5), (4,)),
+    ],
+)
+def test_nerfstudios_lists_of_names_are_the_split(tmp_path: Path, lists, train, test, caplog) -> None:
+    named = {key: [f"./images/{k}.png" for k in numbers] for key, numbers in lists.items()}
+    folder = write(tmp_path / "in", **named)
+    capture = capture_of(folder, tmp_path / "made", split="list")
+    assert capture.train_names == tuple(f"images/{k}.png" for k in train)
+    assert capture.test_names == tuple(f"images/{k}.png" for k in test)
+    assert not caplog.text
+    assert len(capture_of(folder, tmp_path / "other").image_names) == 6
+    assert "a split of its own, which scene.split=list takes" in caplog.text
+
+
+@pytest.mark.parametrize("written", ["images/4.JPG", "images/4", "IMAGES/4.PNG", "images\\4.jpeg"])
+def test_a_file_is_found_whatever_its_extension_and_capitals(tmp_path: Path, written: str) -> None:
+    folder = write(tmp_path / "in")
+    document = json.loads((folder / "transforms.json").read_text())
+    document["frames"][4]["file_path"] = written
+    (folder / "transforms.json").write_text(json.dumps(document))
+    assert sorted(read_transforms(folder).images) == [f"images/{k}.png" for k in range(6)]
+
+
+def test_byte_order_marks(tmp_path: Path) -> None:
+    folder = write(tmp_path / "in")
+    text = (folder / "transforms.json").read_text()
+    (folder / "transforms.json").write_text(text, encoding="utf-8-sig")
+    assert len(read_transforms(folder).images) == 6
+    for encoding in ("utf-16", "utf-32"):
+        (folder / "transforms.json").write_text(text, encoding=encoding)
+        with pytest.raises(InputError, match=r"json cannot be read: it is UTF-16 or UTF-32: save it as UTF-8"):
+            read_transforms(folder)

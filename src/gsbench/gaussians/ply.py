@@ -1,18 +1,25 @@
 """The PLY file of 3DGS, which viewers and other trainers read."""
 
+import logging
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from plyfile import PlyData, PlyElement, PlyParseError
 
 from gsbench.errors import InputError
 from gsbench.files import atomic, require_regular
 from gsbench.gaussians.model import MAX_SH_DEGREE, NUM_SH_REST, Gaussians
+from gsbench.gaussians.ply_files import read_header, read_ply_data
 from gsbench.normalization import IDENTITY, Normalization
+from gsbench.words import counted
+
+log = logging.getLogger(__name__)
 
 NUM_REST = 3 * NUM_SH_REST  # f_rest is stored channel by channel: 15 of red, 15 of green, 15 of blue
 POSITION = ["x", "y", "z"]
@@ -27,7 +34,8 @@ COLUMNS = (
 
 REST = "f_rest_"
 REST_COUNTS = tuple(3 * ((degree + 1) ** 2 - 1) for degree in range(MAX_SH_DEGREE + 1))
-MAX_HEADER = 1 << 16  # bytes
+# The logit that stands for an opacity of 1, and with a minus for 0: float32's nearest to 1 that still has a gradient.
+MAX_LOGIT = 23 * math.log(2)  # 1 - 2^-23
 MIN_TEXT_BYTES = 2  # bytes of a value in an ASCII file, at least: a digit and a space
 SIZES = {"short": 2, "ushort": 2, "int16": 2, "uint16": 2, "int": 4, "uint": 4, "int32": 4, "uint32": 4}
 SIZES |= {"float": 4, "float32": 4, "double": 8, "float64": 8}  # bytes; all other types have 1
@@ -82,13 +90,10 @@ def _check_length(path: Path) -> None:
     """Raise ValueError if the header announces more data than the file can hold."""
     # plyfile allocates what the header announces before it reads: a false count could fill the memory.
     require_regular(path)
-    with path.open("rb") as stream:
-        header, end, _ = stream.read(MAX_HEADER).partition(b"end_header")
-    if not end:
-        raise ValueError("it has no header")
+    header = read_header(path)
     is_text = b"format ascii" in header
     announced = count = 0  # announced: bytes
-    for line in header.decode("ascii").splitlines():
+    for line in header.decode("ascii", errors="replace").splitlines():
         words = line.split()
         if words[:1] == ["element"]:
             count = int(words[2])
@@ -100,6 +105,43 @@ def _check_length(path: Path) -> None:
         raise ValueError(f"it is cut short: its header promises {announced} bytes or more")
 
 
+def _with_finite_opacities(vertices: NDArray[Any], path: Path) -> NDArray[Any]:
+    """Replace infinite logits, which are opacities of exactly 0 and 1 in other programs, by `MAX_LOGIT`."""
+    logits = vertices["opacity"]
+    infinite = np.isinf(logits) if logits.dtype.kind == "f" else np.zeros(len(logits), bool)
+    if not infinite.any():
+        return vertices
+    log.warning("%s: %s an opacity of exactly 0 or 1", path, _have(int(infinite.sum())))
+    changed = vertices.copy()
+    changed["opacity"] = np.where(infinite, np.sign(logits) * MAX_LOGIT, logits)
+    return changed
+
+
+def _have(count: int) -> str:
+    return f"{counted(count, 'Gaussian')} {'has' if count == 1 else 'have'}"
+
+
+def _check_finite(column: NDArray[Any], name: str, path: Path) -> None:
+    if column.dtype.kind not in "fiu":
+        raise InputError(f"{path}: {name} is not a finite number everywhere: export the model again")
+    with np.errstate(over="ignore"):  # float64 may lie beyond float32
+        (bad,) = np.nonzero(~np.isfinite(column.astype(np.float32)))
+    if len(bad):
+        raise InputError(
+            f"{path}: {name} is not a finite number everywhere: it is {column[bad[0]]} in row {bad[0]} and in "
+            f"{len(bad) - 1} more: export the model again"
+        )
+
+
+def _warn_of_activated(vertices: NDArray[Any], path: Path) -> None:
+    """Warn of values that look as if they were stored after 3DGS's activations, exp and sigmoid."""
+    if all((vertices[f"scale_{axis}"] > 0).all() for axis in range(3)):
+        log.warning("%s: all scales are positive: they look like lengths, where 3DGS stores their logarithms", path)
+    opacity = vertices["opacity"]
+    if ((opacity >= 0) & (opacity <= 1)).all():
+        log.warning("%s: all opacities lie in [0, 1]: they look like opacities, where 3DGS stores their logits", path)
+
+
 def read_ply(path: Path, device: torch.device | str = "cpu", normalization: Normalization = IDENTITY) -> Gaussians:
     """Read a 3DGS PLY of SH degree 0 to 3 as float32; coefficients above its degree become zero.
 
@@ -108,7 +150,7 @@ def read_ply(path: Path, device: torch.device | str = "cpu", normalization: Norm
     Raises InputError if the file is not a PLY, lacks a property, or has invalid values.
     """
     with _checked(path):
-        vertices = PlyData.read(str(path))["vertex"].data
+        vertices = read_ply_data(path)["vertex"].data
     present = set(vertices.dtype.names or ())
     present_rest = {name for name in present if name.startswith(REST)}
     rest = [f"{REST}{i}" for i in range(len(present_rest))]
@@ -122,11 +164,13 @@ def read_ply(path: Path, device: torch.device | str = "cpu", normalization: Norm
     if missing or len(vertices) == 0:
         listed = ", ".join(missing) or "all, since it is empty"
         raise InputError(f"{path}: not a 3DGS PLY; missing or odd properties: {listed}")
+    vertices = _with_finite_opacities(vertices, path)
     for name in (*required, *rest):
-        if vertices[name].dtype.kind not in "fiu" or not np.isfinite(vertices[name]).all():
-            raise InputError(f"{path}: {name} is not a finite number everywhere: export the model again")
+        _check_finite(vertices[name], name, path)
     if not np.any([vertices[f"rot_{i}"] != 0 for i in range(4)], axis=0).all():
         raise InputError(f"{path}: a Gaussian has a rotation of (0, 0, 0, 0): export the model again")
+
+    _warn_of_activated(vertices, path)
 
     def columns(names: list[str]) -> torch.Tensor:
         return torch.from_numpy(np.stack([vertices[name].astype(np.float32) for name in names], axis=1)).to(device)

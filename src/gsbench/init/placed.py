@@ -5,20 +5,22 @@ A file holds points of any origin (laser scans, multi-view stereo), or a trained
 
 from __future__ import annotations
 
+import math
 import shutil
 from abc import abstractmethod
 from dataclasses import asdict, dataclass
+from io import StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import numpy as np
 from annotated_types import Interval
 from numpy.typing import NDArray
-from plyfile import PlyData
 from pydantic import PositiveFloat, PositiveInt
 
 from gsbench.errors import InputError
 from gsbench.files import file_sha256, require_regular
+from gsbench.gaussians.ply_files import read_ply_data
 from gsbench.init.base import (
     GAUSSIANS_FILE,
     WORK_FOLDER,
@@ -31,7 +33,7 @@ from gsbench.init.base import (
     TrainingPoints,
 )
 from gsbench.logs import Progress, no_progress
-from gsbench.parsing import one_line
+from gsbench.parsing import one_line, without_byte_order_mark
 from gsbench.scene.images import read_image, read_mask
 from gsbench.scene.types import Array, Capture
 from gsbench.settings import AnyPath, check_settings
@@ -217,6 +219,8 @@ def points_in_view(points: Array, name: str, model: pycolmap.Reconstruction) -> 
 
 
 COLOR_NAMES = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
+DC_NAMES = ("f_dc_0", "f_dc_1", "f_dc_2")
+SH_C0 = 0.5 / math.sqrt(math.pi)  # the constant spherical harmonic, by which 3DGS multiplies f_dc
 TEXT_SUFFIXES = (".xyz", ".txt", ".csv", ".pts")
 
 
@@ -233,7 +237,10 @@ def read_points(path: Path) -> tuple[Array, NDArray[np.uint8] | None]:
         if suffix == ".ply":
             points, colors = _read_ply(path)
         elif suffix in TEXT_SUFFIXES:
-            points, colors = _columns(np.loadtxt(path, delimiter="," if suffix == ".csv" else None, ndmin=2))
+            content = without_byte_order_mark(path.read_bytes()).decode()
+            points, colors = _columns(
+                np.loadtxt(StringIO(content), delimiter="," if suffix == ".csv" else None, ndmin=2)
+            )
         else:
             raise ValueError(f"known are .ply, {', '.join(TEXT_SUFFIXES)}")
     except Exception as error:  # readers may raise any exception on a damaged file, numpy even tokenizer errors
@@ -253,7 +260,7 @@ def read_points(path: Path) -> tuple[Array, NDArray[np.uint8] | None]:
 
 
 def _read_ply(path: Path) -> tuple[Array, NDArray[np.generic] | None]:
-    vertices = PlyData.read(str(path))["vertex"].data
+    vertices = read_ply_data(path)["vertex"].data
     present = vertices.dtype.names or ()
     lacking = [name for name in "xyz" if name not in present]
     if lacking:
@@ -262,6 +269,9 @@ def _read_ply(path: Path) -> tuple[Array, NDArray[np.generic] | None]:
     for names in COLOR_NAMES:
         if all(name in present for name in names):
             return points, np.stack([vertices[name] for name in names], axis=1)
+    if all(name in present for name in DC_NAMES):  # a model of Gaussians
+        dc = np.stack([vertices[name] for name in DC_NAMES], axis=1).astype(np.float64)
+        return points, np.clip(0.5 + SH_C0 * dc, 0.0, 1.0)  # NaN stays, and is refused
     return points, None
 
 

@@ -37,8 +37,8 @@ from gsbench.runs.layout import CONFIG, GROUND_TRUTH, IN_RUNS, MASKS, PER_VIEW, 
 from gsbench.runs.store import Store
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import FROM_RENDERS, RENDERS_ALONE, Code, TrialRecord
-from gsbench.scene.images import image_size, png_name, read_image
-from gsbench.scene.readers import fingerprint, list_images
+from gsbench.scene.images import image_size, list_images, png_name, read_image
+from gsbench.scene.readers import fingerprint
 from gsbench.settings import is_folder_name
 from gsbench.system.device import select_device
 from gsbench.system.own_modules import allow_modules

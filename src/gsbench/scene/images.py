@@ -8,6 +8,8 @@ only where a mask is not 0 (its page "Data conventions"). Ignored pixels are rep
 photograph, so that they cannot influence a result.
 """
 
+import logging
+import os
 import shutil
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
@@ -21,11 +23,14 @@ from PIL import Image, UnidentifiedImageError
 from gsbench.errors import InputError
 from gsbench.files import MAX_NAME_BYTES, require_regular
 from gsbench.scene.options import Backdrop
-from gsbench.words import some_of
+from gsbench.words import counted, some_of
+
+log = logging.getLogger(__name__)
 
 Resample = Literal["lanczos", "area", "bicubic"]
 
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp"})
+HEIC_SUFFIXES = frozenset({".heic", ".heif"})  # photographs of telephones; neither Pillow nor COLMAP reads them
 # The formats of files with these suffixes. Without this list, Pillow would try some forty formats on every file.
 FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP")  # JPEG includes MPO, which holds several JPEGs
 EXIF_ORIENTATION = 0x0112
@@ -40,6 +45,45 @@ WHITE = np.uint8(255)
 IMAGES, MASKS = "images", "masks"  # in the folder of `prepare_photograph`
 MAX_GREY_SHARE = 0.05  # of pixels between black and the brightest value; a photograph given as a mask has far more
 NEARLY_ONE = 1 - 1e-6  # a mean of ones in float32 may round to less than 1
+
+
+def list_images(folder: Path) -> list[str]:
+    """The sorted image files in a folder and its sub-folders, relative, with "/" as separator, without hidden files.
+
+    Links to folders are followed, and no folder is read twice.
+    """
+    names: list[str] = []
+    unread = 0
+    folders, links, seen = [folder], list[Path](), set[tuple[int, int]]()
+    while folders or links:
+        # Links come last, so that images are listed under their real folder rather than under a link to it.
+        parent = folders.pop() if folders else links.pop(0)
+        status = parent.stat()
+        if (status.st_dev, status.st_ino) in seen:  # also ends circles of links
+            continue
+        seen.add((status.st_dev, status.st_ino))
+        for entry in sorted(_entries(parent), key=lambda entry: entry.name):
+            if entry.name.startswith("."):
+                continue
+            if entry.is_dir():
+                (links if entry.is_symlink() else folders).append(Path(entry.path))
+            elif Path(entry.name).suffix.lower() in IMAGE_SUFFIXES:
+                names.append(Path(entry.path).relative_to(folder).as_posix())
+            elif Path(entry.name).suffix.lower() in HEIC_SUFFIXES:
+                unread += 1
+    if unread:
+        log.warning(
+            "%s: %s not read: save as JPEG", folder, f"{counted(unread, 'HEIC file')} {'is' if unread == 1 else 'are'}"
+        )
+    return sorted(names)
+
+
+def _entries(folder: Path) -> list[os.DirEntry[str]]:
+    try:
+        with os.scandir(folder) as entries:
+            return list(entries)
+    except PermissionError:  # treated as an empty folder
+        return []
 
 
 def match_names(wanted: Iterable[str], files: Iterable[str]) -> dict[str, str]:

@@ -2,7 +2,6 @@
 
 import hashlib
 import logging
-import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +14,7 @@ from gsbench.normalization import find_normalization
 from gsbench.parsing import without_byte_order_mark
 from gsbench.scene.colmap_files import count_images, model_files
 from gsbench.scene.hold_out import CamerasByName, hold_out, select_images
-from gsbench.scene.images import IMAGE_SUFFIXES, check_picture_names, find_masks, match_names
+from gsbench.scene.images import IMAGE_SUFFIXES, check_picture_names, find_masks, list_images, match_names
 from gsbench.scene.options import EVERY_NTH, MAX_IMAGES, MIN_IMAGES, TEST_LIST, TRAIN_LIST, SplitRule
 from gsbench.scene.transforms import Transforms
 from gsbench.scene.types import Capture
@@ -23,7 +22,6 @@ from gsbench.words import counted, some_of
 
 log = logging.getLogger(__name__)
 
-HEIC_SUFFIXES = frozenset({".heic", ".heif"})  # photographs of telephones; neither Pillow nor COLMAP reads them
 SPARSE_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0")  # what a message names; see `_find_sparse` for the others
 
 
@@ -97,6 +95,8 @@ def read_transforms(
     _require_enough(len(names), root, "that its transforms.json names are")
     if transforms.has_mask_paths and masks is None:
         raise InputError(f"{transforms.files[0]}: mask_path is not read: give the folder of the masks as scene.masks")
+    if transforms.split is not None and not split.asks_the_capture and not split.by_lists:
+        log.warning("%s has a split of its own, which scene.split=list takes", transforms.files[0])
     capture = _make_capture(
         name, root, names, model, False, max_images, split, root,
         lambda chosen: reference_cameras(read_model(model), chosen),
@@ -165,45 +165,6 @@ def missing_model(name: str, root: Path, sparse: str | None) -> str:
     except InputError as error:
         return f"scene {name}: {error}"
     return ""
-
-
-def list_images(folder: Path) -> list[str]:
-    """The sorted image files in a folder and its sub-folders, relative, with "/" as separator, without hidden files.
-
-    Links to folders are followed, and no folder is read twice.
-    """
-    names: list[str] = []
-    unread = 0
-    folders, links, seen = [folder], list[Path](), set[tuple[int, int]]()
-    while folders or links:
-        # Links come last, so that images are listed under their real folder rather than under a link to it.
-        parent = folders.pop() if folders else links.pop(0)
-        status = parent.stat()
-        if (status.st_dev, status.st_ino) in seen:  # also ends circles of links
-            continue
-        seen.add((status.st_dev, status.st_ino))
-        for entry in sorted(_entries(parent), key=lambda entry: entry.name):
-            if entry.name.startswith("."):
-                continue
-            if entry.is_dir():
-                (links if entry.is_symlink() else folders).append(Path(entry.path))
-            elif Path(entry.name).suffix.lower() in IMAGE_SUFFIXES:
-                names.append(Path(entry.path).relative_to(folder).as_posix())
-            elif Path(entry.name).suffix.lower() in HEIC_SUFFIXES:
-                unread += 1
-    if unread:
-        log.warning(
-            "%s: %s not read: save as JPEG", folder, f"{counted(unread, 'HEIC file')} {'is' if unread == 1 else 'are'}"
-        )
-    return sorted(names)
-
-
-def _entries(folder: Path) -> list[os.DirEntry[str]]:
-    try:
-        with os.scandir(folder) as entries:
-            return list(entries)
-    except PermissionError:  # treated as an empty folder
-        return []
 
 
 def fingerprint(

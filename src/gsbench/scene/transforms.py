@@ -11,16 +11,29 @@ from __future__ import annotations
 
 import logging
 import math
-from dataclasses import dataclass, field
+from collections.abc import Collection
+from dataclasses import dataclass, field, fields
+from functools import cached_property
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Annotated
 
 import numpy as np
 from annotated_types import Len
+from pydantic_core import from_json
 
 from gsbench.errors import InputError
-from gsbench.parsing import Number, Record, Text, read_typed, resolved
-from gsbench.scene.images import IMAGE_SUFFIXES, image_size
+from gsbench.parsing import (
+    DamagedError,
+    Number,
+    Record,
+    Text,
+    parse_typed,
+    read_bytes,
+    resolved,
+    without_byte_order_mark,
+)
+from gsbench.scene.images import IMAGE_SUFFIXES, image_size, list_images, match_names
+from gsbench.scene.transforms_keys import check_keys
 from gsbench.scene.types import Array, CameraModel
 from gsbench.words import some_of
 
@@ -34,6 +47,7 @@ OPENGL = np.diag([1.0, -1.0, -1.0])  # from OpenCV's camera axes to OpenGL's, an
 PosedCamera = tuple[CameraModel, Array, Array]  # with the world-to-camera rotation [3, 3] and translation [3]
 ROTATION_TOLERANCE = 1e-3  # largest error of an entry, for matrices written with few digits
 PERSPECTIVE, FISHEYE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"), "OPENCV_FISHEYE"
+RATIONAL = "FULL_OPENCV"  # OpenCV's: a polynomial of k1, k2, k3 divided by one of k4, k5, k6
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,10 +63,15 @@ class Intrinsics(Record):
     cx: Number | None = None
     cy: Number | None = None
     camera_angle_x: Number | None = None  # horizontal field of view, radians
+    camera_angle_y: Number | None = None  # vertical
+    x_fov: Number | None = None  # the same in degrees: instant-ngp's keys
+    y_fov: Number | None = None
     k1: Number | None = None
     k2: Number | None = None
     k3: Number | None = None
     k4: Number | None = None
+    k5: Number | None = None
+    k6: Number | None = None
     p1: Number | None = None
     p2: Number | None = None
 
@@ -74,6 +93,9 @@ class TransformsRecord(Intrinsics):
     applied_transform: Matrix | None = None
     applied_scale: Number | None = None
     ply_file_path: Text | None = None
+    train_filenames: list[Text] | None = None
+    val_filenames: list[Text] | None = None
+    test_filenames: list[Text] | None = None
 
 
 @dataclass(frozen=True)
@@ -133,7 +155,8 @@ def find_files(folder: Path) -> dict[str, Path]:
 def read_transforms(folder: Path) -> Transforms:
     """Read the cameras in ``folder``; raises InputError, one line, for a file that cannot be understood."""
     files = find_files(folder)
-    records = {split: read_typed(resolved(path), TransformsRecord) for split, path in files.items()}
+    records = {split: _read_record(path) for split, path in files.items()}
+    find = _FileFinder(folder)
     images: dict[str, PosedCamera] = {}
     names: dict[str, list[str]] = {split: [] for split in files}
     points, applied = None, AppliedTransform()
@@ -141,7 +164,7 @@ def read_transforms(folder: Path) -> Transforms:
         path, missing = files[split], []
         applied = _applied_transform(path, record)
         for frame in record.frames:
-            name = _image_name(folder, path, frame.file_path)
+            name = find(path, frame.file_path)
             if name is None:
                 missing.append(frame.file_path)
                 continue
@@ -157,11 +180,12 @@ def read_transforms(folder: Path) -> Transforms:
             points = folder / _relative_path(path, record.ply_file_path)
             if not points.is_file():
                 raise InputError(f"{path} names {record.ply_file_path}, which is not there")
+    own_lists = _named_split(files[""], records[""], images) if "" in files else None
     held_out = next((sorted(names[split]) for split in ("test", "val") if split in files), None)
     return Transforms(
         tuple(files.values()),
         dict(sorted(images.items())),
-        None if held_out is None else (sorted(names["train"]), held_out),
+        own_lists if held_out is None else (sorted(names["train"]), held_out),
         points,
         applied,
         any(frame.mask_path for record in records.values() for frame in record.frames),
@@ -176,16 +200,61 @@ def _relative_path(path: Path, written: str) -> PurePosixPath:
     return relative
 
 
-def _image_name(folder: Path, path: Path, written: str) -> str | None:
-    """The image file that ``file_path`` means, or None if there is none. Blender's files leave out the extension."""
-    relative = _relative_path(path, written)
-    if relative.suffix.lower() in IMAGE_SUFFIXES and (folder / relative).is_file():
-        return relative.as_posix()
-    candidates = (f"{relative}{suffix}" for suffix in sorted(IMAGE_SUFFIXES))
-    existing = [name for name in candidates if (folder / name).is_file()]
-    if len(existing) > 1:
-        raise InputError(f"{path}: {written} may be {' or '.join(existing)}: add the extension")
-    return existing[0] if existing else None
+def _read_record(path: Path) -> TransformsRecord:
+    content = read_bytes(resolved(path))
+    try:
+        content = without_byte_order_mark(content)
+    except InputError as error:
+        raise DamagedError(path, f"cannot be read: {error}") from error
+    record = parse_typed(content, TransformsRecord, path)
+    check_keys(path, from_json(content), names_of(TransformsRecord), names_of(FrameRecord))
+    return record
+
+
+def names_of(kind: type[Record]) -> frozenset[str]:
+    """The keys of a record, which gsbench uses."""
+    return frozenset(field.name for field in fields(kind))
+
+
+class _FileFinder:
+    """Finds the image file that ``file_path`` means, as images of COLMAP models are found (`match_names`)."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    @cached_property
+    def _files(self) -> list[str]:
+        return list_images(self.folder)
+
+    def __call__(self, path: Path, written: str) -> str | None:
+        """The name below the folder, or None if there is no file. Blender's files leave out the extension."""
+        relative = _relative_path(path, written)
+        if relative.suffix.lower() in IMAGE_SUFFIXES and (self.folder / relative).is_file():
+            return relative.as_posix()
+        try:
+            return match_names([relative.as_posix()], self._files).get(relative.as_posix())
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from error
+
+
+def _named_split(path: Path, record: TransformsRecord, images: Collection[str]) -> tuple[list[str], list[str]] | None:
+    """nerfstudio's lists of names: those to train on, and those to test on or else to validate on."""
+    train, val, test = record.train_filenames, record.val_filenames, record.test_filenames
+    held_out = val if test is None else test
+    if held_out is None:
+        return None
+    written = {"train": train or [], "held-out": held_out}
+    chosen = {}
+    for which, listed in written.items():
+        wanted = [_relative_path(path, name).as_posix() for name in listed]
+        matches = match_names(wanted, images)
+        if missing := [name for name in wanted if name not in matches]:
+            raise InputError(f"{path}: its {which} filenames name {some_of(missing)}, which is no frame with a file")
+        chosen[which] = set(matches.values())
+    if both := sorted(chosen["train"] & chosen["held-out"]):
+        raise InputError(f"{path}: {some_of(both)} would be trained and tested on: correct its lists of filenames")
+    kept = chosen["train"] if train is not None else set(images) - chosen["held-out"]
+    return sorted(kept), sorted(chosen["held-out"])
 
 
 def _applied_transform(path: Path, record: TransformsRecord) -> AppliedTransform:
@@ -230,12 +299,15 @@ def _camera(image: Path, path: Path, record: TransformsRecord, frame: FrameRecor
         width, height = image_size(image)
     if width != int(width) or height != int(height) or min(width, height) < 1:
         raise InputError(f"{where}: w and h must be whole numbers of px, got {width} and {height}")
-    focal_x, angle = value("fl_x"), value("camera_angle_x")
-    if focal_x is None and angle is not None and 0 < angle < math.pi:
-        focal_x = width / (2 * math.tan(angle / 2))
-    focal_y = value("fl_y") or focal_x
+    focal_x = _focal_length(width, value("fl_x"), value("camera_angle_x"), value("x_fov"))
+    focal_y = _focal_length(height, value("fl_y"), value("camera_angle_y"), value("y_fov"))
+    # Pixels are square if only one of both is given, as in instant-ngp and nerfstudio.
+    focal_x, focal_y = focal_y if focal_x is None else focal_x, focal_x if focal_y is None else focal_y
     if focal_x is None or focal_y is None or min(focal_x, focal_y) <= 0.0:
-        raise InputError(f"{where}: no focal length: fl_x, or camera_angle_x between 0 and pi, must be given")
+        raise InputError(
+            f"{where}: no focal length: fl_x, camera_angle_x (between 0 and pi) or x_fov (between 0 and 180) must be "
+            "given, or the same for y"
+        )
     cx, cy = value("cx"), value("cy")
     center = (width / 2 if cx is None else cx, height / 2 if cy is None else cy)
     model, distortion = _distortion(where, record, frame)
@@ -244,16 +316,39 @@ def _camera(image: Path, path: Path, record: TransformsRecord, frame: FrameRecor
 
 def _distortion(where: str, record: TransformsRecord, frame: FrameRecord) -> tuple[str, tuple[float, ...]]:
     """COLMAP's name of the camera model, and its parameters after the principal point."""
-    names = ("k1", "k2", "k3", "k4", "p1", "p2")
+    names = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
     # A frame with a coefficient of its own uses none of the file's.
     own = any(getattr(frame, name) is not None for name in names)
-    k1, k2, k3, k4, p1, p2 = (getattr(frame if own else record, name) or 0.0 for name in names)
+    k1, k2, k3, k4, k5, k6, p1, p2 = (getattr(frame if own else record, name) or 0.0 for name in names)
     fisheye = record.is_fisheye if frame.is_fisheye is None else frame.is_fisheye
     model = frame.camera_model or record.camera_model or (FISHEYE if fisheye else "OPENCV")
     if model == FISHEYE:
+        if any((k5, k6, p1, p2)):
+            raise InputError(f"{where}: {FISHEYE} has k1 to k4 alone, but k5, k6, p1 or p2 is not 0")
         return model, (k1, k2, k3, k4)
+    if model == RATIONAL:
+        return model, (k1, k2, p1, p2, k3, k4, k5, k6)
     if model not in PERSPECTIVE:
-        raise InputError(f"{where}: camera_model {model} is not known here ({', '.join((*PERSPECTIVE, FISHEYE))})")
-    if k3 or k4:
-        raise InputError(f"{where}: k3 and k4 are read of {FISHEYE} alone: leave them out, or make a COLMAP model")
+        raise InputError(
+            f"{where}: camera_model {model} is not known here ({', '.join((*PERSPECTIVE, RATIONAL, FISHEYE))})"
+        )
+    # k4 is a coefficient of r^8 in nerfstudio and Metashape, but a divisor in OpenCV; only RATIONAL says which.
+    if any((k4, k5, k6)):
+        raise InputError(f"{where}: k4, k5 and k6 are read of {FISHEYE} and {RATIONAL} alone: make a COLMAP model")
+    if k3:
+        return RATIONAL, (k1, k2, p1, p2, k3, 0.0, 0.0, 0.0)
     return ("OPENCV", (k1, k2, p1, p2)) if any((k1, k2, p1, p2)) else ("PINHOLE", ())
+
+
+def _focal_length(side: float, given: float | None, angle: float | None, degrees: float | None) -> float | None:
+    """The focal length in px along a side in px: as given, else from the field of view in radians or degrees.
+
+    None if nothing is given, and 0 for a field of view that is none.
+    """
+    if given is not None:
+        return given
+    if angle is None and degrees is not None:
+        angle = math.radians(degrees)
+    if angle is None:
+        return None
+    return side / (2 * math.tan(angle / 2)) if 0 < angle < math.pi else 0.0
