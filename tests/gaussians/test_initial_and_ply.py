@@ -260,7 +260,7 @@ COMPRESSED += b"property uint packed_position\nproperty uint packed_rotation\nen
     ("name", "content", "said"),
     [
         ("a.compressed.ply", COMPRESSED, "a compressed PLY, as SuperSplat writes it"),
-        ("a.ply", gzip.compress(b"NGSP"), "the format SPZ"),
+        ("a.ply", gzip.compress(b"NGSP", mtime=0), "the format SPZ"),
         ("a.ply", b"NGSP" + bytes(9), "the format SPZ"),
         ("a.ply", b"PK\3\4" + bytes(9), "the format SOG"),
         ("meta.json", b'{"version": 2}', "the format SOG"),

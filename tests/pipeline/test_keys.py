@@ -24,11 +24,11 @@ WORDS = [
 BARE = Capture("garden", Path("photos"), ("a.jpg", "b.jpg", "c.jpg"), ("a.jpg",), None, False, "0" * 64)
 KEYS = [
     ("config", "efb880968c80cdd904651c24a9fa44e607e6283f150f6dbad8f47651f0e9d49f"),
-    ("init", "6599fceb46df18df358d574ef2868e5bc85c2b8debe3c0b07b0aceb77882c9af"),  # of the cameras
-    ("init", "19174a6b3b6b609d44ce3db01225cc25635b08315e8ddff0edafa7848403a6e5"),
-    ("train", "88c3ca899428dee0fb817e4ebae5b764dfc1916c06f6963ce0ff49d9207658ac"),
-    ("ground_truth", "34c661b8e20d4f0cff6464efb17533ee1bb568d03fb173ac1c93634803011512"),
-    ("evaluate", "96891892dfc2048c6292a3671abee7ef7349c31cedf2d8564b452702f9ff8ace"),
+    ("init", "b5ba65df7105e9263ad05addef8425d35e29fe982775d730fbe604647ec2a9ae"),  # of the cameras
+    ("init", "cad201af4f604b328caa8c2ed8aca73b64062872f7f0a7b2461e97dbd362a442"),
+    ("train", "7a176da93dc7e68fd25ee10044cf3183c8cb124d04f8db5675e00a55f16c0f6c"),
+    ("ground_truth", "25bd2fff6458d0bf7b5f3c85e52eea1f097cf4fa10c2f93e6be1429d23b17af4"),
+    ("evaluate", "69ed8884d31466e846c86a05ad11f0b2918b9739822a680d08a8389b04c93395"),
 ]
 
 

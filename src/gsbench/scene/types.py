@@ -61,7 +61,7 @@ class Camera:
         return -self.rotation.T @ self.translation
 
     def in_own_coordinates(self, normalization: Normalization) -> Camera:
-        """This camera of the training, as it stands in the coordinates that the scene was given in."""
+        """Return the camera as it stands in the coordinates in which the scene was given."""
         if normalization.is_identity:
             return self
         return replace(self, translation=-self.rotation @ normalization.undo(self.center))
