@@ -142,6 +142,9 @@ MEASURED: dict[str, Callable[[Sequence[TrialResult]], str]] = {
     "held-out views": _span(lambda trial: trial.record.test_views),
     "pictures": _distinct(_resolution),
     "photographs (hash)": _distinct(lambda trial: trial.record.hashes.get("data", "")[:12]),
+    "test views with a near twin in training": _span(
+        lambda trial: None if trial.record.twins is None else len(trial.record.twins.near)
+    ),
     "initial points": _span(lambda trial: trial.record.num_init_points),
     "initial points in two training views": _distinct(lambda trial: _start(trial, "seen", ".1%")),
     "agreement of their colours with photographs": _distinct(lambda trial: _start(trial, "color_agreement", ".2f")),

@@ -27,7 +27,7 @@ from gsbench.analysis.results import Arm, Experiment, TrialResult, group_by, see
 from gsbench.analysis.table_formats import Column, Row, Table, TableEntry
 from gsbench.runs.keys import SHOWN
 from gsbench.runs.layout import TUNING
-from gsbench.runs.trial_record import FROM_MODEL, FROM_RENDERS
+from gsbench.runs.trial_record import FROM_MODEL, FROM_RENDERS, TwinViews
 from gsbench.words import counted, some_of
 
 DEFAULT_ROWS = ("scene", "init", "densify")
@@ -258,6 +258,14 @@ def doubt_notes(trials: Sequence[TrialResult]) -> list[str]:
     for trial in trials:
         if line := trial.record.learnt_nothing:
             notes.append(f"{LEARNT_NOTHING} {trial.label} is {line}.")
+    for trial in trials:
+        twins = trial.record.twins or TwinViews()
+        if twins.near:
+            count = f"{len(twins.near)} of {trial.record.test_views} test views have"
+            notes.append(f"{trial.scene}: {count} a near twin in training, so they measure memory too.")
+        if twins.left_out:
+            left_out = counted(len(twins.left_out), "photograph")
+            notes.append(f"{trial.scene}: {left_out} left out, since another one has its name or content.")
     for trial in trials:
         cloud = trial.record.initial_cloud
         lines = [] if cloud is None else cloud.warnings

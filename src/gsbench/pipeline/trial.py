@@ -51,6 +51,7 @@ from gsbench.runs.trial_record import (
     Failure,
     Training,
     TrialRecord,
+    TwinViews,
     read_rows,
     split_text,
 )
@@ -290,6 +291,7 @@ def results_of(
         causes=training.causes,
         one_color_psnr=evaluation.one_color_psnr,
         initial_cloud=training.initial_cloud,
+        twins=TwinViews(left_out={**capture.left_out, **scene.twins.left_out}, near=dict(scene.twins.near)),
         scene_extent=training.scene_extent,
         seconds=seconds,
         peak_memory_mb=training.peak_memory_mb,

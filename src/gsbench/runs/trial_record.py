@@ -117,6 +117,18 @@ class InitialCloud(Record):
 
 
 @dataclass(frozen=True, kw_only=True)
+class TwinViews(Record):
+    """Photographs that the capture has twice.
+
+    ``left_out`` maps each photograph that was not used to the one that it copies. ``near`` maps a test view to the
+    training view that looks nearly the same, as the next shot of a burst does; it was used.
+    """
+
+    left_out: dict[str, str] = field(default_factory=dict)
+    near: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
 class TrialRecord(Record):
     """A finished trial. A value that cannot be known is None; the file leaves out None if that is the default.
 
@@ -152,6 +164,7 @@ class TrialRecord(Record):
     causes: dict[str, Count] = field(default_factory=dict)  # Gaussians at the end, by the cause of their creation
     scene_extent: Amount | None = None  # units of the given coordinates
     initial_cloud: InitialCloud | None = None
+    twins: TwinViews | None = None  # None: not looked for
     normalization: Normalization | None = None  # from the given coordinates to those of the training; None: the same
     budget: Budget | None = None
     train_views: Count | None = None

@@ -17,6 +17,7 @@ from gsbench.scene.hold_out import CamerasByName, hold_out, select_images
 from gsbench.scene.images import IMAGE_SUFFIXES, check_picture_names, find_masks, list_images, match_names
 from gsbench.scene.options import EVERY_NTH, MAX_IMAGES, MIN_IMAGES, TEST_LIST, TRAIN_LIST, SplitRule
 from gsbench.scene.transforms import Transforms
+from gsbench.scene.twins import copies_by_name, copies_of_test_views, report_left_out
 from gsbench.scene.types import Capture
 from gsbench.words import counted, some_of
 
@@ -203,11 +204,16 @@ def _make_capture(
     own_split: tuple[list[str], list[str]] | None = None,
 ) -> Capture:
     lists = own_split if own_split and split.asks_the_capture else _read_lists(root, split)
+    left_out = copies_by_name(names, {name for wanted in lists for name in wanted or ()})
+    report_left_out(folder, left_out, "of the same name")
+    names = [name for name in names if name not in left_out]
     train, test = (None if wanted is None else _resolve(wanted, names, folder) for wanted in lists)
     if train is not None and test is not None:
         names = sorted({*train, *test})
     held_out = hold_out(select_images(names, max_images), split, (train, test), cameras)
-    kept = tuple(sorted([*held_out.train, *held_out.test]))
+    copies = copies_of_test_views(folder, held_out.train, held_out.test)
+    report_left_out(folder, copies, "with the content of a test view")
+    kept = tuple(sorted({*held_out.train, *held_out.test} - set(copies)))
     check_picture_names(held_out.test, folder)
     _require_enough(len(kept), folder, "in the split lists" if split.by_lists else "left by the split")
     masks = {} if mask_folder is None else find_masks(mask_folder, folder, kept)
@@ -221,6 +227,7 @@ def _make_capture(
         fingerprint=fingerprint(folder, kept, model_files(model) if model is not None else (), masks),
         held_out=held_out.description,
         masks=masks,
+        left_out=left_out | copies,
     )
 
 

@@ -95,6 +95,18 @@ def to_pinhole(camera: CameraModel) -> Camera:
 
 
 @dataclass(frozen=True)
+class Twins:
+    """Photographs that occur twice (`gsbench.scene.twins`).
+
+    ``left_out`` maps each photograph that is not used to the one that it copies. ``near`` maps a test view to the
+    training view that looks nearly the same, and is used.
+    """
+
+    left_out: Mapping[str, str] = field(default_factory=dict)
+    near: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
 class Capture:
     """Photographs on disk, and the cameras that came with them, if any.
 
@@ -105,7 +117,8 @@ class Capture:
     is a sha256 over names and contents of the selected images, their masks and the model. ``read_from`` are further
     files of the user that the cameras were read from. ``advised_normalization`` maps the given coordinates to those in
     which the scene should be trained (`gsbench.scene.colmap.normalize_capture`). ``normalization`` is the map that was
-    applied to ``model`` already.
+    applied to ``model`` already. ``left_out`` maps each photograph that is left out, since another
+    has its name or content, to that other.
     """
 
     name: str
@@ -120,6 +133,7 @@ class Capture:
     read_from: tuple[Path, ...] = ()
     advised_normalization: Normalization = IDENTITY
     normalization: Normalization = IDENTITY
+    left_out: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def train_names(self) -> tuple[str, ...]:
@@ -153,6 +167,7 @@ class Scene:
     name: str
     train: tuple[View, ...]
     test: tuple[View, ...]
+    twins: Twins = field(default_factory=Twins)
 
     @cached_property
     def extent(self) -> float:

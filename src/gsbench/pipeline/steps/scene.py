@@ -48,6 +48,7 @@ from gsbench.scene.readers import (
 )
 from gsbench.scene.transforms import Transforms
 from gsbench.scene.transforms import read_transforms as read_transforms_files
+from gsbench.scene.twins import without_copies
 from gsbench.scene.types import Capture, Scene
 from gsbench.system.install import version_of
 from gsbench.system.resources import available_threads
@@ -194,9 +195,12 @@ class Views:
 
     @cached_property
     def scene(self) -> Scene:
-        """The undistorted and shrunk views; ``init`` must be built. Prepared images are cached in the store."""
+        """The undistorted and shrunk views without copies of test views in training; ``init`` must be built.
+
+        Prepared images are cached in the store.
+        """
         with progress("scene") as report:
-            return load_scene(
+            scene = load_scene(
                 self.capture,
                 self.store.path(self.init) / MODEL_FOLDER,
                 self.store.root / VIEWS,
@@ -204,6 +208,7 @@ class Views:
                 made_by=view_versions(),
                 **self.preparation,
             )
+        return without_copies(scene)
 
 
 @cache

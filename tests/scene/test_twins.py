@@ -1,0 +1,154 @@
+"""Photographs that a capture has twice: which are left out, and which are reported."""
+
+from __future__ import annotations
+
+import io
+import logging
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from gsbench.errors import InputError
+from gsbench.scene.options import SplitRule
+from gsbench.scene.readers import read_colmap, read_photos
+from gsbench.scene.twins import copies_by_name, without_copies
+from gsbench.scene.types import Scene, View
+from tests.scene.conftest import smooth_image
+from tests.train.conftest import orbit_camera
+
+
+@pytest.mark.parametrize(
+    ("names", "wanted", "left_out"),
+    [
+        (["a.jpg", "a.png", "b.jpg"], (), {"a.png": "a.jpg"}),
+        (["a.jpg", "a.png", "b.png"], (), {"a.jpg": "a.png"}),  # the format that more photographs have
+        (["a.JPEG", "a.png", "b.png", "c.JPG", "c.tif"], (), {"a.png": "a.JPEG", "c.tif": "c.JPG"}),
+        (["a.jpg", "a.png", "b.jpg"], {"a.png"}, {"a.jpg": "a.png"}),
+        (["1/a.jpg", "2/a.png"], (), {}),
+        (["a.jpg", "a.v2.jpg"], (), {}),
+    ],
+)
+def test_of_photographs_with_one_name_one_is_used(names: list[str], wanted: set[str], left_out: dict[str, str]) -> None:
+    assert copies_by_name(names, wanted) == left_out
+
+
+def photographs(folder: Path, suffixes: tuple[str, ...], count: int = 9) -> Path:
+    folder.mkdir()
+    for k in range(count):
+        for suffix in suffixes:
+            Image.fromarray(smooth_image(40, 30, seed=k)).save(folder / f"{k}{suffix}")
+    return folder
+
+
+def test_a_folder_with_every_photograph_in_two_formats_is_read_once(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    capture = read_photos("own", photographs(tmp_path / "own", (".jpg", ".png")))
+    assert capture.image_names == tuple(f"{k}.jpg" for k in range(9))
+    (line,) = [record.message for record in caplog.records]
+    assert "9 photographs left out, of the same name: 0.png (0.jpg is used)" in line
+    alone = read_photos("own", photographs(tmp_path / "alone", (".jpg",)))
+    assert (capture.fingerprint, alone.left_out) == (alone.fingerprint, {})
+
+
+def test_a_training_file_with_the_content_of_a_test_view_is_left_out(make_scene: Callable[..., Path]) -> None:
+    root = make_scene()
+    shutil.copy(root / "images/00.png", root / "images/03.png")  # 00.png is the test view
+    shutil.copy(root / "images/04.png", root / "images/05.png")  # copies within training are the user's choice
+    capture = read_colmap("toy", root)
+    assert capture.test_names == ("00.png",)
+    assert capture.train_names == ("01.png", "02.png", "04.png", "05.png")
+    assert capture.left_out == {"03.png": "00.png"}
+
+
+def test_copies_across_lists_are_found(make_scene: Callable[..., Path]) -> None:
+    root = make_scene()
+    shutil.copy(root / "images/02.png", root / "images/05.png")
+    (root / "train.txt").write_text("00.png\n01.png\n05.png\n")
+    (root / "test.txt").write_text("02.png\n03.png\n")
+    capture = read_colmap("toy", root, split=SplitRule("list", train_list="train.txt", test_list="test.txt"))
+    assert (capture.train_names, capture.left_out) == (("00.png", "01.png"), {"05.png": "02.png"})
+
+
+def picture(seed: int) -> np.ndarray:
+    """A photograph of something: a smooth picture with fine detail, [H, W, 3] uint8."""
+    noise = np.random.default_rng(seed).normal(0, 12, (128, 160, 3))
+    return (smooth_image(160, 128, seed) + noise).clip(0, 255).astype(np.uint8)
+
+
+def encoded_again(image: np.ndarray) -> np.ndarray:
+    stream = io.BytesIO()
+    Image.fromarray(image).save(stream, format="JPEG", quality=80)
+    return np.asarray(Image.open(stream))
+
+
+def scene_of(test: np.ndarray, other: np.ndarray, mask: np.ndarray | None = None) -> Scene:
+    camera = orbit_camera(0.1, 160, 128)
+    views = [View(f"{k}.png", camera, picture(k)) for k in range(1, 4)]
+    twin, held_out = View("twin.png", camera, other, mask), View("0.png", camera, test, mask)
+    return Scene("made", (*views, twin), (held_out,))
+
+
+@pytest.mark.parametrize(
+    ("change", "left_out", "is_near"),
+    [
+        (lambda image: image.copy(), True, False),
+        (encoded_again, False, True),
+        (lambda image: np.roll(image, 1, axis=1), False, True),
+        (lambda image: (image * 0.8).astype(np.uint8), False, True),
+        (lambda image: image[:, ::-1].copy(), False, False),
+        (lambda image: picture(77), False, False),
+    ],
+    ids=["equal", "encoded again", "next of a burst", "another exposure", "mirrored", "another place"],
+)
+def test_equal_pixels_are_left_out_and_near_twins_are_reported(
+    caplog: pytest.LogCaptureFixture, change: Callable[[np.ndarray], np.ndarray], left_out: bool, is_near: bool
+) -> None:
+    scene = without_copies(scene_of(picture(0), change(picture(0))))
+    assert len(scene.train) == (3 if left_out else 4)
+    assert scene.twins.left_out == ({"twin.png": "0.png"} if left_out else {})
+    assert scene.twins.near == ({"0.png": "twin.png"} if is_near else {})
+    assert len(caplog.records) == left_out + is_near
+    if is_near:
+        assert "1 of 1 test views have a near twin in training: 0.png (twin.png)" in caplog.text
+
+
+def test_pixels_under_a_mask_do_not_make_photographs_different() -> None:
+    mask = np.arange(160)[None, :].repeat(128, axis=0) < 120
+    other = np.where(mask[..., None], picture(0), picture(9))
+    scene = scene_of(picture(0), other, mask)
+    assert without_copies(scene).twins.left_out == {"twin.png": "0.png"}
+    assert without_copies(replace(scene, train=scene.train[:3])).twins.left_out == {}
+
+
+def test_a_split_without_training_views_of_its_own_is_refused() -> None:
+    view = View("0.png", orbit_camera(0.1, 160, 128), picture(0))
+    with pytest.raises(InputError, match="all training views are copies of test views"):
+        without_copies(Scene("made", (replace(view, name="1.png"),), (view,)))
+
+
+def test_flat_pictures_are_twins_only_if_they_are_equal(caplog: pytest.LogCaptureFixture) -> None:
+    grey = np.full((128, 160, 3), 100, dtype=np.uint8)
+    with caplog.at_level(logging.WARNING):
+        assert without_copies(scene_of(grey, grey + 1)).twins == without_copies(scene_of(picture(0), picture(5))).twins
+        assert without_copies(scene_of(grey, grey)).twins.left_out == {"twin.png": "0.png"}
+
+
+@pytest.mark.shared
+@pytest.mark.parametrize(
+    ("capture", "most"), [("fox", 0.2), ("garfield", 0.0), ("monstree", 0.0), ("studio_room", 0.2)]
+)
+def test_neighbours_of_real_captures_are_no_twins(shared: Path, capture: str, most: float) -> None:
+    """In a walk around an object each view has neighbours; they are what training is for."""
+    files = sorted((shared / "data" / capture / "images").iterdir())[:40]
+    views = []
+    for file in files:
+        image = np.asarray(Image.open(file).convert("RGB").resize((160, 120)))
+        views.append(View(file.name, orbit_camera(0.1, 160, 120), image))
+    scene = Scene(capture, tuple(v for k, v in enumerate(views) if k % 8), tuple(views[::8]))
+    assert len(without_copies(scene).twins.near) <= most * len(scene.test)
