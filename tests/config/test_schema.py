@@ -13,6 +13,7 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from gsbench.app.command import compose_trials
+from gsbench.config.command_words import check_words
 from gsbench.config.compose import compose_one
 from gsbench.config.schema import checked_values, register_schemas
 from gsbench.config.trust import check_target
@@ -279,3 +280,19 @@ def test_no_training_needs_no_densifier() -> None:
 def test_no_more_threads_than_a_system_starts(threads: str) -> None:
     with pytest.raises(InputError, match=r"threads must be a whole number in \[1, 4096\] or 'auto'"):
         composed(f"threads={threads}")
+
+
+@pytest.mark.parametrize(
+    ("word", "is_kept"),
+    [
+        ("name=1_1", False), ("name=1e3", False), ("densify.name=1e3", False), ("name=007", False),
+        ("name=2,1_1", False), ("scene.path=1.50", False), ("name=12", True), ("name=on", True), ("name=0x10", True),
+        ('name="1e3"', True), ("name=2026-11-26", True), ("name=a_1", True), ("densify.volume_threshold=1e-3", True),
+    ],
+)  # fmt: skip
+def test_a_text_is_kept_as_typed_or_refused(word: str, is_kept: bool) -> None:
+    if is_kept:
+        check_words([word])
+    else:
+        with pytest.raises(InputError, match="would be read as the number"):
+            check_words([word])

@@ -23,6 +23,8 @@ GROUPS = ("scene", "init", "densify", "raster", "train", "eval", "tracking", "la
 EXTERNAL_FOLDER = "external"  # subfolder of a group for other programs; glob(*) does not list it
 IN_TRIAL_PATH = ("name", "seed")  # not in the configuration's hash, but in the path of the trial's folder
 OPTIONS = ("-m", "--multirun", "--dry-run", "--config-dir", "--cfg", "--info", "--help", "--version")
+# Settings that are texts, by the last part of their keys.
+TEXTS = ("name", "runs", "path", "images", "sparse", "masks", "train_list", "test_list", "weights", "uri", "version")
 MAX_BRACKETS = 40  # open at once in a word, since Hydra's parser recurses into them
 KEY = re.compile(r"[+~]*\w+([./]\w+)*")
 
@@ -85,6 +87,25 @@ def check_words(words: Sequence[str]) -> None:
             check_removal(override)
         elif key in GROUPS and not _is_choice(override):
             raise InputError(f"{word!r}: choose one by its name: {key}={', '.join(options(key))}")
+        elif key.rpartition(".")[2] in TEXTS:
+            check_text(word)
+
+
+def check_text(word: str) -> None:
+    """Raise InputError for a text that Hydra would read as a number and write differently.
+
+    ``name=1_1`` would become 11, and ``name=1e3`` 1000.0, so results would land in a folder that nobody named.
+    """
+    key, _, values = word.partition("=")
+    for text in map(str.strip, values.split(",")):
+        for read in (int, float):
+            try:
+                number = str(read(text))
+            except ValueError:
+                continue
+            if number != text:
+                raise InputError(f"{word!r}: {text} would be read as the number {number}: type '{key}=\"{text}\"'")
+            break
 
 
 def check_removal(override: Override) -> None:

@@ -27,7 +27,7 @@ FORMATS = (".jpg", ".png", ".tif", ".webp", ".bmp")
 SAME_FORMAT = {".jpeg": ".jpg", ".tiff": ".tif"}
 
 # Near twins are compared as grey pictures with a longest side of 32 px. In 16 captures, a second shot that is moved by
-# half a percent of its width correlates by at least .978 with the first, and one that is encoded again by more than .99.
+# half a percent of its width correlates by at least .978 with the first, and one that is encoded again by over .99.
 # Between neighbours of ordinary captures the median is .25 to .92.
 GRID = 32  # px
 NEAR = 0.975  # correlation
