@@ -253,8 +253,8 @@ def test_views_have_their_masks_at_the_final_size(make_scene: MakeScene, tmp_pat
 def test_a_mask_is_undistorted_with_its_photograph(make_scene: MakeScene, tmp_path: Path) -> None:
     """A photograph that is as its mask, white and black, stays so: a pixel counts where it is white."""
     root = make_scene(size=(120, 90), model="SIMPLE_RADIAL", params=(100, 60, 45, 0.15))
-    for path in (root / "images").iterdir():
-        disc = np.hypot(*np.mgrid[-45:45, -60:60]) > 20
+    for k, path in enumerate((root / "images").iterdir()):
+        disc = np.hypot(*np.mgrid[-45:45, -60:60]) > 20 + k
         save(path, np.repeat(disc[..., None] * np.uint8(255), 3, axis=2))
         save(root / "masks" / f"{path.name}.png", disc * np.uint8(255))
     raw = read_colmap("toy", root, masks="masks")
