@@ -2,7 +2,7 @@
 
 MLflow's page keeps what it shows (columns, groups, charts) in a tag of the experiment, if somebody shares that as a
 link: ``mlflow.sharedViewState.KEY`` holds JSON, and the address has ``viewStateShareKey=KEY``. The format is not
-documented, and was tried with MLflow 3.17. `address_of` gives the plain page for versions before 3.10 and from 4 on.
+documented, and was tried with MLflow 3.17: `addresses` gives the plain page for other versions.
 """
 
 from __future__ import annotations
@@ -19,22 +19,26 @@ from gsbench.analysis.results import Experiment, TrialResult, read_experiment
 from gsbench.analysis.table_formats import to_markdown
 from gsbench.analysis.tables import build_table
 from gsbench.errors import InputError
-from gsbench.eval.facts import known_keys
+from gsbench.eval.facts import find_metric, known_keys
+from gsbench.runs.layout import RENDERS
 from gsbench.tracking.mlflow_sink import NOTE, connect, ensure_experiment
-from gsbench.tracking.sinks import EVAL, eval_name
+from gsbench.tracking.sinks import EVAL, PICTURE_KINDS, arm_name, eval_name, picture_key
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
 
-KEY = "gsbench"
-VIEW = f"mlflow.sharedViewState.{KEY}"
+SHARED = "mlflow.sharedViewState."
+ARMS, PICTURES = "gsbench", "gsbench-pictures"  # keys of views
 MAX_TAG = 5000  # characters of an experiment's tag in older versions of MLflow
-TRIED = ("3.17",)  # versions of MLflow whose page was seen to show the view
+TRIED = ("3.17.",)  # versions of MLflow whose page was seen to show the views
 COLUMNS = ("scene", "init", "densify", "seed")  # tags of a run
-COSTS = {"gaussians": "Gaussians", "minutes": "training time (minutes)"}
+COSTS = {"gaussians": "Gaussians", "minutes": "training time (min)"}
 ARM = "arm"  # the parameter by which runs are grouped
-COMPLETE = "tags.kind = 'trial'"
-VERDICT = "Verdict"  # how the notes begin that belong above the table
+VERDICT = "- Verdict, "  # how the notes begin that belong above the table
+PICTURED_VIEWS = 2
+NAME_WIDTH = 290  # px of the runs' names
+
+Sections = dict[str, list[dict[str, Any]]]  # charts by the headings of their sections
 
 
 def publish(home: Path, uri: str | None) -> str:
@@ -46,7 +50,9 @@ def publish(home: Path, uri: str | None) -> str:
     experiment_id = ensure_experiment(client, home.name, home.parent)
     experiment = read_experiment(home)
     if experiment.trials:
-        _set(client, experiment_id, {NOTE: description(experiment), VIEW: packed(view_state(experiment.trials))})
+        tags = {NOTE: description(experiment)}
+        tags |= {f"{SHARED}{key}": packed(state) for key, state in views(experiment.trials).items()}
+        _set(client, experiment_id, tags)
     return experiment_id
 
 
@@ -57,12 +63,17 @@ def _set(client: MlflowClient, experiment_id: str, tags: dict[str, str]) -> None
             client.set_experiment_tag(experiment_id, key, value)
 
 
-def address_of(server: str, experiment_id: str, version: str, charts: bool = True) -> str:
-    """The address of the view on a ``server`` with this version of MLflow: its charts, or its list of runs."""
+def addresses(server: str, experiment_id: str, version: str) -> dict[str, str]:
+    """The addresses of the views on a ``server`` with this version of MLflow, by what they show."""
     page = f"{server.rstrip('/')}/#/experiments/{experiment_id}"
-    if not version.startswith(tuple(f"{tried}." for tried in TRIED)):
-        return page
-    return f"{page}/runs?viewStateShareKey={KEY}&compareRunsMode={'CHART' if charts else 'TABLE'}"
+    if not version.startswith(TRIED):
+        return {"experiment": page}
+    shared = f"{page}/runs?viewStateShareKey="
+    return {
+        "arms": f"{shared}{ARMS}&compareRunsMode=CHART",
+        "table": f"{shared}{ARMS}&compareRunsMode=TABLE",
+        "pictures": f"{shared}{PICTURES}&compareRunsMode=CHART",
+    }
 
 
 def description(experiment: Experiment) -> str:
@@ -71,10 +82,13 @@ def description(experiment: Experiment) -> str:
         lines = to_markdown(build_table(experiment)).splitlines()
     except InputError as error:  # cells would average unlike trials
         return f"No table: {error}"
-    verdicts = [line for line in lines if line.startswith(f"- {VERDICT}")]
+    verdicts = [line for line in lines if line.startswith(VERDICT)]
     rest = [line for line in lines if line not in verdicts and not line.startswith("#")]
+    # The page shows only the first line until it is clicked: decided pairs of arms come first there.
+    short = [line.removeprefix(VERDICT).partition(" (")[0] for line in verdicts]
+    answer = "; ".join(sorted(short, key=lambda text: "undecided" in text))
     end = f"\n\n`gsbench report {experiment.name}` shows more."
-    text = "\n".join([*verdicts, "", *rest]).strip()
+    text = "\n".join([f"**{answer}**" if answer else "", "", *verdicts, "", *rest]).strip()
     if len(text) + len(end) > MAX_TAG:
         text = text[: MAX_TAG - len(end)].rpartition("\n")[0]
     return text + end
@@ -85,25 +99,49 @@ def packed(state: dict[str, Any]) -> str:
     return "deflate;" + base64.b64encode(zlib.compress(json.dumps(state).encode(), 9)).decode()
 
 
-def view_state(trials: Sequence[TrialResult]) -> dict[str, Any]:
-    """The state of MLflow's page that compares the arms of ``trials``."""
+def views(trials: Sequence[TrialResult]) -> dict[str, dict[str, Any]]:
+    """The states of the views by their keys: the arms of ``trials`` in groups, and the test views of each trial."""
     measured = {key for trial in trials for key in trial.metrics}
-    metrics = [eval_name(key) for key in known_keys() if key in measured]
-    metrics += [eval_name(key) for key in sorted(measured - set(known_keys()))]
-    results = [*metrics, *(f"{EVAL}/{key}" for key in COSTS)]
-    curves = ["train/gaussians", "train/loss"]
-    if any(trial.record.metrics_at for trial in trials):  # eval.at
-        curves.insert(0, metrics[0])
-    pictures = sorted({path.stem for path in trials[0].folder.pictures("renders")})[:1]
-    sections = {
-        "Results: mean over the trials of an arm": [_chart("BAR", name, metricKey=name) for name in results],
-        "Over iterations": [_chart("LINE", name, metricKey=name, selectedMetricKeys=[name]) for name in curves],
-        "Test views": [
-            _chart("IMAGE", f"{view} {kind}", imageKeys=[f"{view}/{kind}"])
-            for view in pictures
-            for kind in ("1 render", "2 photograph", "3 error")
-        ],
+    keys = [*(key for key in known_keys() if key in measured), *sorted(measured - set(known_keys()))]
+    results = {eval_name(key): _label(key) for key in keys}
+    results |= {f"{EVAL}/{key}": label for key, label in COSTS.items()}
+    curves = {"train/gaussians": COSTS["gaussians"], "train/loss": "training loss"}
+    if any(trial.record.metrics_at for trial in trials) and keys:  # eval.at
+        curves = {eval_name(keys[0]): _label(keys[0])} | curves
+    # MLflow shows no pictures of groups.
+    pictures = [path.stem for path in trials[0].folder.pictures(RENDERS)][:PICTURED_VIEWS]
+    lines = [_chart("LINE", name, label, metricKey=name, selectedMetricKeys=[name]) for name, label in curves.items()]
+    arms = {
+        "Mean by arm": [_chart("BAR", name, label, metricKey=name) for name, label in results.items()],
+        "Over iterations (mean, least and largest)": lines,
     }
+    images = {
+        kind[2:]: [_chart("IMAGE", key := picture_key(view, kind), view, imageKeys=[key]) for view in pictures]
+        for kind in PICTURE_KINDS
+    }
+    swept = swept_settings(trials)
+    groups = [{"mode": "param", "groupByData": key} for key in (ARM, *swept)]
+    collapsed = {_group_of(trial, swept): False for trial in trials}
+    return {
+        ARMS: _state(list(results), arms, {"aggregateFunction": "average", "groupByKeys": groups}, collapsed),
+        PICTURES: _state(list(results), images, None, {}),
+    }
+
+
+def _group_of(trial: TrialResult, swept: Sequence[str]) -> str:
+    """The id of the trial's group on MLflow's page."""
+    values = {ARM: arm_name(trial.densify, trial.init)} | {key: str(trial.config.get(key, "")) for key in swept}
+    return ",".join(f"param.{key}.{value or 'null'}" for key, value in values.items())
+
+
+def _label(key: str) -> str:
+    facts = find_metric(key)
+    return facts.name if facts else key
+
+
+def _state(results: list[str], sections: Sections, groups: Any, expanded: dict[str, bool]) -> dict[str, Any]:
+    """The state of MLflow's page with these metrics in its list, charts in sections, and groups of runs."""
+    columns = [*(f"tags.`{tag}`" for tag in COLUMNS), *(f"metrics.`{name}`" for name in results)]
     return {
         # the search
         "searchFilter": "",
@@ -114,9 +152,9 @@ def view_state(trials: Sequence[TrialResult]) -> dict[str, Any]:
         "datasetsFilter": [],
         "modelVersionFilter": "All Runs",
         # the page
-        "selectedColumns": [*(f"tags.`{tag}`" for tag in COLUMNS), *(f"metrics.`{name}`" for name in results)],
-        "columnOrder": [],
-        "columnWidths": {},
+        "selectedColumns": columns,
+        "columnOrder": ["attributes.`Run Name`", *columns],
+        "columnWidths": {"attributes.`Run Name`": NAME_WIDTH},
         "runsExpanded": {},
         "runsPinned": [],
         "runsHidden": [],
@@ -127,11 +165,8 @@ def view_state(trials: Sequence[TrialResult]) -> dict[str, Any]:
         "isAccordionReordered": True,
         "useGroupedValuesInCharts": True,
         "hideEmptyCharts": True,
-        "groupBy": {
-            "aggregateFunction": "average",
-            "groupByKeys": [{"mode": "param", "groupByData": key} for key in (ARM, *swept_settings(trials))],
-        },
-        "groupsExpanded": {},
+        "groupBy": groups,
+        "groupsExpanded": expanded,
         "autoRefreshEnabled": True,
         "compareRunCharts": list(_placed(sections)),
         "compareRunSections": [
@@ -141,8 +176,9 @@ def view_state(trials: Sequence[TrialResult]) -> dict[str, Any]:
     }
 
 
-def _chart(kind: str, name: str, **options: Any) -> dict[str, Any]:
+def _chart(kind: str, name: str, label: str, **options: Any) -> dict[str, Any]:
     return {
+        "displayName": label,
         "uuid": f"{kind} {name}",
         "type": kind,
         "runsCountToCompare": 100,
@@ -152,7 +188,7 @@ def _chart(kind: str, name: str, **options: Any) -> dict[str, Any]:
     }
 
 
-def _placed(sections: dict[str, list[dict[str, Any]]]) -> Iterator[dict[str, Any]]:
+def _placed(sections: Sections) -> Iterator[dict[str, Any]]:
     for section, charts in sections.items():
         for chart in charts:
             yield chart | {"metricSectionId": section}

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import logging
 import os
-import re
 import time
 import uuid
 from collections.abc import Mapping, Sequence
@@ -152,7 +151,6 @@ ERROR_TAG = "error"
 NOTE = "mlflow.note.content"  # the description, in Markdown
 MAX_TAG = 5000  # characters of a tag (MLflow's limit)
 MAX_VALUES = (6000, 500, 250)  # characters of a parameter: MLflow's limit, and the limits of older servers
-NOT_IN_A_KEY = re.compile(r"[^a-zA-Z0-9_\-./ ]")  # characters that MLflow refuses in a picture's name
 
 
 class MlflowSink:
@@ -214,8 +212,7 @@ class MlflowSink:
         for folder, path in summary.files:
             self.client.log_artifact(self.run_id, str(path), folder or None)
         at = self._time_of(summary.seconds)
-        for name, picture in summary.pictures.items():
-            key = NOT_IN_A_KEY.sub("_", name)
+        for key, picture in summary.pictures.items():
             self.client.log_image(self.run_id, picture, key=key, step=summary.step, timestamp=at, synchronous=True)
         self.client.set_terminated(self.run_id, "FINISHED")
 

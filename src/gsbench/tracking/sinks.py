@@ -1,6 +1,7 @@
 """A trial in a tracker's terms, the contract of a tracker, and the trackers TensorBoard and Weights & Biases."""
 
 import os
+import re
 import shlex
 import shutil
 import time
@@ -22,6 +23,7 @@ from gsbench.runs.keys import TRAIN, flatten, sha256_of
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import TrialRecord, read_rows
 
+NOT_IN_A_KEY = re.compile(r"[^a-zA-Z0-9_\-. ]")  # characters that MLflow refuses in a picture's name
 Array = NDArray[np.uint8]
 FILES = (layout.CONFIG, layout.RESULTS, layout.INIT_REPORT, layout.PER_VIEW, layout.EVENTS)
 # Trackers sort names and show a chart for each, so only what people look at is sent, results first.
@@ -38,6 +40,19 @@ CURVES: dict[str, dict[str, str]] = {  # by file: key in it -> name in the track
         for key in ("cloned", "split_gradient", "split_volume", "pruned_opacity", "pruned_size", "blocked_by_cap")
     },
 }
+
+
+PICTURE_KINDS = ("1 render", "2 photograph", "3 error")  # of a test view, numbered for their order
+
+
+def picture_key(view: str, kind: str) -> str:
+    """The name of a picture of a test view, with characters that every tracker takes."""
+    return f"{NOT_IN_A_KEY.sub('_', view)}/{kind}"
+
+
+def arm_name(densify: str, init: str) -> str:
+    """The name of an arm. What is compared most often comes first, since trackers cut long names at their end."""
+    return f"{densify} · {init}"
 
 
 def eval_name(key: str) -> str:
@@ -147,14 +162,13 @@ class TrackedTrial:
 
     @property
     def arm(self) -> str:
-        """Initialiser and densifier."""
-        return f"{self.values['init']['name']}-{self.values['densify']['name']}"
+        """The name of the trial's arm."""
+        return arm_name(self.values["densify"]["name"], self.values["init"]["name"])
 
     @property
     def label(self) -> str:
-        """The run's name. The densifier comes first, since trackers cut long names at their end."""
-        densify, init, scene = (self.values[group]["name"] for group in ("densify", "init", "scene"))
-        return f"{densify} · {init} · {scene} · s{self.values['seed']}"
+        """The run's name: densifier, scene and seed."""
+        return f"{self.values['densify']['name']} · {self.values['scene']['name']} · s{self.values['seed']}"
 
     @property
     def path(self) -> str:
@@ -239,19 +253,20 @@ class TrackedTrial:
         return "\n\n".join(lines)
 
     def _pictures(self, count: int) -> dict[str, Array]:
-        """Render, photograph and absolute error of ``count`` test views: ``VIEW/1 render`` …, in this order."""
+        """Render, photograph and absolute error of ``count`` test views, by `picture_key`."""
+        rendered, photographed, wrong = PICTURE_KINDS
         pictures: dict[str, Array] = {}
         for path in self.folder.pictures(layout.RENDERS)[:count]:
             render = _read_picture(path)
-            pictures[f"{path.stem}/1 render"] = render
+            pictures[picture_key(path.stem, rendered)] = render
             photograph = self.folder.path / layout.GROUND_TRUTH / path.name
             if not photograph.exists():
                 continue
             truth = _read_picture(photograph)
-            pictures[f"{path.stem}/2 photograph"] = truth
+            pictures[picture_key(path.stem, photographed)] = truth
             if truth.shape == render.shape:
                 error = np.abs(render.astype(np.int16) - truth.astype(np.int16))
-                pictures[f"{path.stem}/3 error"] = error.astype(np.uint8)
+                pictures[picture_key(path.stem, wrong)] = error.astype(np.uint8)
         return pictures
 
 
