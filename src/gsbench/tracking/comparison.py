@@ -19,23 +19,22 @@ from gsbench.analysis.results import Experiment, TrialResult, read_experiment
 from gsbench.analysis.table_formats import to_markdown
 from gsbench.analysis.tables import build_table
 from gsbench.errors import InputError
-from gsbench.eval.facts import find_metric, known_keys
-from gsbench.runs.layout import RENDERS
+from gsbench.eval.facts import known_keys
 from gsbench.tracking.mlflow_sink import NOTE, connect, ensure_experiment
-from gsbench.tracking.sinks import EVAL, PICTURE_KINDS, arm_name, eval_name, picture_key
+from gsbench.tracking.sinks import EVAL, arm_name, eval_name
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
 
-SHARED = "mlflow.sharedViewState."
-ARMS, PICTURES = "gsbench", "gsbench-pictures"  # keys of views
+KEY = "gsbench"
+VIEW = f"mlflow.sharedViewState.{KEY}"
 MAX_TAG = 5000  # characters of an experiment's tag in older versions of MLflow
 TRIED = ("3.17.",)  # versions of MLflow whose page was seen to show the views
 COLUMNS = ("scene", "init", "densify", "seed")  # tags of a run
-COSTS = {"gaussians": "Gaussians", "minutes": "training time (min)"}
 ARM = "arm"  # the parameter by which runs are grouped
 VERDICT = "- Verdict, "  # how the notes begin that belong above the table
-PICTURED_VIEWS = 2
+OWN_NOTE = "`gsbench report"  # in a description that `publish` wrote
+CHART_HEIGHT = 250  # px
 NAME_WIDTH = 290  # px of the runs' names
 
 Sections = dict[str, list[dict[str, Any]]]  # charts by the headings of their sections
@@ -50,14 +49,15 @@ def publish(home: Path, uri: str | None) -> str:
     experiment_id = ensure_experiment(client, home.name, home.parent)
     experiment = read_experiment(home)
     if experiment.trials:
-        tags = {NOTE: description(experiment)}
-        tags |= {f"{SHARED}{key}": packed(state) for key, state in views(experiment.trials).items()}
-        _set(client, experiment_id, tags)
+        _set(client, experiment_id, {NOTE: description(experiment), VIEW: packed(view_state(experiment.trials))})
     return experiment_id
 
 
 def _set(client: MlflowClient, experiment_id: str, tags: dict[str, str]) -> None:
     present = client.get_experiment(experiment_id).tags
+    note = present.get(NOTE)
+    if note and OWN_NOTE not in note:  # somebody wrote a description
+        tags = {VIEW: tags[VIEW]}
     for key, value in tags.items():
         if len(value) <= MAX_TAG and present.get(key) != value:
             client.set_experiment_tag(experiment_id, key, value)
@@ -68,11 +68,10 @@ def addresses(server: str, experiment_id: str, version: str) -> dict[str, str]:
     page = f"{server.rstrip('/')}/#/experiments/{experiment_id}"
     if not version.startswith(TRIED):
         return {"experiment": page}
-    shared = f"{page}/runs?viewStateShareKey="
+    shared = f"{page}/runs?viewStateShareKey={KEY}"
     return {
-        "arms": f"{shared}{ARMS}&compareRunsMode=CHART",
-        "table": f"{shared}{ARMS}&compareRunsMode=TABLE",
-        "pictures": f"{shared}{PICTURES}&compareRunsMode=CHART",
+        "arms": f"{shared}&compareRunsMode=CHART",
+        "table": f"{shared}&compareRunsMode=TABLE",
     }
 
 
@@ -81,13 +80,13 @@ def description(experiment: Experiment) -> str:
     try:
         lines = to_markdown(build_table(experiment)).splitlines()
     except InputError as error:  # cells would average unlike trials
-        return f"No table: {error}"
+        return f"No table: {error}\n\n{OWN_NOTE} {experiment.name}`"
     verdicts = [line for line in lines if line.startswith(VERDICT)]
     rest = [line for line in lines if line not in verdicts and not line.startswith("#")]
     # The page shows only the first line until it is clicked: decided pairs of arms come first there.
     short = [line.removeprefix(VERDICT).partition(" (")[0] for line in verdicts]
     answer = "; ".join(sorted(short, key=lambda text: "undecided" in text))
-    end = f"\n\n`gsbench report {experiment.name}` shows more."
+    end = f"\n\n{OWN_NOTE} {experiment.name}` shows more."
     text = "\n".join([f"**{answer}**" if answer else "", "", *verdicts, "", *rest]).strip()
     if len(text) + len(end) > MAX_TAG:
         text = text[: MAX_TAG - len(end)].rpartition("\n")[0]
@@ -99,44 +98,29 @@ def packed(state: dict[str, Any]) -> str:
     return "deflate;" + base64.b64encode(zlib.compress(json.dumps(state).encode(), 9)).decode()
 
 
-def views(trials: Sequence[TrialResult]) -> dict[str, dict[str, Any]]:
-    """The states of the views by their keys: the arms of ``trials`` in groups, and the test views of each trial."""
+def view_state(trials: Sequence[TrialResult]) -> dict[str, Any]:
+    """The state of MLflow's page that shows the ``trials`` in groups by arm, with a chart for each result."""
     measured = {key for trial in trials for key in trial.metrics}
     keys = [*(key for key in known_keys() if key in measured), *sorted(measured - set(known_keys()))]
-    results = {eval_name(key): _label(key) for key in keys}
-    results |= {f"{EVAL}/{key}": label for key, label in COSTS.items()}
-    curves = {"train/gaussians": COSTS["gaussians"], "train/loss": "training loss"}
-    if any(trial.record.metrics_at for trial in trials) and keys:  # eval.at
-        curves = {eval_name(keys[0]): _label(keys[0])} | curves
-    # MLflow shows no pictures of groups.
-    pictures = [path.stem for path in trials[0].folder.pictures(RENDERS)][:PICTURED_VIEWS]
-    lines = [_chart("LINE", name, label, metricKey=name, selectedMetricKeys=[name]) for name, label in curves.items()]
+    results = [*map(eval_name, keys), f"{EVAL}/gaussians", f"{EVAL}/minutes"]
+    curves = ["train/gaussians", "train/loss"]
+    if any(trial.record.metrics_at for trial in trials):  # eval.at
+        curves.insert(0, results[0])
+    lines = [_chart("LINE", name, metricKey=name, selectedMetricKeys=[name]) for name in curves]
     arms = {
-        "Mean by arm": [_chart("BAR", name, label, metricKey=name) for name, label in results.items()],
+        "Mean by arm": [_chart("BAR", name, metricKey=name) for name in results],
         "Over iterations (mean, least and largest)": lines,
-    }
-    images = {
-        kind[2:]: [_chart("IMAGE", key := picture_key(view, kind), view, imageKeys=[key]) for view in pictures]
-        for kind in PICTURE_KINDS
     }
     swept = swept_settings(trials)
     groups = [{"mode": "param", "groupByData": key} for key in (ARM, *swept)]
     collapsed = {_group_of(trial, swept): False for trial in trials}
-    return {
-        ARMS: _state(list(results), arms, {"aggregateFunction": "average", "groupByKeys": groups}, collapsed),
-        PICTURES: _state(list(results), images, None, {}),
-    }
+    return _state(results, arms, {"aggregateFunction": "average", "groupByKeys": groups}, collapsed)
 
 
 def _group_of(trial: TrialResult, swept: Sequence[str]) -> str:
     """The id of the trial's group on MLflow's page."""
     values = {ARM: arm_name(trial.densify, trial.init)} | {key: str(trial.config.get(key, "")) for key in swept}
     return ",".join(f"param.{key}.{value or 'null'}" for key, value in values.items())
-
-
-def _label(key: str) -> str:
-    facts = find_metric(key)
-    return facts.name if facts else key
 
 
 def _state(results: list[str], sections: Sections, groups: Any, expanded: dict[str, bool]) -> dict[str, Any]:
@@ -171,14 +155,14 @@ def _state(results: list[str], sections: Sections, groups: Any, expanded: dict[s
         "compareRunCharts": list(_placed(sections)),
         "compareRunSections": [
             {"uuid": name, "name": name, "display": True, "isReordered": True, "deleted": False, "isGenerated": False}
+            | {"columns": 3, "cardHeight": CHART_HEIGHT}
             for name in sections
         ],
     }
 
 
-def _chart(kind: str, name: str, label: str, **options: Any) -> dict[str, Any]:
+def _chart(kind: str, name: str, **options: Any) -> dict[str, Any]:
     return {
-        "displayName": label,
         "uuid": f"{kind} {name}",
         "type": kind,
         "runsCountToCompare": 100,
