@@ -166,7 +166,7 @@ def test_a_mirror_in_mlflow(gsbench: Run, runs: Path) -> None:
     assert done.returncode == 0, done.stderr
     wanted = [json.loads((trial / "results.json").read_text())["metrics"]["psnr"] for trial in trials_of(runs).values()]
     with sqlite3.connect(runs / "mlflow.db") as database:  # without MLflow's own code
-        sent = [value for (value,) in database.execute("SELECT value FROM latest_metrics WHERE key = 'psnr'")]
+        sent = [value for (value,) in database.execute("SELECT value FROM latest_metrics WHERE key = 'eval/psnr_dB'")]
     assert sorted(sent) == pytest.approx(sorted(wanted))
 
 

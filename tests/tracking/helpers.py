@@ -53,7 +53,7 @@ def mirror_trial(settings: dict[str, Any], folder: Path, values: dict[str, Any])
 def write_trial(folder: Path, values: dict[str, Any], records: int = RECORDS, psnr: float = 20.0) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     seed = values["seed"]
-    lines = [{"step": i, "loss": 1 / i, "seed": seed, "seconds": 0.01 * i} for i in range(1, records + 1)]
+    lines = [{"step": i, "loss": 1 / i, "l1": seed, "seconds": 0.01 * i} for i in range(1, records + 1)]
     (folder / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     (folder / "events.jsonl").write_text("".join(json.dumps({"step": i, "cloned": i}) + "\n" for i in (50, 100)))
     if not (folder / "config.yaml").exists():

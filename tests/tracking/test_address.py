@@ -110,3 +110,11 @@ def test_no_link_among_the_artifacts_is_written_through(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="follows no links"):
         mirror_trial(options(), folder, values)
     assert private.read_text() == "secret"
+
+
+@pytest.mark.parametrize("address", ["./mlruns", "mlruns", "file:./mlruns", "http:/host"])
+def test_an_address_that_is_a_folder_is_refused_in_one_line(address: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["scene=courtyard", f"tracking.uri={address}", "--dry-run"]) == 2
+    said = capsys.readouterr().err.splitlines()
+    assert len(said) == 1
+    assert "tracking.uri must be an address such as http://HOST:PORT" in said[0]

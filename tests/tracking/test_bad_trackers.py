@@ -188,7 +188,7 @@ def test_a_tracker_may_go_at_any_moment(
     for run in found:
         assert run.info.status == "FINISHED"
         assert history(client, run.info.run_id, "train/loss") == [(i, 1 / i) for i in range(1, RECORDS + 1)]
-        assert run.data.metrics["num_gaussians"] == 10 + int(run.data.tags["seed"])
+        assert run.data.metrics["eval/gaussians"] == 10 + int(run.data.tags["seed"])
 
 
 def mirror_a_trial(runs: Path, uri: str, seed: int, patience: float) -> str:

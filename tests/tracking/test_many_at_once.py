@@ -48,8 +48,8 @@ def check_jobs(client: Any) -> None:
         seed = int(run.data.tags["seed"])
         assert run.info.status == "FINISHED"
         assert history(client, run.info.run_id, "train/loss") == [(i, 1 / i) for i in range(1, RECORDS + 1)]
-        assert {value for _, value in history(client, run.info.run_id, "train/seed")} == {float(seed)}
-        assert run.data.metrics["num_gaussians"] == 10 + seed
+        assert {value for _, value in history(client, run.info.run_id, "train/l1")} == {float(seed)}
+        assert run.data.metrics["eval/gaussians"] == 10 + seed
     assert found_runs(client, "Default") == []
 
 

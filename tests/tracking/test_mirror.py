@@ -47,11 +47,10 @@ def test_all_that_the_files_say_is_mirrored_once(runs: Path) -> None:
     client = connect(None, runs)
     run = run_of(client, 1)
     assert run.info.status == "FINISHED"
-    assert run.data.metrics["psnr"] == 20.0
-    assert run.data.metrics["total/cloned"] == 150
+    assert run.data.metrics["eval/psnr_dB"] == 20.0
     assert run.data.params["densify.name"] == "a_densify"
     assert history(client, run.info.run_id, "train/loss") == [(i, 1 / i) for i in range(1, RECORDS + 1)]
-    assert history(client, run.info.run_id, "events/cloned") == [(50, 50.0), (100, 100.0)]
+    assert history(client, run.info.run_id, "train/densify/cloned") == [(50, 50.0), (100, 100.0)]
     assert {item.path for item in client.list_artifacts(run.info.run_id)} >= {"config.yaml", "results.json"}
 
 
@@ -66,7 +65,7 @@ def test_a_crash_between_sending_and_noting_it_repeats_nothing(runs: Path) -> No
     client = connect(None, runs)
     run = run_of(client, 2)
     assert len(history(client, run.info.run_id, "train/loss")) == RECORDS
-    assert len(history(client, run.info.run_id, "psnr")) == 1
+    assert len(history(client, run.info.run_id, "eval/psnr_dB")) == 1
 
 
 def test_results_that_changed_replace_the_run(runs: Path) -> None:
@@ -78,7 +77,7 @@ def test_results_that_changed_replace_the_run(runs: Path) -> None:
     assert mirror_trial(options(), folder, values)
     assert not mirror_trial(options(), folder, values)
     run = run_of(connect(None, runs), 3)
-    assert run.data.metrics["psnr"] == 33.0
+    assert run.data.metrics["eval/psnr_dB"] == 33.0
 
 
 def wait_for_run(folder: Path) -> None:

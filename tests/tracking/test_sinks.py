@@ -41,8 +41,12 @@ def finished_trial(runs: Path, seed: int) -> tuple[Path, dict[str, Any]]:
     write_trial(folder, values)
     results = json.loads((folder / "results.json").read_text()) | {"metrics_at": AT}
     (folder / "results.json").write_text(json.dumps(results))
-    (folder / "renders").mkdir()
-    Image.fromarray(np.full((4, 6, 3), 200, np.uint8)).save(folder / "renders" / "view 1#.png")
+    for kind, value in (("renders", 200), ("ground_truth", 50)):
+        (folder / kind).mkdir()
+        Image.fromarray(np.full((4, 6, 3), value, np.uint8)).save(folder / kind / "view 1#.png")
+    words = ["densify=a_densify", "scene.path=/my photos"]
+    plan = {"trials": {folder.relative_to(folder.parents[2]).as_posix(): {"overrides": words}}}
+    (folder.parents[2] / "plan.json").write_text(json.dumps(plan))
     return folder, values
 
 
@@ -51,12 +55,14 @@ def test_mlflow_shows_a_curve_of_the_final_metrics_and_a_grid_of_the_test_pictur
     mirror_trial(options(), folder, values)
     client = connect(None, runs)
     run = run_of(client, 1)
-    assert run.info.run_name == "seed 1 a_scene a_init-a_densify"
-    assert history(client, run.info.run_id, "psnr") == [(50, 15.0), (RECORDS, 20.0)]
-    assert run.data.metrics["psnr"] == 20.0  # what the tables show is the last
+    assert run.info.run_name == "a_densify · a_scene · s1"
+    assert history(client, run.info.run_id, "eval/psnr_dB") == [(50, 15.0), (RECORDS, 20.0)]
+    assert run.data.metrics["eval/psnr_dB"] == 20.0  # what the tables show is the last
     assert run.data.tags["mlflow.loggedImages"] == "True"  # by which the page knows that it has a grid to show
     names = [Path(item.path).name for item in client.list_artifacts(run.info.run_id, "images")]
-    assert any(name.startswith(f"renders~view 1_+step+{RECORDS}+") and name.endswith(".png") for name in names), names
+    for kind in ("1 render", "2 photograph", "3 error"):
+        assert [n for n in names if n.startswith(f"view 1_~{kind}+step+{RECORDS}+") and n.endswith(".png")], names
+    assert run.data.tags["mlflow.note.content"].startswith("PSNR (dB) 20, 11 Gaussians after 150 iterations.")
 
 
 def test_the_summary_of_a_trial(tmp_path: Path) -> None:
@@ -67,14 +73,17 @@ def test_the_summary_of_a_trial(tmp_path: Path) -> None:
     summary = trial.summary(results, images=1, with_model=False)
     assert (summary.step, summary.seconds) == (RECORDS, 2.0)
     found = {(scalar.key, scalar.step): scalar for scalar in summary.scalars}
-    assert found["psnr", 50].seconds == pytest.approx(2.0 * 50 / RECORDS)
-    assert found["psnr", RECORDS].seconds == 2.0
+    assert found["eval/psnr_dB", 50].seconds == pytest.approx(2.0 * 50 / RECORDS)
+    assert found["eval/psnr_dB", RECORDS].seconds == 2.0
     assert {key: scalar.value for (key, step), scalar in found.items() if step == RECORDS} == {
-        "psnr": 20.0, "num_gaussians": 13.0, "num_init_points": 5.0, "peak_memory_mb": 1.5, "seconds_train": 2.0,
-        "total/cloned": 150.0,
+        "eval/psnr_dB": 20.0, "eval/gaussians": 13.0, "eval/init_points": 5.0, "eval/peak_memory_MB": 1.5,
+        "eval/minutes": pytest.approx(2 / 60),
     }  # fmt: skip
     assert summary.tags["hash_config"] == "abc"
-    assert list(summary.pictures) == ["renders/view 1#"]
+    assert list(summary.pictures) == ["view 1_/1 render", "view 1_/2 photograph", "view 1_/3 error"]
+    assert (summary.pictures["view 1_/3 error"] == 150).all()
+    again = summary.note.splitlines()[-1].removeprefix("Again: ")
+    assert again == "`gsbench densify=a_densify 'scene.path=/my photos'`"
     assert trial.summary(results, images=0, with_model=False).pictures == {}
     assert {path.name for _, path in summary.files} == {"config.yaml", "results.json", "events.jsonl"}
 
@@ -91,14 +100,14 @@ def test_weights_and_biases_gets_all_of_a_trial_in_one_run(tmp_path: Path, monke
     assert os.environ["WANDB_BASE_URL"] == "http://wandb.example"
     (asked,) = (call.kwargs for call in wandb.init.call_args_list)
     assert (asked["project"], asked["resume"]) == ("tracked", "allow")
-    assert asked["name"] == "seed 1 a_scene a_init-a_densify"
+    assert asked["name"] == "a_densify · a_scene · s1"
     run = wandb.init.return_value
     logged = [call.args[0] for call in run.log.call_args_list]
     losses = [(row["iteration"], row["train/loss"]) for row in logged if "train/loss" in row]
     assert losses == [(i, 1 / i) for i in range(1, RECORDS + 1)]
-    assert {"iteration": 50, "psnr": 15.0} in logged
-    assert [row["iteration"] for row in logged if "renders/view 1#" in row] == [RECORDS]
-    assert run.summary.update.call_args.args[0]["psnr"] == 20.0
+    assert {"iteration": 50, "eval/psnr_dB": 15.0} in logged
+    assert [row["iteration"] for row in logged if "view 1_/1 render" in row] == [RECORDS]
+    assert run.summary.update.call_args.args[0]["eval/psnr_dB"] == 20.0
     assert {Path(call.args[0]).name for call in run.save.call_args_list} >= {"config.yaml", "results.json"}
     run.finish.assert_called_once_with(0)
     write_trial(folder, values, psnr=33.0)
@@ -148,8 +157,8 @@ def test_tensorboard_shows_the_same_numbers_once(tmp_path: Path) -> None:
         assert len(list(there.iterdir())) == 1
         losses = [(event.step, event.value) for event in shown().Scalars("train/loss")]
         assert losses == [(i, pytest.approx(1 / i)) for i in range(1, RECORDS + 1)]
-        assert [(event.step, event.value) for event in shown().Scalars("psnr")] == [(50, 15.0), (RECORDS, 20.0)]
-        assert [event.step for event in shown().Images("renders/view 1#")] == [RECORDS]
+        assert [(event.step, event.value) for event in shown().Scalars("eval/psnr_dB")] == [(50, 15.0), (RECORDS, 20.0)]
+        assert [event.step for event in shown().Images("view 1_/1 render")] == [RECORDS]
         state = json.loads((folder / "tensorboard.json").read_text())
         (folder / "tensorboard.json").write_text(json.dumps(state | {"complete": None}))
     assert not (folder / STATE).exists()
@@ -164,5 +173,5 @@ def test_weights_and_biases_takes_a_trial_without_a_network(tmp_path: Path, monk
     assert not mirror_trial(sink, folder, values)
     (file,) = (tmp_path / "wandb").rglob("*.wandb")
     said = file.read_bytes()
-    for word in (b"train/loss", b"psnr", b"seed 1 a_scene a_init-a_densify"):
+    for word in (b"train/loss", b"eval/psnr_dB", "a_densify · a_scene · s1".encode()):
         assert word in said

@@ -34,6 +34,7 @@ from gsbench.runs.layout import CONFIG, FAILED, RESULTS
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.isolate import describe_exit, error_lines, python_command
 from gsbench.system.locks import BusyError, hold
+from gsbench.tracking.comparison import publish
 from gsbench.tracking.mlflow_sink import MlflowSink, untyped_address
 from gsbench.tracking.sinks import MirrorState, Sink, TensorBoardSink, TrackedTrial, WandbSink
 from gsbench.words import counted
@@ -41,6 +42,7 @@ from gsbench.words import counted
 log = logging.getLogger(__name__)
 
 TRACKER_FAILED = 3  # exit code if the tracker, or a file, is at fault: the last line on stderr says why
+SECONDS_BETWEEN_TABLES = 60.0  # an experiment of thousands of trials takes seconds to read
 SECONDS_TO_STOP = 3.0  # patience after a signal that asks to end
 SINKS: dict[str, Any] = {"mlflow": MlflowSink, "tensorboard": TensorBoardSink, "wandb": WandbSink}
 
@@ -203,6 +205,7 @@ def sync(folders: Iterable[TrialFolder], uri: str | None) -> Iterator[str]:
     Raises MirrorError if the tracker refuses a trial.
     """
     new = already_there = 0
+    pages: Pages = {}
     for folder in folders:
         state = folder.state()
         if state == "damaged":
@@ -224,6 +227,7 @@ def sync(folders: Iterable[TrialFolder], uri: str | None) -> Iterator[str]:
             continue
         try:
             is_new = mirror_ended(folder, options, values)
+            pages[folder.home, options["uri"]] = folder, options
         except BusyError:
             yield f"{folder.label} is being mirrored by another process"
             continue
@@ -232,6 +236,7 @@ def sync(folders: Iterable[TrialFolder], uri: str | None) -> Iterator[str]:
         new, already_there = new + is_new, already_there + (not is_new)
         if is_new:
             yield f"mirrored {folder.label}"
+    _renew(pages)
     yield f"{counted(new, 'trial')} mirrored now, {already_there} before"
 
 
@@ -249,6 +254,20 @@ def refusal(folder: TrialFolder, options: dict[str, Any], error: Exception) -> M
     lines = str(error).strip().splitlines()
     reason = f"{type(error).__name__}: {lines[0][:200] if lines else ''}"
     return MirrorError(f"{sink_of(options).name} does not take {folder.label} ({reason})")
+
+
+Pages = dict[tuple[Path, str | None], tuple[TrialFolder, dict[str, Any]]]  # by experiment and tracker: a trial there
+
+
+def _renew(pages: Pages) -> None:
+    """Show the present table and verdict of experiments on their pages. Raises MirrorError."""
+    for folder, options in pages.values():
+        if sink_of(options) is MlflowSink:
+            try:
+                publish(folder.home, options["uri"])
+            except Exception as error:  # any error of the tracker's client
+                raise refusal(folder, options, error) from error
+    pages.clear()
 
 
 # ---- beside a sweep
@@ -278,6 +297,8 @@ def follow() -> NoReturn:
 
 def _follow(lines: Lines, pause: float) -> None:
     trials: list[_FollowedTrial] = []
+    pages: Pages = {}
+    renewed_at = 0.0
     last = False
     while not last:
         with suppress(Empty):
@@ -294,7 +315,13 @@ def _follow(lines: Lines, pause: float) -> None:
             except Exception as error:  # any error of the tracker's client: tried again, and raised the last time
                 if last:
                     raise refusal(trial.folder, trial.options, error) from error
+        for trial in trials:
+            if trial.has_ended:
+                pages[trial.folder.home, trial.options["uri"]] = trial.folder, trial.options
         trials = [trial for trial in trials if not trial.has_ended]
+        if last or time.monotonic() - renewed_at > SECONDS_BETWEEN_TABLES:
+            _renew(pages)
+            renewed_at = time.monotonic()
 
 
 class _FollowedTrial:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import logging
 import os
-import re
 import time
 import uuid
 from collections.abc import Mapping, Sequence
@@ -149,9 +148,9 @@ OWN_DATABASE = "runs/mlflow.db"  # stands in the state for the database of the r
 TOKEN_TAG = "gsbench.token"
 PARAMS_TAG = "gsbench"  # set once all settings are logged
 ERROR_TAG = "error"
+NOTE = "mlflow.note.content"  # the description, in Markdown
 MAX_TAG = 5000  # characters of a tag (MLflow's limit)
-MAX_VALUE = 6000  # characters of a parameter (MLflow's limit)
-NOT_IN_A_KEY = re.compile(r"[^a-zA-Z0-9_\-./ ]")  # characters that MLflow refuses in a picture's name
+MAX_VALUES = (6000, 500, 250)  # characters of a parameter: MLflow's limit, and the limits of older servers
 
 
 class MlflowSink:
@@ -204,19 +203,17 @@ class MlflowSink:
     def complete(self, summary: Summary) -> None:
         """Log the final metrics, pictures and files, and close the run."""
         from mlflow.entities import RunTag
-        from PIL import Image
 
         if ERROR_TAG in self.client.get_run(self.run_id).data.tags:  # an earlier attempt failed
             self.client.delete_tag(self.run_id, ERROR_TAG)
         self.log(summary.scalars)
-        self.client.log_batch(self.run_id, tags=[RunTag(key, value) for key, value in summary.tags.items()])
+        tags = summary.tags | {NOTE: summary.note[:MAX_TAG]}
+        self.client.log_batch(self.run_id, tags=[RunTag(key, value) for key, value in tags.items()])
         for folder, path in summary.files:
             self.client.log_artifact(self.run_id, str(path), folder or None)
-        for name, path in summary.pictures.items():
-            with Image.open(path) as image:
-                key = NOT_IN_A_KEY.sub("_", name)
-                at = self._time_of(summary.seconds)
-                self.client.log_image(self.run_id, image, key=key, step=summary.step, timestamp=at, synchronous=True)
+        at = self._time_of(summary.seconds)
+        for key, picture in summary.pictures.items():
+            self.client.log_image(self.run_id, picture, key=key, step=summary.step, timestamp=at, synchronous=True)
         self.client.set_terminated(self.run_id, "FINISHED")
 
     def stop(self, status: str, reason: str | None) -> None:
@@ -230,9 +227,17 @@ class MlflowSink:
 
     def _log_params(self) -> None:
         from mlflow.entities import Param
+        from mlflow.exceptions import MlflowException
 
-        params = [Param(key, value[:MAX_VALUE]) for key, value in self._trial.params().items()]
-        self.client.log_batch(self.run_id, params=params)
+        values = self._trial.params()
+        for limit in MAX_VALUES:
+            params = [Param(key, value[:limit]) for key, value in values.items()]
+            try:
+                self.client.log_batch(self.run_id, params=params)
+                break
+            except MlflowException:  # perhaps a value is too long for this server
+                if limit == MAX_VALUES[-1] or max(map(len, values.values())) <= MAX_VALUES[-1]:
+                    raise
         self.client.set_tag(self.run_id, PARAMS_TAG, "1")
 
     def _time_of(self, seconds: float) -> int:

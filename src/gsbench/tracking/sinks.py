@@ -1,6 +1,8 @@
 """A trial in a tracker's terms, the contract of a tracker, and the trackers TensorBoard and Weights & Biases."""
 
 import os
+import re
+import shlex
 import shutil
 import time
 import uuid
@@ -9,15 +11,55 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from gsbench.eval.facts import find_metric
 from gsbench.files import require_no_links
-from gsbench.parsing import Count, Record
+from gsbench.parsing import Count, Record, read_if_sound
 from gsbench.runs import layout
 from gsbench.runs.keys import TRAIN, flatten, sha256_of
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import TrialRecord, read_rows
 
+NOT_IN_A_KEY = re.compile(r"[^a-zA-Z0-9_\-. ]")  # characters that MLflow refuses in a picture's name
+Array = NDArray[np.uint8]
 FILES = (layout.CONFIG, layout.RESULTS, layout.INIT_REPORT, layout.PER_VIEW, layout.EVENTS)
-CURVES = {layout.CURVES: "train", layout.EVENTS: "events"}  # file: prefix of its scalars' names
+# Trackers sort names and show a chart for each, so only what people look at is sent, results first.
+EVAL = "eval"
+CURVES: dict[str, dict[str, str]] = {  # by file: key in it -> name in the tracker
+    layout.CURVES: {
+        "loss": "train/loss",
+        "l1": "train/l1",
+        "ssim": "train/ssim",
+        "num_gaussians": "train/gaussians",
+    },
+    layout.EVENTS: {
+        key: f"train/densify/{key}"
+        for key in ("cloned", "split_gradient", "split_volume", "pruned_opacity", "pruned_size", "blocked_by_cap")
+    },
+}
+
+
+PICTURE_KINDS = ("1 render", "2 photograph", "3 error")  # of a test view, numbered for their order
+
+
+def picture_key(view: str, kind: str) -> str:
+    """The name of a picture of a test view, with characters that every tracker takes."""
+    return f"{NOT_IN_A_KEY.sub('_', view)}/{kind}"
+
+
+def arm_name(densify: str, init: str) -> str:
+    """The name of an arm. What is compared most often comes first, since trackers cut long names at their end."""
+    return f"{densify} · {init}"
+
+
+def eval_name(key: str) -> str:
+    """The name of a metric of the test views, with its unit: ``eval/psnr_dB``."""
+    facts = find_metric(key)
+    unit = facts.unit.replace("/", "_per_") if facts else ""
+    return f"{EVAL}/{key}_{unit}" if unit else f"{EVAL}/{key}"
 
 
 @dataclass(frozen=True)
@@ -32,11 +74,12 @@ class Scalar:
 
 @dataclass(frozen=True)
 class Summary:
-    """Summary of a complete trial: what a tracker shows at its end."""
+    """Summary of a complete trial: what a tracker shows at its end, in Markdown (``note``) and in numbers."""
 
+    note: str
     scalars: Sequence[Scalar]
     tags: dict[str, str]
-    pictures: dict[str, Path]  # of the test views, by name
+    pictures: dict[str, Array]  # of the test views, by name: [H, W, 3] uint8
     files: Sequence[tuple[str, Path]]  # (folder in the tracker, "" for none; file)
     step: int
     seconds: float
@@ -119,13 +162,13 @@ class TrackedTrial:
 
     @property
     def arm(self) -> str:
-        """Initialiser and densifier."""
-        return f"{self.values['init']['name']}-{self.values['densify']['name']}"
+        """The name of the trial's arm."""
+        return arm_name(self.values["densify"]["name"], self.values["init"]["name"])
 
     @property
     def label(self) -> str:
-        """The run's name. The seed comes first, since trackers cut long names at their end."""
-        return f"seed {self.values['seed']} {self.values['scene']['name']} {self.arm}"
+        """The run's name: densifier, scene and seed."""
+        return f"{self.values['densify']['name']} · {self.values['scene']['name']} · s{self.values['seed']}"
 
     @property
     def path(self) -> str:
@@ -153,30 +196,33 @@ class TrackedTrial:
         """
         building = self.folder.building()  # a training in progress writes to its own folder in the store
         sources = [Path(building.folder)] if building.stage == TRAIN.name else []
-        for name, prefix in CURVES.items():
+        for name, names in CURVES.items():
             source = next((folder / name for folder in (*sources, self.folder.path) if (folder / name).exists()), None)
             records = [] if source is None else [r for r in read_rows(source) if r["step"] > logged.get(name, 0)]
             if records:
                 scalars = [
-                    Scalar(f"{prefix}/{key}", float(value), int(record["step"]), _seconds(record))
+                    Scalar(names[key], float(value), int(record["step"]), _seconds(record))
                     for record in records
                     for key, value in record.items()
-                    if key != "step"
+                    if key in names
                 ]
                 yield name, int(records[-1]["step"]), scalars
 
     def summary(self, results: TrialRecord, images: int, with_model: bool) -> Summary:
         """The summary of the finished trial, with at most ``images`` test views, and the model if ``with_model``."""
         step, seconds = results.iterations, results.seconds.get("train", results.iterations / 1000)
-        numbers = dict(results.metrics) | {
-            key: value
-            for key in ("num_gaussians", "num_init_points", "peak_memory_mb")
-            if (value := getattr(results, key)) is not None  # None: unknown, for renders of another program
+        numbers = {eval_name(key): value for key, value in results.metrics.items()}
+        counts = {
+            "gaussians": results.num_gaussians,
+            "init_points": results.num_init_points,
+            "peak_memory_MB": results.peak_memory_mb,
         }
-        numbers |= {f"seconds_{key}": value for key, value in results.seconds.items()}
-        numbers |= {f"total/{key}": value for key, value in results.events.items()}
+        # None: unknown, for renders of another program
+        numbers |= {f"{EVAL}/{key}": value for key, value in counts.items() if value is not None}
+        if "train" in results.seconds:
+            numbers[f"{EVAL}/minutes"] = results.seconds["train"] / 60
         scalars = [
-            Scalar(key, float(value), int(at), seconds * int(at) / max(1, step))
+            Scalar(eval_name(key), float(value), int(at), seconds * int(at) / max(1, step))
             for at, measured in results.metrics_at.items()
             for key, value in measured.metrics.items()
         ]
@@ -184,17 +230,56 @@ class TrackedTrial:
         names = (*FILES, *([layout.POINT_CLOUD] if with_model else []))
         files = [("", self.folder.path / name) for name in names if (self.folder.path / name).exists()]
         return Summary(
+            note=self._note(results),
             scalars=scalars + [Scalar(key, float(value), step, seconds) for key, value in numbers.items()],
             tags=tags | {f"hash_{key}": value for key, value in results.hashes.items()},
-            pictures={
-                f"{kind}/{path.stem}": path
-                for kind in (layout.RENDERS, layout.GROUND_TRUTH)
-                for path in self.folder.pictures(kind)[:images]
-            },
+            pictures=self._pictures(images),
             files=files + [(layout.FIGURES, path) for path in self.folder.pictures(layout.FIGURES)[:images]],
             step=step,
             seconds=seconds,
         )
+
+    def _note(self, results: TrialRecord) -> str:
+        """The results in one line, the folder, and the command that repeats the trial, in Markdown."""
+        shown = [(find_metric(key), key, value) for key, value in results.metrics.items()]
+        texts = [f"{facts.name if facts else key} {value:.4g}" for facts, key, value in shown]
+        if results.num_gaussians is not None:
+            texts.append(f"{results.num_gaussians:,} Gaussians")
+        lines = [f"{', '.join(texts)} after {results.iterations:,} iterations.", f"Folder: `{self.path}`"]
+        plan = read_if_sound(self.folder.home / layout.PLAN, _Plan)
+        planned = plan.trials.get(self.folder.path.relative_to(self.folder.home).as_posix(), {}) if plan else {}
+        if words := planned.get("overrides"):
+            lines.append(f"Again: `{shlex.join(['gsbench', *map(str, words)])}`")
+        return "\n\n".join(lines)
+
+    def _pictures(self, count: int) -> dict[str, Array]:
+        """Render, photograph and absolute error of ``count`` test views, by `picture_key`."""
+        rendered, photographed, wrong = PICTURE_KINDS
+        pictures: dict[str, Array] = {}
+        for path in self.folder.pictures(layout.RENDERS)[:count]:
+            render = _read_picture(path)
+            pictures[picture_key(path.stem, rendered)] = render
+            photograph = self.folder.path / layout.GROUND_TRUTH / path.name
+            if not photograph.exists():
+                continue
+            truth = _read_picture(photograph)
+            pictures[picture_key(path.stem, photographed)] = truth
+            if truth.shape == render.shape:
+                error = np.abs(render.astype(np.int16) - truth.astype(np.int16))
+                pictures[picture_key(path.stem, wrong)] = error.astype(np.uint8)
+        return pictures
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Plan(Record):
+    """The part of an experiment's plan that is shown: the words of each trial's command."""
+
+    trials: dict[str, Any]
+
+
+def _read_picture(path: Path) -> Array:
+    with Image.open(path) as image:
+        return np.asarray(image.convert("RGB"))
 
 
 def _seconds(record: Mapping[str, float]) -> float:
@@ -238,13 +323,10 @@ class TensorBoardSink:
 
     def complete(self, summary: Summary) -> None:
         """Write the final numbers and the pictures of the test views."""
-        import numpy as np
-        from PIL import Image
-
         self.log(summary.scalars)
-        for name, path in summary.pictures.items():
-            with Image.open(path) as image:
-                self._writer.add_image(name, np.asarray(image.convert("RGB")), summary.step, dataformats="HWC")
+        for name, picture in summary.pictures.items():
+            self._writer.add_image(name, picture, summary.step, dataformats="HWC")
+        self._writer.add_text("note", summary.note, summary.step)
         self._writer.add_text("status", "FINISHED", summary.step)
         self._writer.flush()
 
@@ -309,12 +391,13 @@ class WandbSink:
         import wandb
 
         self.log(summary.scalars)
-        pictures = {name: wandb.Image(str(path)) for name, path in summary.pictures.items()}
+        pictures = {name: wandb.Image(picture) for name, picture in summary.pictures.items()}
         if pictures:
             self._run.log({STEP: summary.step, **pictures})
         final = {scalar.key: scalar.value for scalar in summary.scalars if scalar.step == summary.step}
         self._run.summary.update(final)
         self._run.config.update(summary.tags, allow_val_change=True)
+        self._run.notes = summary.note
         for _, path in summary.files:
             self._run.save(str(path), base_path=str(self._trial.folder.path), policy="now")
         self._run.finish(0)

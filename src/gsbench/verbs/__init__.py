@@ -21,7 +21,7 @@ VERBS = {  # their modules, with their purposes as `gsbench --help` lists them
     "retry": ("trials", "run failed, stopped, damaged and missing trials again"),
     "bench": ("machine", "time rasterizers and the training step"),
     "sync": ("trials", "send to MLflow the trials that it lacks"),
-    "ui": ("servers", "open the MLflow dashboard on this machine"),
+    "ui": ("servers", "compare the arms of an experiment in MLflow, in the browser"),
     "export": ("exchange", "copy a trained model, an initial cloud or an experiment's results for others"),
     "view": ("servers", "look at trained models in the browser: one, or two side by side"),
     "doctor": ("machine", "check this machine and say what is missing"),

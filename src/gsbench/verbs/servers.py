@@ -6,19 +6,27 @@ import shlex
 import subprocess
 import sys
 import threading
+import time
+import webbrowser
 from collections.abc import Sequence
+from importlib.metadata import version
 from pathlib import Path
 
+import requests
+
 from gsbench.errors import InputError
+from gsbench.runs.experiments import experiment_home, list_experiments
 from gsbench.runs.layout import DATABASE
 from gsbench.system.install import install_command
 from gsbench.system.isolate import end_descendants
 from gsbench.system.stopping import stop_on_signals
+from gsbench.tracking.comparison import addresses, publish
 from gsbench.tracking.mlflow_sink import SETTINGS, default_uri, tracker_uri
 from gsbench.verbs.arguments import ArgumentParser, port
 from gsbench.view import ADDRESS
 
 VIEWER_PORT, DASHBOARD_PORT = 8080, 5000
+SECONDS_TO_ANSWER, SECONDS_TO_START = 5.0, 60
 LEAN = {"MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false"}  # MLflow's defaults take eight processes and 2 GB
 
 
@@ -55,20 +63,64 @@ def view(argv: Sequence[str], runs: Path) -> int:
 
 
 def ui(argv: Sequence[str], runs: Path) -> int:
-    """Run the verb: serves the dashboard until Ctrl-C."""
+    """Run the verb: serves the dashboard until Ctrl-C, if no server does already."""
     parser = ArgumentParser("ui")
-    parser.add_argument("--uri", help="the tracker's database; default: $MLFLOW_TRACKING_URI, or the runs folder's")
+    parser.add_argument("experiment", nargs="?", help="open the comparison of its arms; default: the only experiment")
+    parser.add_argument("--uri", help="the tracker's address; default: $MLFLOW_TRACKING_URI, or the runs folder's")
     parser.add_argument("--port", type=port, default=DASHBOARD_PORT)
+    parser.add_argument("--no-browser", action="store_true", help="only print the addresses")
     options = parser.parse_args(argv)
     if options.uri is not None and "://" not in options.uri:
         raise InputError(f"--uri {options.uri} is not an address such as sqlite:///FILE")
     uri = tracker_uri(options.uri, runs)
-    if uri.startswith("http"):
-        raise InputError(f"{uri} is a server, which has its own page: open that in the browser")
+    home = None if options.experiment is None else experiment_home(runs, options.experiment)
+    if home is None and len(names := list_experiments(runs)) == 1:
+        home = experiment_home(runs, names[0])
     if uri == default_uri(runs) and not (runs / DATABASE).exists():
         raise InputError(f"no MLflow database in {runs}: run a trial first, or `gsbench sync`, or give --uri")
-    print(f"http://127.0.0.1:{options.port}", flush=True)
-    return serve(uri, options.port)
+    is_served = uri.startswith(("http://", "https://"))
+    server = uri if is_served else f"http://127.0.0.1:{options.port}"
+    pages = {"dashboard": server}
+    if home is not None:
+        try:
+            pages = addresses(server, publish(home, uri), version("mlflow"))
+        except Exception as error:  # any error of the tracker's client
+            raise InputError(f"{uri} does not take {home.name} ({type(error).__name__}: {error})") from error
+    for name, address in pages.items():
+        print(f"{name:<10} {address}", flush=True)
+    first = next(iter(pages.values()))
+    is_served = is_served or (home is not None and _serves(server, home.name, first))
+    if not options.no_browser and sys.stdout.isatty() and _has_screen():
+        threading.Thread(target=_open, args=(server, first), daemon=not is_served).start()
+    return 0 if is_served else serve(uri, options.port)
+
+
+def _serves(server: str, experiment: str, page: str) -> bool:
+    """Return whether an MLflow server answers there that knows the experiment by the id in ``page``."""
+    place = f"{server}/api/2.0/mlflow/experiments/get-by-name"
+    try:
+        answer = requests.get(place, params={"experiment_name": experiment}, timeout=SECONDS_TO_ANSWER)
+        found = answer.json()["experiment"]["experiment_id"]
+    except (requests.RequestException, ValueError, KeyError, TypeError):
+        return False
+    return f"/experiments/{found}" in page
+
+
+def _has_screen() -> bool:
+    """Return whether a browser would open in a window, not within this terminal."""
+    return os.name == "nt" or sys.platform == "darwin" or bool({"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys())
+
+
+def _open(server: str, page: str) -> None:
+    """Open the page once the server answers."""
+    for _ in range(SECONDS_TO_START):
+        try:
+            requests.get(server, timeout=SECONDS_TO_ANSWER)
+        except requests.RequestException:
+            time.sleep(1)
+            continue
+        webbrowser.open(page)
+        return
 
 
 def serve(uri: str, port: int) -> int:

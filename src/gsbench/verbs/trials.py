@@ -6,8 +6,14 @@ import os
 import time
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import asdict, replace
 from pathlib import Path
+
+from rich.console import Group
+from rich.live import Live
+from rich.markup import escape
+from rich.table import Table
 
 from gsbench.analysis.differences import find_superseded
 from gsbench.analysis.results import TrialResult, read_experiment
@@ -15,6 +21,7 @@ from gsbench.config.command_words import key_of, makes_other_trials, typed_permi
 from gsbench.config.compose import Trial, compose_one
 from gsbench.config.trust import PERMISSIONS
 from gsbench.errors import GsbenchError, InputError
+from gsbench.launch.progress import Progress, progress_of
 from gsbench.launch.record import PlannedTrial, forget, read_plan, remove
 from gsbench.launch.states import TrialState, describe_plan, states_of_experiment
 from gsbench.runs.experiments import experiment_home, list_experiments, trial_folders
@@ -31,6 +38,7 @@ from gsbench.words import counted, readable_time
 ORDER = ("failed", "damaged", "running", "queued", "partial", "missing", "superseded", "done")
 RETRIED = ("failed", "partial", "damaged", "missing")
 TRACKER = "tracking.uri"
+SECONDS_BETWEEN_LOOKS = 3.0
 
 log = logging.getLogger(__name__)
 
@@ -40,6 +48,7 @@ def status(argv: Sequence[str], runs: Path) -> int:
     parser = ArgumentParser("status")
     parser.add_argument("experiment", nargs="?", help="its name; without one, a line for each experiment")
     parser.add_argument("--all", action="store_true", help="list the finished trials too")
+    parser.add_argument("--watch", action="store_true", help="a table of arms and scenes, renewed until all have ended")
     parser.add_argument("--json", action="store_true", help="print a JSON list instead of lines")
     parser.add_argument("--forget", action="store_true", help="remove trials from the plan that never started")
     parser.add_argument(
@@ -49,8 +58,12 @@ def status(argv: Sequence[str], runs: Path) -> int:
     )
     options = parser.parse_args(argv)
     if options.experiment is None:
+        if options.watch:
+            raise InputError("--watch needs the name of an experiment")
         return _overview(runs)
     home = experiment_home(runs, options.experiment)
+    if options.watch:
+        _watch(home)
     trials = progress_with_superseded(home)
     if options.forget_superseded:
         superseded = [trial for trial in trials if trial.state == "superseded"]
@@ -69,6 +82,36 @@ def status(argv: Sequence[str], runs: Path) -> int:
     else:
         print("\n".join(lines_of(trials, options.all)))
     return 0 if all(trial.state in ("done", "running", "queued", "superseded") for trial in trials) else 1
+
+
+def _watch(home: Path) -> None:
+    """Show the progress of the experiment in ``home`` until all its trials have ended, or until Ctrl-C."""
+    progress = progress_of(home)
+    with suppress(KeyboardInterrupt), Live(_progress_view(home.name, progress), auto_refresh=False) as live:
+        while not progress.has_ended:
+            time.sleep(SECONDS_BETWEEN_LOOKS)
+            progress = progress_of(home)
+            live.update(_progress_view(home.name, progress), refresh=True)
+
+
+def _progress_view(name: str, progress: Progress) -> Group:
+    """A table of arms by scenes, with the numbers of trials that are done and in other states, and lines below it."""
+    scenes = sorted({scene for _, scene in progress.cells})
+    table = Table("arm", *map(escape, scenes), title=escape(f"{name}: trials done of all"))
+    for arm in sorted({arm for arm, _ in progress.cells}):
+        cells = [progress.cells.get((arm, scene)) for scene in scenes]
+        table.add_row(escape(arm), *(_cell(cell) if cell else "–" for cell in cells))
+    lines = []
+    if progress.speeds:
+        lines.append(f"{sum(progress.speeds.values()):.1f} iterations/s")
+    if progress.seconds_left is not None and not progress.has_ended:
+        lines.append(f"about {readable_time(progress.seconds_left)} left")
+    return Group(table, ", ".join(lines), escape(progress.leader))
+
+
+def _cell(counts: dict[str, int]) -> str:
+    others = [f"{counts[state]} {state}" for state in ("running", "failed") if counts[state]]
+    return ", ".join([f"{counts['done']}/{sum(counts.values())}", *others])
 
 
 def progress_with_superseded(home: Path) -> list[TrialState]:

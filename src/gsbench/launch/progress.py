@@ -1,0 +1,160 @@
+"""How far a sweep is: the states of its trials by arm and scene, its speed, the time left, and the leading arm."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import fmean
+from typing import TYPE_CHECKING
+
+from gsbench.analysis.declaration import active_declaration
+from gsbench.analysis.quantities import Quantity, asked_quantity
+from gsbench.analysis.results import TrialResult, read_experiment
+from gsbench.errors import InputError
+from gsbench.launch.states import TrialState, states_of_experiment
+from gsbench.runs.experiments import experiment_home
+from gsbench.runs.layout import CURVES, SEED
+from gsbench.runs.trial_folder import TrialFolder
+from gsbench.runs.trial_record import read_rows
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+Name = tuple[str, str]  # arm, scene
+COUNTED = ("done", "running", "failed")  # all other states are waiting
+WAITING = "waiting"
+
+
+@dataclass(frozen=True)
+class Progress:
+    """The progress of a sweep.
+
+    ``cells`` has the number of trials by (arm, scene) and state (`COUNTED` or ``waiting``), ``speeds`` the iterations
+    per second of running trainings. ``seconds_left`` is None as long as no trial is done. ``leader`` says which arm
+    is best so far; "" if that cannot be said.
+    """
+
+    cells: dict[Name, dict[str, int]]
+    speeds: dict[Name, float]
+    seconds_left: float | None
+    leader: str
+
+    @property
+    def has_ended(self) -> bool:
+        """Return whether no trial runs or waits."""
+        return not any(cell["running"] + cell[WAITING] for cell in self.cells.values())
+
+
+def progress_frame(runs: Path, experiment: str) -> pd.DataFrame:
+    """A row for each arm and scene of an experiment in the folder ``runs``, as ``gsbench status --watch`` shows it.
+
+    Its columns are arm, scene, done, running, failed, waiting (numbers of trials) and iterations_per_second (of
+    running trainings, else 0). ``attrs`` has seconds_left and leader. Raises InputError for an unknown experiment.
+    """
+    import pandas as pd
+
+    found = progress_of(experiment_home(runs, experiment))
+    rows = [
+        {"arm": arm, "scene": scene, **cell, "iterations_per_second": found.speeds.get((arm, scene), 0.0)}
+        for (arm, scene), cell in found.cells.items()
+    ]
+    frame = pd.DataFrame(rows)
+    frame.attrs |= {"seconds_left": found.seconds_left, "leader": found.leader}
+    return frame
+
+
+def progress_of(home: Path) -> Progress:
+    """The progress of the experiment in ``home``, from its files."""
+    states = [state for state in states_of_experiment(home) if state.state != "superseded"]
+    names = _names([state.folder for state in states])
+    cells: dict[Name, dict[str, int]] = {name: dict.fromkeys((*COUNTED, WAITING), 0) for name in sorted(names.values())}
+    speeds: dict[Name, float] = defaultdict(float)
+    for state in states:
+        cells[names[state.folder]][state.state if state.state in COUNTED else WAITING] += 1
+        if state.state == "running":
+            speeds[names[state.folder]] += _training(state.folder)[1]
+    trials = [trial for trial in read_experiment(home).trials if trial.path in names]
+    return Progress(cells, dict(speeds), _seconds_left(states, names, trials), _leader(home, names, trials))
+
+
+def _names(folders: Sequence[Path]) -> dict[Path, Name]:
+    """Arm and scene of each trial's folder; an arm of several settings has a hash in its name."""
+    hashes: dict[Path, set[str]] = defaultdict(set)
+    for folder in folders:
+        hashes[folder.parent].add(folder.name.partition(SEED)[0])
+    names = {}
+    for folder in folders:
+        several = len(hashes[folder.parent]) > 1
+        mark = f" {folder.name.partition(SEED)[0]}" if several else ""
+        names[folder] = (folder.parent.name + mark, folder.parents[1].name)
+    return names
+
+
+def _training(folder: Path) -> tuple[int, float]:
+    """The last iteration of the training in progress, and its iterations per second; zeros if there is none."""
+    building = TrialFolder(folder).building()
+    file = Path(building.folder, CURVES) if building.folder else None
+    rows = read_rows(file) if file is not None and file.exists() else []
+    if not rows:
+        return 0, 0.0
+    step, seconds = int(rows[-1]["step"]), float(rows[-1].get("seconds", 0.0))
+    return step, step / seconds if seconds > 0 else 0.0
+
+
+def _seconds_left(states: Sequence[TrialState], names: dict[Path, Name], trials: Sequence[TrialResult]) -> float | None:
+    """The seconds until all trials have ended, if as many run at once as now.
+
+    A trial takes as long as the finished ones of its arm and scene, else of its arm, else of all.
+    """
+    known: dict[Name, list[float]] = defaultdict(list)
+    for trial in trials:
+        arm, scene = names[trial.path]
+        seconds = sum(trial.record.seconds.values())
+        for name in ((arm, scene), (arm, ""), ("", "")):
+            known[name].append(seconds)
+    if not known:
+        return None
+    total = 0.0
+    for state in states:
+        if state.state in ("done", "failed"):
+            continue
+        arm, scene = names[state.folder]
+        seconds = fmean(next(known[name] for name in ((arm, scene), (arm, ""), ("", "")) if name in known))
+        total += seconds * (1 - _share_done(state) if state.state == "running" else 1)
+    return total / max(1, sum(state.state == "running" for state in states))
+
+
+def _share_done(state: TrialState) -> float:
+    try:
+        iterations = TrialFolder(state.folder).configuration()["train"]["iterations"]
+    except (InputError, KeyError, TypeError):
+        return 0.0
+    return min(1.0, _training(state.folder)[0] / max(1, iterations))
+
+
+def _leader(home: Path, names: dict[Path, Name], trials: Sequence[TrialResult]) -> str:
+    """The arm with the best mean over those scenes and seeds that all arms have, in words."""
+    declared = active_declaration(home, trials) if trials else None
+    metric = asked_quantity(declared.metric if declared else "psnr", trials)
+    values: dict[str, dict[tuple[str, int], float]] = {arm: {} for arm, _ in names.values()}
+    for trial in trials:
+        arm, scene = names[trial.path]
+        if (value := metric.read(trial)) is not None:
+            values[arm][scene, trial.seed] = value
+    shared = set.intersection(*map(set, values.values())) if values else set()
+    if len(values) < 2 or not shared or not metric.direction:
+        return ""
+    means = {arm: fmean(own[place] for place in shared) for arm, own in values.items()}
+    return _in_words(means, metric, len(shared))
+
+
+def _in_words(means: dict[str, float], metric: Quantity, shared: int) -> str:
+    best = max(means, key=lambda arm: metric.direction * means[arm])
+    if len({metric.format(mean) for mean in means.values()}) == 1:
+        return f"no arm leads in {metric.name}; {shared} trials of each are compared"
+    return (
+        f"{best} leads so far: {metric.name} {metric.format(means[best])}, mean of the {shared} scenes and seeds that "
+        "all arms have. This is not a verdict."
+    )

@@ -1,0 +1,179 @@
+"""The page of an experiment in MLflow answers which arm is better, also in a browser."""
+
+from __future__ import annotations
+
+import base64
+import json
+import threading
+import time
+import zlib
+from pathlib import Path
+from typing import Any
+
+import mlflow
+import numpy as np
+import pytest
+from mlflow.exceptions import MlflowException
+from PIL import Image
+
+from gsbench.analysis.results import read_experiment
+from gsbench.runs.trial_folder import TrialFolder
+from gsbench.tracking import connect, publish
+from gsbench.tracking.comparison import addresses, description
+from gsbench.tracking.mirror import sync
+from gsbench.verbs import servers
+from tests.tracking.helpers import (
+    begin_trial,
+    found_runs,
+    free_port,
+    mirror_trial,
+    options,
+    run_of,
+    trial_values,
+    write_trial,
+)
+from tests.view.browser import Browser
+
+NOTE, VIEW = "mlflow.note.content", "mlflow.sharedViewState.gsbench"
+
+
+def write_sweep(runs: Path, arms: tuple[str, ...] = ("adc", "volumetric"), name: str = "swept") -> list[TrialFolder]:
+    """Trials of arms, on two scenes with two seeds; later arms have a larger PSNR."""
+    folders = []
+    for number, arm in enumerate(arms):
+        for scene in ("courtyard", "yard"):
+            for seed in (0, 1):
+                values = trial_values(runs, seed, name) | {"scene": {"name": scene}, "densify": {"name": arm}}
+                folder = begin_trial(values)
+                write_trial(folder, values, psnr=20 + number + seed / 10)
+                folders.append(TrialFolder(folder))
+    return folders
+
+
+def tags_of(client: Any, name: str = "swept") -> dict[str, str]:
+    return dict(client.get_experiment_by_name(name).tags)
+
+
+def unpacked(tag: str) -> dict[str, Any]:
+    kind, _, data = tag.partition(";")
+    assert kind == "deflate"
+    return dict(json.loads(zlib.decompress(base64.b64decode(data))))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["sqlite", "postgresql"])
+def test_the_files_alone_make_the_page_again(kind: str, tmp_path: Path, request: pytest.FixtureRequest) -> None:
+    uri = None if kind == "sqlite" else request.getfixturevalue("postgresql")
+    folders = write_sweep(tmp_path / "runs")
+    assert list(sync(folders, uri))[-1] == "8 trials mirrored now, 0 before"
+    client = connect(uri, tmp_path / "runs")
+    tags = tags_of(client)
+    assert "| courtyard | a_init | volumetric | " in tags[NOTE]
+    view = unpacked(tags[VIEW])
+    assert view["groupBy"]["groupByKeys"] == [{"mode": "param", "groupByData": "arm"}]
+    charted = {chart["metricKey"] for chart in view["compareRunCharts"]}
+    names = set().union(*(run.data.metrics for run in found_runs(client, "swept")))
+    assert {"eval/psnr_dB", "train/gaussians"} <= charted
+    assert charted - {"train/gaussians"} <= names  # these files have no counts over iterations
+    collapsed = {f"param.arm.{run.data.params['arm']}" for run in found_runs(client, "swept")}
+    assert set(view["groupsExpanded"]) == collapsed == {"param.arm.adc · a_init", "param.arm.volumetric · a_init"}
+
+
+def test_a_description_of_somebody_else_stays(runs: Path) -> None:
+    write_sweep(runs, name="described")
+    publish(runs / "described", None)
+    client = connect(None, runs)
+    assert "volumetric" in tags_of(client, "described")[NOTE]
+    experiment = client.get_experiment_by_name("described").experiment_id
+    client.set_experiment_tag(experiment, NOTE, "my own words")
+    publish(runs / "described", None)
+    assert tags_of(client, "described")[NOTE] == "my own words"
+
+
+def test_a_long_description_is_cut_at_a_line(tmp_path: Path) -> None:
+    write_sweep(tmp_path, tuple(f"arm{number:02}_{'x' * 40}" for number in range(20)))
+    text = description(read_experiment(tmp_path / "swept"))
+    assert len(text) <= 5000
+    assert text.splitlines()[-1] == "`gsbench report swept` shows more."
+
+
+@pytest.mark.parametrize("version", ["2.22.0", "3.1.0", "3.170.0", "4.0.0"])
+def test_other_versions_of_mlflow_get_the_plain_page(version: str) -> None:
+    assert addresses("http://a/", "7", version) == {"experiment": "http://a/#/experiments/7"}
+
+
+@pytest.mark.parametrize("limit", [500, 250])
+def test_a_server_that_refuses_long_parameters_gets_the_rest(
+    limit: int, runs: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    send = mlflow.MlflowClient.log_batch
+
+    def strict(self: Any, run_id: str, **sent: Any) -> None:
+        if any(len(param.value) > limit for param in sent.get("params", ())):
+            raise MlflowException(f"Param value exceeded length {limit}")
+        send(self, run_id, **sent)
+
+    monkeypatch.setattr(mlflow.MlflowClient, "log_batch", strict)
+    values = trial_values(runs, seed=1000 + limit) | {"long": "x" * 700}
+    folder = TrialFolder.of(values).path
+    write_trial(folder, values)
+    assert mirror_trial(options(), folder, values)
+    run = run_of(connect(None, runs), 1000 + limit)
+    assert run.info.status == "FINISHED"
+    assert run.data.params["long"] == "x" * limit
+    assert run.data.params["densify.name"] == "a_densify"
+
+
+@pytest.mark.slow
+def test_portrait_and_landscape_pictures_are_logged_as_they_are(runs: Path) -> None:
+    values = trial_values(runs, seed=2000)
+    folder = TrialFolder.of(values).path
+    write_trial(folder, values)
+    sizes = {"a": (8, 4), "b": (4, 8)}
+    for kind in ("renders", "ground_truth"):
+        (folder / kind).mkdir()
+        for name, size in sizes.items():
+            Image.new("RGB", size).save(folder / kind / f"{name}.png")
+    assert mirror_trial(options(), folder, values)
+    client = connect(None, runs)
+    run = run_of(client, 2000)
+    names = [item.path for item in client.list_artifacts(run.info.run_id, "images") if item.path.endswith(".png")]
+    assert len(names) == 6
+    for name in names:
+        with Image.open(client.download_artifacts(run.info.run_id, name)) as image:
+            assert image.size == sizes[Path(name).name[0]]
+
+
+@pytest.mark.slow
+@pytest.mark.browser
+def test_a_browser_shows_the_arms_as_groups_and_a_chart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    runs, port = tmp_path / "runs", free_port()
+    list(sync(write_sweep(runs), None))
+    page = addresses(f"http://127.0.0.1:{port}", publish(runs / "swept", None), mlflow.__version__)["arms"]
+    started: list[Any] = []
+    popen = servers.subprocess.Popen
+    monkeypatch.setattr(servers.subprocess, "Popen", lambda *a, **k: started.append(popen(*a, **k)) or started[-1])
+    thread = threading.Thread(target=servers.ui, args=(["swept", "--port", str(port), "--no-browser"], runs))
+    monkeypatch.setattr(servers, "stop_on_signals", lambda: threading.Lock())  # signals need the main thread
+    thread.start()
+    try:
+        deadline = time.monotonic() + 120
+        while not servers._serves(f"http://127.0.0.1:{port}", "swept", page):
+            assert time.monotonic() < deadline
+            time.sleep(0.5)
+        with Browser(page, tmp_path / "profile", (1500, 1000)) as browser:
+
+            def evaluated(script: str) -> Any:
+                return browser.call("Runtime.evaluate", expression=script, returnByValue=True)["result"].get("value")
+
+            bars = "[...document.querySelectorAll('.barlayer .point path')].filter(p => p.getBBox().width > 5).length"
+            browser.wait_until(lambda picture: (evaluated(bars) or 0) >= 4, "two bars in each of two charts")
+            text = evaluated("document.body.innerText")
+            assert "Group: adc · a_init" in text
+            assert "Group: volumetric · a_init" in text
+            assert "viewing a shared view" in text
+            assert np.ptp(browser.picture()) > 0
+    finally:
+        for process in started:
+            process.terminate()
+        thread.join(30)
