@@ -150,7 +150,7 @@ def test_blenders_angle_its_missing_extension_its_parts_and_its_alpha(tmp_path: 
             pixels = np.zeros((40, 40, 4), np.uint8)
             pixels[10:30, 10:30] = (200, 40, 40, 255)
             pixels[5, 5] = (255, 0, 0, 128)
-            pixels[20, 20] = (10 * count, 10 * k, 0, 255)  # no photograph twice
+            pixels[21, 24] = (10 * count, 10 * k, 0, 255)  # no photograph twice
             Image.fromarray(pixels).save(path)
             matrix = looking_at_origin(EYES[k]).tolist()
             frames.append({"file_path": f"./{part}/r_{k}", "rotation": 0.01, "transform_matrix": matrix})
