@@ -1,4 +1,4 @@
-"""The progress of a sweep: the states of its trials by arm and scene, its speed, the time left, and the leading arm.
+"""The progress of a sweep: the states of its trials by arm and scene, its speed, time left and leading arm."""
 
 from __future__ import annotations
 
