@@ -121,8 +121,9 @@ def test_curves_of_a_training_in_progress_are_followed(runs: Path, tmp_path: Pat
         deadline = time.monotonic() + SECONDS
         while not seen and time.monotonic() < deadline:
             time.sleep(0.1)
-            run = run_of(client, 5)
-            seen = len(history(client, run.info.run_id, "train/loss"))
+            # The token is noted before the run is created, so the run may still be missing.
+            found = [run for run in found_runs(client, "tracked") if run.data.tags["seed"] == "5"]
+            seen = sum(len(history(client, run.info.run_id, "train/loss")) for run in found)
     assert seen == 1
 
 
