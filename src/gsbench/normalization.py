@@ -43,6 +43,11 @@ class Normalization:
         """Return whether the scene is trained in its own coordinates."""
         return self == IDENTITY
 
+    @property
+    def is_far(self) -> bool:
+        """Return whether the scene's own coordinates need float64: it lies far from the origin for its size."""
+        return self.scale * max(map(abs, self.center)) > MAX_DISTANCE * COLMAP_SIZE
+
     def apply(self, points: ArrayLike) -> NDArray[np.float64]:
         """Map points [..., 3] of the scene's own coordinates to the training's (float64)."""
         mapped: NDArray[np.float64] = (np.asarray(points, dtype=np.float64) - self.center) * self.scale

@@ -18,6 +18,7 @@ from gsbench.gaussians.initial import gaussians_from_cloud
 from gsbench.gaussians.model import dc_to_rgb, rgb_to_dc
 from gsbench.gaussians.ply import check_ply, read_ply, write_ply
 from gsbench.init.placed import read_points
+from gsbench.normalization import Normalization
 from tests.gaussians.helpers import random_gaussians
 
 
@@ -317,3 +318,24 @@ def test_values_that_look_activated_are_warned_of(tmp_path: Path, prefix, values
     read_ply(save(table, tmp_path / "b.ply"))
     assert bool(caplog.text) is bool(said)
     assert re.search(said, caplog.text)
+
+
+@pytest.mark.parametrize(
+    ("center", "scale", "kind"),
+    [((0.0, 0.0, 0.0), 1.0, "f4"), ((0.1, -0.2, 0.3), 100.0, "f4"), ((5e5, 5.4e6, 300.0), 1.0, "f8"),
+     ((2.0, 3.0, 4.0), 1e5, "f8")],
+)  # fmt: skip
+def test_a_normalized_model_is_written_in_its_own_coordinates_and_read_back(
+    tmp_path: Path, center: tuple[float, float, float], scale: float, kind: str
+) -> None:
+    normalization, gaussians = Normalization(center, scale), random_gaussians(50, dtype=torch.float32)
+    write_ply(gaussians, tmp_path / "own.ply", normalization)
+    table = PlyData.read(str(tmp_path / "own.ply"))["vertex"].data
+    assert table["x"].dtype == np.dtype(kind)
+    own = np.array(center) + gaussians.means.double().numpy() / scale
+    np.testing.assert_allclose(np.column_stack([table[axis] for axis in "xyz"]), own, rtol=2e-7)
+    np.testing.assert_allclose(np.exp(table["scale_1"]), gaussians.log_scales[:, 1].exp() / scale, rtol=1e-5)
+    again = read_ply(tmp_path / "own.ply", normalization=normalization)
+    torch.testing.assert_close(again.means, gaussians.means, atol=1e-5, rtol=0)
+    torch.testing.assert_close(again.log_scales, gaussians.log_scales, atol=1e-5, rtol=0)
+    torch.testing.assert_close(again.quaternions, gaussians.quaternions)

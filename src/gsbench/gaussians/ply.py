@@ -44,8 +44,8 @@ SIZES |= {"float": 4, "float32": 4, "double": 8, "float64": 8}  # bytes; all oth
 def write_ply(gaussians: Gaussians, path: Path, normalization: Normalization = IDENTITY) -> None:
     """Write raw parameters as binary little-endian float32 in 3DGS's column order, with zero normals; atomic.
 
-    ``normalization`` is undone. Positions that it moves are written as float64, because float32 has steps of half a
-    unit at UTM coordinates.
+    ``normalization`` is undone. Positions far from the origin are written as float64, because float32 has steps of half
+    a unit at UTM coordinates. Others stay float32, which every viewer reads.
     """
     raw = gaussians.detach().map(lambda tensor: tensor.float().cpu())
     table = torch.cat(
@@ -62,7 +62,8 @@ def write_ply(gaussians: Gaussians, path: Path, normalization: Normalization = I
     ).numpy()  # [N, 62]
     vertices = np.ascontiguousarray(table, dtype="<f4").view([(name, "<f4") for name in COLUMNS]).reshape(len(raw))
     if not normalization.is_identity:
-        vertices = vertices.astype([(name, "<f8" if name in POSITION else "<f4") for name in COLUMNS])
+        position_type = "<f8" if normalization.is_far else "<f4"
+        vertices = vertices.astype([(name, position_type if name in POSITION else "<f4") for name in COLUMNS])
         own = normalization.undo(raw.means.numpy())  # [N, 3]
         for axis, name in enumerate(POSITION):
             vertices[name] = own[:, axis]
