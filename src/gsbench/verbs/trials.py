@@ -97,8 +97,13 @@ def _watch(home: Path) -> None:
 def _progress_view(name: str, progress: Progress) -> Group:
     """A table of arms by scenes, with the numbers of trials that are done and in other states, and lines below it."""
     scenes = sorted({scene for _, scene in progress.cells})
-    table = Table("arm", *map(escape, scenes), title=escape(f"{name}: trials done of all"))
-    for arm in sorted({arm for arm, _ in progress.cells}):
+    arms = sorted({arm for arm, _ in progress.cells})
+    table = Table(title=escape(f"{name}: trials done of all"))
+    # In a narrow terminal the scenes are cut: arms often differ in their last letters only.
+    table.add_column("arm", no_wrap=True, min_width=max(map(len, arms), default=0))
+    for scene in scenes:
+        table.add_column(escape(scene))
+    for arm in arms:
         cells = [progress.cells.get((arm, scene)) for scene in scenes]
         table.add_row(escape(arm), *(_cell(cell) if cell else "–" for cell in cells))
     lines = []
