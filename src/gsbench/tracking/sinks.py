@@ -247,9 +247,9 @@ class TrackedTrial:
             texts.append(f"{results.num_gaussians:,} Gaussians")
         lines = [f"{', '.join(texts)} after {results.iterations:,} iterations.", f"Folder: `{self.path}`"]
         plan = read_if_sound(self.folder.home / layout.PLAN, _Plan)
-        planned = plan.trials.get(self.folder.path.relative_to(self.folder.home).as_posix(), {}) if plan else {}
-        if words := planned.get("overrides"):
-            lines.append(f"Again: `{shlex.join(['gsbench', *map(str, words)])}`")
+        planned = plan.trials.get(self.folder.path.relative_to(self.folder.home).as_posix()) if plan else None
+        if planned:
+            lines.append(f"Again: `{shlex.join(['gsbench', *planned.overrides])}`")
         return "\n\n".join(lines)
 
     def _pictures(self, count: int) -> dict[str, Array]:
@@ -271,10 +271,17 @@ class TrackedTrial:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Plan(Record):
-    """The part of an experiment's plan that is shown: the words of each trial's command."""
+class _Planned(Record):
+    """The part of a planned trial that is shown: the words of its command."""
 
-    trials: dict[str, Any]
+    overrides: tuple[str, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Plan(Record):
+    """The part of an experiment's plan that is shown: its trials by their folders."""
+
+    trials: dict[str, _Planned]
 
 
 def _read_picture(path: Path) -> Array:
