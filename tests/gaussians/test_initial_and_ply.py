@@ -320,6 +320,20 @@ def test_values_that_look_activated_are_warned_of(tmp_path: Path, prefix, values
     assert re.search(said, caplog.text)
 
 
+@pytest.mark.parametrize("unit", [0.01, 1.0, 10.0, 1000.0, 1e5])
+@pytest.mark.parametrize("activated", [False, True])
+def test_lengths_are_told_from_logarithms_in_any_unit(tmp_path: Path, unit: float, activated: bool, caplog) -> None:
+    random = np.random.default_rng(0)
+    table = table_of(tmp_path / "a.ply")
+    for axis in "xyz":
+        table[axis] = unit * random.normal(0, 3, len(table))
+    for axis in range(3):
+        lengths = unit * random.lognormal(math.log(0.05), 0.5, len(table))
+        table[f"scale_{axis}"] = lengths if activated else np.log(lengths)
+    read_ply(save(table, tmp_path / "b.ply"))
+    assert ("look like lengths" in caplog.text) is activated
+
+
 @pytest.mark.parametrize(
     ("center", "scale", "kind"),
     [((0.0, 0.0, 0.0), 1.0, "f4"), ((0.1, -0.2, 0.3), 100.0, "f4"), ((5e5, 5.4e6, 300.0), 1.0, "f8"),

@@ -51,6 +51,30 @@ def test_matched_splits_leave_equally_many_views(count: int, sectors: int, secto
     assert len(steps) == 0 or steps.max() - steps.min() <= 1, "spread evenly"
 
 
+@given(st.data())
+def test_no_split_is_empty_or_trains_on_a_test_view(data: st.DataObject) -> None:
+    names = NAMES[: data.draw(st.integers(3, 8), "number of photographs")]
+    sectors = data.draw(st.integers(2, 10), "sectors")
+    rule = SplitRule(
+        split=data.draw(st.sampled_from(["every_nth", "sector", "list"])),
+        test_every=data.draw(st.integers(2, 30), "test_every"),
+        sectors=sectors,
+        sector=data.draw(st.integers(0, sectors - 1), "sector"),
+        match_views=data.draw(st.booleans(), "match_views"),
+        validation=data.draw(st.booleans(), "validation"),
+    )
+    some = st.none() | st.lists(st.sampled_from(names), unique=True)
+    lists = (data.draw(some), data.draw(some)) if rule.split == "list" else (None, None)
+    try:
+        found = hold_out(names, rule, lists, cameras)
+    except InputError:
+        return
+    assert found.train
+    assert found.test
+    assert not set(found.train) & set(found.test)
+    assert {*found.train, *found.test} <= set(names)
+
+
 @pytest.mark.parametrize("split", ["every_nth", "sector"])
 def test_validation_puts_the_test_views_away_and_asks_the_same_of_the_rest(split: str) -> None:
     rule = SplitRule(split=split, sectors=4, test_every=4)  # type: ignore[arg-type]

@@ -58,6 +58,17 @@ def test_a_sound_cloud_is_seen_agrees_and_raises_no_doubt(
     assert not caplog.records
 
 
+@pytest.mark.parametrize("level", [0, 1, 128, 255])
+def test_a_cloud_without_colours_is_warned_of(scene: Scene, cloud: tuple[np.ndarray, np.ndarray], level: int) -> None:
+    points, colors = cloud
+    plain = np.full_like(colors, level)
+    assert check_start(points, plain, scene, random_points=True).warnings == []
+    facts = check_start(points, plain, scene)
+    assert facts.color_agreement is None
+    (line,) = facts.warnings
+    assert f"the colour ({level}, {level}, {level})" in line
+
+
 def seen_by_brute_force(points: np.ndarray, scene: Scene) -> float:
     """The share of points that two views see, point by point and view by view."""
     shares = []
@@ -99,12 +110,6 @@ def test_a_wrong_cloud_is_doubted_and_random_ones_are_not_doubted_for_their_colo
     assert [record.levelno for record in caplog.records] == [logging.WARNING] * len(facts.warnings)
     at_random = check_start(change(points), colors, scene, random_points=True)
     assert not any("agree" in line or "in view" in line for line in at_random.warnings)
-
-
-def test_points_of_one_colour_have_no_agreement(scene: Scene, cloud: tuple[np.ndarray, np.ndarray]) -> None:
-    points, colors = cloud
-    facts = check_start(points, np.full_like(colors, 128), scene)
-    assert (facts.color_agreement, facts.warnings) == (None, [])
 
 
 def test_agreement_is_that_of_all_pairs(scene: Scene, cloud: tuple[np.ndarray, np.ndarray]) -> None:

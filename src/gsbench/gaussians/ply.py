@@ -36,6 +36,7 @@ REST = "f_rest_"
 REST_COUNTS = tuple(3 * ((degree + 1) ** 2 - 1) for degree in range(MAX_SH_DEGREE + 1))
 # The logit that stands for an opacity of 1, and with a minus for 0: float32's nearest to 1 that still has a gradient.
 MAX_LOGIT = 23 * math.log(2)  # 1 - 2^-23
+TYPICAL_SCALE = 0.02  # of a model's size: the median of Gaussians trained here is .009 to .035
 MIN_TEXT_BYTES = 2  # bytes of a value in an ASCII file, at least: a digit and a space
 SIZES = {"short": 2, "ushort": 2, "int16": 2, "uint16": 2, "int": 4, "uint": 4, "int32": 4, "uint32": 4}
 SIZES |= {"float": 4, "float32": 4, "double": 8, "float64": 8}  # bytes; all other types have 1
@@ -136,11 +137,28 @@ def _check_finite(column: NDArray[Any], name: str, path: Path) -> None:
 
 def _warn_of_activated(vertices: NDArray[Any], path: Path) -> None:
     """Warn of values that look as if they were stored after 3DGS's activations, exp and sigmoid."""
-    if all((vertices[f"scale_{axis}"] > 0).all() for axis in range(3)):
+    if _look_like_lengths(vertices):
         log.warning("%s: all scales are positive: they look like lengths, where 3DGS stores their logarithms", path)
     opacity = vertices["opacity"]
     if ((opacity >= 0) & (opacity <= 1)).all():
         log.warning("%s: all opacities lie in [0, 1]: they look like opacities, where 3DGS stores their logits", path)
+
+
+def _look_like_lengths(vertices: NDArray[Any]) -> bool:
+    """Whether the stored scales are more plausible as lengths than as logarithms of lengths.
+
+    Both can be positive everywhere: the logarithms are in a scene that is measured in millimetres.
+    """
+    scales = np.stack([vertices[f"scale_{axis}"] for axis in range(3)]).astype(np.float64)  # [3, N]
+    if not (scales > 0).all():
+        return False
+    positions = np.stack([vertices[axis] for axis in POSITION]).astype(np.float64)  # [3, N]
+    offsets = positions - np.median(positions, axis=1, keepdims=True)
+    size = float(np.median(np.linalg.norm(offsets, axis=0)))
+    if size == 0:
+        return False
+    typical, scale = math.log(TYPICAL_SCALE * size), float(np.median(scales))
+    return abs(math.log(scale) - typical) < abs(scale - typical)
 
 
 def read_ply(path: Path, device: torch.device | str = "cpu", normalization: Normalization = IDENTITY) -> Gaussians:

@@ -84,6 +84,9 @@ def check_start(
         warnings=[],
     )
     warnings = far_cameras(scene) + _doubts(facts, random_points)
+    if not random_points and len(colors) > 1 and colors.std(axis=0).max() < MIN_COLOR_SPREAD:
+        shade = ", ".join(str(level) for level in colors[0])
+        warnings.append(f"all initial points have the colour ({shade}): export the cloud with its colours")
     for line in warnings:
         log.warning("scene %s: %s", scene.name, line)
     return replace(facts, warnings=warnings)
