@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 from dataclasses import replace
 
@@ -12,7 +13,7 @@ from gsbench.errors import InputError
 from gsbench.normalization import Normalization
 from gsbench.runs.trial_record import InitialCloud
 from gsbench.scene.types import Scene, View
-from gsbench.train.start import check_start
+from gsbench.train.start import check_start, odd_lenses
 from tests.train.conftest import orbit_camera
 
 WALL_Z = 4.0
@@ -56,6 +57,34 @@ def test_a_sound_cloud_is_seen_agrees_and_raises_no_doubt(
     assert facts.color_agreement > 0.85
     assert (facts.identical, facts.far, facts.warnings) == (0.0, 0, [])
     assert not caplog.records
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda camera: {"fx": 0.8, "fy": 0.8}, "a focal length of 0.8 px for a width of"),
+        (lambda camera: {"fx": 300 * camera.width, "fy": 300 * camera.width}, "a focal length of"),
+        (lambda camera: {"fy": 2 * camera.fx}, "pixels are square"),
+        (lambda camera: {"fy": 0.7 * camera.fx}, "pixels are square"),
+        (lambda camera: {"cx": 0.5, "cy": 0.5}, "its principal point at (0.5, 0.5)"),
+        (lambda camera: {"cy": -3.0}, "its principal point"),
+        (lambda camera: {"cx": 1.2 * camera.cx, "fy": 1.1 * camera.fx}, ""),
+    ],
+)
+def test_intrinsics_that_no_lens_has_are_named_once(
+    scene: Scene, cloud: tuple[np.ndarray, np.ndarray], change, said: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    train = tuple(replace(view, camera=replace(view.camera, **change(view.camera))) for view in scene.train)
+    changed = replace(scene, train=train)
+    lines = odd_lenses(changed)
+    assert len(lines) == bool(said)
+    for line in lines:
+        assert line.startswith("the camera of 1.png, 2.png, 3.png and 5 more has ")
+        assert said in line
+    caplog.clear()
+    with contextlib.suppress(InputError):  # a lens may also leave no point in view
+        check_start(*cloud, changed, random_points=True)
+    assert all(line in caplog.text for line in lines)
 
 
 @pytest.mark.parametrize("level", [0, 1, 128, 255])

@@ -182,7 +182,9 @@ def read_ply(path: Path, device: torch.device | str = "cpu", normalization: Norm
         )
     if missing or len(vertices) == 0:
         listed = ", ".join(missing) or "all, since it is empty"
-        raise InputError(f"{path}: not a 3DGS PLY; missing or odd properties: {listed}")
+        is_cloud = present >= set(POSITION) and "f_dc_0" in missing
+        hint = ": it is a point cloud, which init=points reads" if is_cloud else ""
+        raise InputError(f"{path}: not a 3DGS PLY; missing or odd properties: {listed}{hint}")
     vertices = _with_finite_opacities(vertices, path)
     for name in (*required, *rest):
         _check_finite(vertices[name], name, path)

@@ -7,6 +7,8 @@ is an error or a warning here, before the first iteration. The measured facts ar
 from __future__ import annotations
 
 import logging
+import math
+from collections import defaultdict
 from dataclasses import replace
 
 import numpy as np
@@ -16,8 +18,8 @@ from gsbench.errors import InputError
 from gsbench.normalization import IDENTITY, Normalization
 from gsbench.raster.base import CONSTANTS
 from gsbench.runs.trial_record import InitialCloud
-from gsbench.scene.types import Array, Scene, View
-from gsbench.words import counted
+from gsbench.scene.types import Array, Camera, Scene, View
+from gsbench.words import counted, some_of
 
 log = logging.getLogger(__name__)
 
@@ -32,6 +34,10 @@ MIN_AGREEMENT = 0.25
 MAX_IDENTICAL = 0.5
 MIN_SPREAD = 0.02
 MIN_COLOR_SPREAD = 1.0  # levels of 255; a cloud of one colour has nothing to agree with
+MAX_FIELD_OF_VIEW = 150.0  # degrees; the widest pinhole lenses have 130
+MIN_FIELD_OF_VIEW = 0.2  # degrees; satellites have 1 or 2
+MAX_PIXEL_RATIO = 1.25  # of the focal lengths in x and y; unequal scaling of photographs gives 1.01
+CENTRAL = (0.1, 0.9)  # of a side, where the principal point of an uncropped photograph lies
 FAR_CAMERA = 20.0  # times the median distance of the training cameras from their median place
 
 
@@ -54,6 +60,8 @@ def check_start(
             f"scene {scene.name}: all training cameras stand at one place, so no depth can be learnt: take photographs "
             "from several places"
         )
+    warnings = far_cameras(scene) + odd_lenses(scene)
+    _warn(scene, warnings)  # before the errors below, which they may explain
     middle, from_middle = camera_distances(scene)
     # A camera far off sets the extent, but not the median distance. That is 0 if most cameras stand at one place.
     size = float(np.median(from_middle)) or scene.extent
@@ -83,13 +91,17 @@ def check_start(
         spread=float(np.median(np.linalg.norm(points - np.median(points, axis=0), axis=1)) / size),
         warnings=[],
     )
-    warnings = far_cameras(scene) + _doubts(facts, random_points)
+    doubts = _doubts(facts, random_points)
     if not random_points and len(colors) > 1 and colors.std(axis=0).max() < MIN_COLOR_SPREAD:
         shade = ", ".join(str(level) for level in colors[0])
-        warnings.append(f"all initial points have the colour ({shade}): export the cloud with its colours")
-    for line in warnings:
+        doubts.append(f"all initial points have the colour ({shade}): export the cloud with its colours")
+    _warn(scene, doubts)
+    return replace(facts, warnings=warnings + doubts)
+
+
+def _warn(scene: Scene, lines: list[str]) -> None:
+    for line in lines:
         log.warning("scene %s: %s", scene.name, line)
-    return replace(facts, warnings=warnings)
 
 
 def _doubts(facts: InitialCloud, random_points: bool) -> list[str]:
@@ -128,6 +140,35 @@ def far_cameras(scene: Scene) -> list[str]:
         for view, distance in zip(scene.train, distances, strict=True)
         if distance > FAR_CAMERA * typical > 0
     ]
+
+
+def odd_lenses(scene: Scene) -> list[str]:
+    """A line for each way in which intrinsics differ from those of common lenses, such as values in other units."""
+    names: dict[str, list[str]] = defaultdict(list)
+    lines: dict[str, str] = {}
+    for view in scene.train:
+        for kind, line in _odd_about(view.camera).items():
+            names[kind].append(view.name)
+            lines.setdefault(kind, line)
+    return [f"the camera of {some_of(names[kind])} has {line}" for kind, line in lines.items()]
+
+
+def _odd_about(camera: Camera) -> dict[str, str]:
+    """What is odd about the intrinsics of ``camera``: a text for each kind of oddity."""
+    width, height = camera.width, camera.height
+    field = math.degrees(2 * math.atan(width / (2 * camera.fx)))
+    odd = {}
+    if not MIN_FIELD_OF_VIEW < field < MAX_FIELD_OF_VIEW:
+        odd["field"] = f"a focal length of {camera.fx:.4g} px for a width of {width} px: check its unit"
+    if not 1 / MAX_PIXEL_RATIO < camera.fy / camera.fx < MAX_PIXEL_RATIO:
+        odd["ratio"] = f"focal lengths of {camera.fx:.4g} and {camera.fy:.4g} px, but pixels are square: check both"
+    least, most = CENTRAL
+    if not (least < camera.cx / width < most and least < camera.cy / height < most):
+        odd["center"] = (
+            f"its principal point at ({camera.cx:.4g}, {camera.cy:.4g}) of {width}x{height} px, far from the middle: "
+            "check its unit, unless the photographs were cropped"
+        )
+    return odd
 
 
 def camera_distances(scene: Scene) -> tuple[Array, Array]:
