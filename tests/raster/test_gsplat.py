@@ -143,7 +143,7 @@ def test_a_camera_is_uploaded_once_and_forgotten_with_it(library: ModuleType) ->
 def test_on_a_gpu_it_departs_only_as_its_module_says() -> None:
     pytest.importorskip("gsplat")
     told = departures(GsplatRasterizer(), "cuda", cases=(FAINT,))
-    assert [line for line in told if "radii differ" not in line] == []
+    assert [line for line in told if "radius" not in line] == []
 
 
 def test_square_radii_are_those_of_the_reference() -> None:

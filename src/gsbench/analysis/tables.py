@@ -253,11 +253,15 @@ def trials_notes(experiment: Experiment, trials: Sequence[TrialResult]) -> list[
 
 
 def doubt_notes(trials: Sequence[TrialResult]) -> list[str]:
-    """Lines on results that are worth little: renders not better than one colour, and doubts about initial points."""
+    """Lines on results that are worth little or may surprise.
+
+    Renders not better than one colour, executors that failed their proof, twins, and doubts about initial points.
+    """
     notes = []
     for trial in trials:
         if line := trial.record.learnt_nothing:
             notes.append(f"{LEARNT_NOTHING} {trial.label} is {line}.")
+        notes += [f"{line}." for line in trial.record.raster_passed_over]
     folders, downscales = (
         {trial.config.get(key) for trial in trials if trial.config} for key in ("scene.images", "scene.downscale")
     )

@@ -90,7 +90,7 @@ def _state(folder: Path, planned: float | None, queue: Queue | None) -> TrialSta
     """The state of the trial in ``folder``; ``planned`` is the time of its plan."""
     state = TrialFolder(folder).state()
     if state == "done":
-        return TrialState(folder, state, _changed(folder / RESULTS), TrialFolder(folder).record().learnt_nothing)
+        return TrialState(folder, state, _changed(folder / RESULTS), TrialFolder(folder).record().remark)
     if state == "running":
         holder = read_holder(folder / LOCK)
         since, process = (None, "process ? on ?") if holder is None else (holder.since, holder.description)

@@ -29,7 +29,7 @@ from gsbench.eval.options import EvalConfig
 from gsbench.eval.protocol import get_protocol
 from gsbench.external.settings import External
 from gsbench.init.base import Initializer
-from gsbench.raster import EXECUTORS, Rasterizer, create_rasterizer
+from gsbench.raster import EXECUTORS, Rasterizer
 from gsbench.raster.executors import AUTO, offers, resolve
 from gsbench.runs.experiments import metric_and_question
 from gsbench.runs.keys import OWN, UserCode, module_digest, targets_in, unnamed_modules, user_modules
@@ -38,6 +38,7 @@ from gsbench.settings import check_values, unknown_setting
 from gsbench.system.device import select_device
 from gsbench.system.resources import available_threads
 from gsbench.train.options import TrainConfig
+from gsbench.train.proof import Proven, create_proven
 from gsbench.words import did_you_mean
 
 log = logging.getLogger(__name__)
@@ -122,13 +123,16 @@ class Parts:
         return available_threads(self.values["launch"]["parallel"]) if wanted == "auto" else int(wanted)
 
     @cached_property
+    def raster(self) -> Proven:
+        """The rasterizer for ``device``, with its proof. A user's own has none."""
+        chosen = None if self.own_rasterizer is None else Proven(self.own_rasterizer)
+        chosen = chosen or create_proven(self.values["raster"]["name"], self.device, self.threads)
+        self._check_features(chosen.rasterizer.name)
+        return chosen
+
+    @property
     def rasterizer(self) -> Rasterizer:
-        """The rasterizer for ``device``."""
-        rasterizer = self.own_rasterizer
-        if rasterizer is None:
-            rasterizer = create_rasterizer(self.values["raster"]["name"], self.device, self.threads)
-        self._check_features(rasterizer.name)
-        return rasterizer
+        return self.raster.rasterizer
 
     @cached_property
     def evaluator(self) -> Evaluator:

@@ -6,6 +6,7 @@ import time
 import traceback
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -189,6 +190,7 @@ def _run(trial: Trial, folder: TrialFolder) -> TrialRecord:
             if step.stage is keys.INIT:
                 link_or_copy(entry.path / REPORT_FILE, folder.path / layout.INIT_REPORT)
         results = results_of(values, trial_steps.capture, trial_steps.views.scene, parts.rasterizer.name, entries, code)
+        results = replace(results, raster_proof=parts.raster.proof, raster_passed_over=[*parts.raster.passed_over])
         published = _publish(folder.path, entries, trial_steps.capture.normalization)
         made_of = {name: entry.path for name, entry in entries.items() if name != keys.CAPTURE.name}
         sources = source_files(trial_steps.photographs, store)

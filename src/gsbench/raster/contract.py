@@ -5,7 +5,10 @@ gsbench tests its own executors with the same scenes. To test yours:
     assert departures(MyRasterizer()) == []
 """
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -18,13 +21,17 @@ from gsbench.raster.reference import ReferenceRasterizer
 from gsbench.scene.types import Camera
 
 VALUE_TOLERANCE = 1e-4  # of image and alpha
+RADIUS_TOLERANCE = 0.5  # px: radii are whole
 GRADIENT_TOLERANCE = 1e-3  # of the largest entry of each gradient
 FOOTPRINT_TOLERANCE = 1e-3  # of each sum: rounding may skip a pixel whose alpha is nearly 1/255, or not
 
 
 @dataclass(frozen=True)
 class Case:
-    """A seeded scene with its camera. ``principal`` is the offset of the principal point from the image centre, px."""
+    """A seeded scene with its camera. ``principal`` is the offset of the principal point from the image centre, px.
+
+    ``spread`` scales the distances of the Gaussians from the axis through their middle, which is ``depth`` away.
+    """
 
     width: int
     height: int
@@ -33,6 +40,8 @@ class Case:
     principal: tuple[float, float] = (0.0, 0.0)
     log_scale: float = -2.0
     logit: float = 0.0
+    spread: float = 1.0
+    depth: float = 4.0
 
     def __str__(self) -> str:
         return f"{self.width}x{self.height}-n{self.count}-sh{self.sh_degree}"
@@ -61,7 +70,8 @@ class Case:
             return torch.randn(*shape, generator=generator, dtype=torch.float64)
 
         means = normal(self.count, 3)
-        means[:, 2] += 4
+        means[:, :2] *= self.spread
+        means[:, 2] += self.depth
         gaussians = Gaussians(
             means,
             self.log_scale + 0.8 * normal(self.count, 3),
@@ -108,51 +118,95 @@ def render_with_gradients(
     }
 
 
+class Error(NamedTuple):
+    """The largest error of a quantity in a case, what the contract allows, and the place of the error in words."""
+
+    case: str
+    quantity: str
+    off: float  # NaN if a value is not finite
+    limit: float
+    place: str
+    unit: str = ""
+
+    @property
+    def is_departure(self) -> bool:
+        return not self.off < self.limit
+
+    def __str__(self) -> str:
+        if math.isinf(self.off):
+            return f"{self.case}: {self.quantity} {self.place}"
+        return f"{self.case}: {self.quantity} is off by up to {self.off:.2e}{self.unit} at {self.place}"
+
+
 def departures(rasterizer: Rasterizer, device: str = "cpu", cases: tuple[Case, ...] = CASES) -> list[str]:
     """List where ``rasterizer``, in float32 on ``device``, departs from the contract, one line each; [] if nowhere.
 
     For all ``cases``, it compares image, alpha, radii, all gradients and, if offered, footprint and splitting matrices
     with the reference. It also tests a scene without Gaussians. Takes seconds.
     """
-    return [line for case in cases for line in _compare(rasterizer, case, device)] + _without_gaussians(
-        rasterizer, device
-    )
-
-
-def _compare(rasterizer: Rasterizer, case: Case, device: str) -> list[str]:
-    expected, references = render_with_gradients(ReferenceRasterizer(), case, torch.float64)
-    try:
-        output, gradients = render_with_gradients(rasterizer, case, torch.float32, device)
-    except (RuntimeError, ValueError, TypeError, NotImplementedError) as error:
-        return [f"{case}: {type(error).__name__}: {error}"]
     lines = []
-    for name in ("image", "alpha"):
-        value, reference = getattr(output, name).detach().cpu().double(), getattr(expected, name).detach()
+    for case in cases:
+        try:
+            lines += [str(error) for error in measure(rasterizer, case, device) if error.is_departure]
+        except (RuntimeError, ValueError, TypeError, NotImplementedError) as error:
+            lines.append(f"{case}: {type(error).__name__}: {error}")
+    return lines + _without_gaussians(rasterizer, device)
+
+
+def measure(rasterizer: Rasterizer, case: Case, device: str) -> list[Error]:
+    """The largest error of each quantity of ``rasterizer``, in float32 on ``device``, against the float64 reference.
+
+    A shape or dtype that is not the contract's is an infinite error.
+    """
+    expected, references = render_with_gradients(ReferenceRasterizer(), case, torch.float64)
+    output, gradients = render_with_gradients(rasterizer, case, torch.float32, device)
+    errors = []
+
+    def compare(quantity: str, value: Tensor, reference: Tensor, limit: float, relative: bool, place: Place) -> None:
+        value, reference = value.detach().cpu().double(), reference.detach().double()
         if value.shape != reference.shape:
-            lines.append(f"{case}: {name} has shape {tuple(value.shape)}, expected {tuple(reference.shape)}")
-        elif not (off := _largest(value - reference)) < VALUE_TOLERANCE:
-            lines.append(f"{case}: {name} is off by up to {off:.2e}")
+            shapes = (
+                f"has shape {tuple(value.shape)}, expected {tuple(reference.shape)}" if value.dim() else "is missing"
+            )
+            errors.append(Error(str(case), quantity, math.inf, limit, shapes))
+            return
+        off = (value - reference).abs()
+        largest = float(off.max()) if off.numel() else 0.0
+        at = place(int(off.argmax())) if off.numel() else "nothing"
+        scale = max(float(reference.abs().max()), 1e-30) if relative and off.numel() else 1.0
+        unit = " of its largest entry" if relative else ""
+        errors.append(Error(str(case), quantity, largest / scale, limit, at, unit))
+
+    def pixel(index: int) -> str:
+        return f"pixel ({index % case.width}, {index // case.width})"
+
+    compare("image", output.image, expected.image, VALUE_TOLERANCE, False, lambda index: pixel(index // 3))
+    compare("alpha", output.alpha, expected.alpha, VALUE_TOLERANCE, False, pixel)
+    compare("radius", output.radii, expected.radii, RADIUS_TOLERANCE, False, lambda index: f"Gaussian {index}")
     if output.radii.dtype != torch.int32:
-        lines.append(f"{case}: radii are {output.radii.dtype}, expected torch.int32")
-    elif not torch.equal(output.radii.cpu(), expected.radii):
-        different = int((output.radii.cpu() != expected.radii).sum())
-        lines.append(f"{case}: radii differ for {different} of {case.count} Gaussians")
+        errors.append(
+            Error(str(case), "radius", math.inf, RADIUS_TOLERANCE, f"is {output.radii.dtype}, expected torch.int32")
+        )
     for name, reference in references.items():
         if name == "splitting_probe" and name not in gradients:
             continue  # optional
         if reference.dim() == 0:  # no gradient: at degree 0 nothing depends on ``sh_rest``
             reference = torch.zeros_like(gradients[name])
-        if gradients[name].shape != reference.shape:
-            lines.append(f"{case}: there is no gradient of {name}")
-            continue
-        off = _largest(gradients[name] - reference) / max(_largest(reference), 1e-30)
-        if not off < GRADIENT_TOLERANCE:
-            lines.append(f"{case}: the gradient of {name} is off by {off:.2e} of its largest entry")
+        size = reference.numel() // max(1, case.count) or 1  # numbers for each Gaussian
+        quantity = "splitting matrix" if name == "splitting_probe" else f"gradient of {name}"
+        compare(
+            quantity, gradients[name], reference, GRADIENT_TOLERANCE, True,
+            lambda index, size=size: f"Gaussian {index // size}",  # type: ignore[misc]
+        )  # fmt: skip
     if output.footprint is not None:
         for name, off in footprint_errors(output, expected).items():
-            if not off < FOOTPRINT_TOLERANCE:
-                lines.append(f"{case}: the {name} of the footprint are off by {off:.2e} of their sum")
-    return lines
+            errors.append(
+                Error(str(case), f"footprint ({name})", off, FOOTPRINT_TOLERANCE, "all pixels", " of the sum")
+            )
+    return errors
+
+
+Place = Callable[[int], str]  # words for the place of a tensor's flat index
 
 
 def footprint_errors(output: RenderOutput, expected: RenderOutput) -> dict[str, float]:
@@ -181,8 +235,3 @@ def _without_gaussians(rasterizer: Rasterizer, device: str) -> list[str]:
     if not torch.equal(output.image, background.expand(case.height, case.width, 3)) or output.alpha.abs().max() > 0:
         return ["without Gaussians: the image is not the background"]
     return []
-
-
-def _largest(tensor: Tensor) -> float:
-    """The largest absolute value, NaN included; 0 for an empty tensor."""
-    return float(tensor.abs().max()) if tensor.numel() else 0.0

@@ -36,6 +36,8 @@ class Executor:
     takes_threads: bool = False  # its class has an argument ``threads``
     has_footprint: bool = True  # it gives ``RenderOutput.footprint``
     has_splitting_matrix: bool = True  # it gives ``RenderOutput.splitting_probe``
+    same_bits: bool = True  # two runs on a device give the same bits
+    keeps_contract: bool = True  # False: its module says where it departs
 
     @property
     def is_installed(self) -> bool:
@@ -60,6 +62,7 @@ EXECUTORS = (  # ``auto`` takes the first that is made for the type of device an
         "gsbench.raster.reference.ReferenceRasterizer",
         devices=(),
         text="plain torch, float32 or float64: the definition; all others are tested against it; slow",
+        same_bits=False,  # torch's sums on a GPU use atomics
     ),
     Executor(
         "cpu",
@@ -85,6 +88,8 @@ EXECUTORS = (  # ``auto`` takes the first that is made for the type of device an
         install=install_command("gsplat"),
         has_footprint=False,
         has_splitting_matrix=False,
+        same_bits=False,
+        keeps_contract=False,
     ),
 )
 
@@ -119,21 +124,25 @@ def resolve(name: str, device_type: str) -> Executor:
     Raises InputError if it cannot run there. ``auto`` logs a warning if only the slow reference can run.
     """
     if name == AUTO:
-        return _automatic(device_type)
+        first, *_ = automatic(device_type)
+        return first
     executor = find_executor(name)
     if (obstacle := executor.obstacle(device_type)) is not None:
         raise InputError(f"raster={name} {obstacle}")
     return executor
 
 
-def _automatic(device_type: str) -> Executor:
+def automatic(device_type: str) -> list[Executor]:
+    """The executors that ``auto`` takes on a device of this type, the best first; the last is the reference.
+
+    Logs a warning if only the slow reference can run.
+    """
     candidates = [executor for executor in EXECUTORS if device_type in executor.devices]
-    for executor in candidates:
-        if executor.obstacle(device_type) is None:
-            return executor
-    hints = "; ".join(f"{executor.name} needs {executor.package}: {executor.install}" for executor in candidates)
-    log.warning("raster=auto: the slow reference rasterizer runs%s", f" ({hints})" if hints else "")
-    return find_executor("reference")
+    usable = [executor for executor in candidates if executor.obstacle(device_type) is None]
+    if not usable:
+        hints = "; ".join(f"{executor.name} needs {executor.package}: {executor.install}" for executor in candidates)
+        log.warning("raster=auto: the slow reference rasterizer runs%s", f" ({hints})" if hints else "")
+    return [*usable, find_executor("reference")]
 
 
 def missing_tools() -> list[str]:

@@ -129,6 +129,25 @@ class TwinViews(Record):
 
 
 @dataclass(frozen=True, kw_only=True)
+class RasterProof(Record):
+    """A comparison of a rasterizer with the float64 reference on a device (`gsbench.train.proof`).
+
+    ``errors`` has the largest error of each quantity. ``failures`` has a line for each that is too large.
+    """
+
+    raster: Text
+    device: Text
+    versions: dict[str, str]
+    errors: dict[str, Number]
+    failures: list[str]
+    seconds: Amount
+
+    @property
+    def passed(self) -> bool:
+        return not self.failures
+
+
+@dataclass(frozen=True, kw_only=True)
 class TrialRecord(Record):
     """A finished trial. A value that cannot be known is None; the file leaves out None if that is the default.
 
@@ -177,6 +196,13 @@ class TrialRecord(Record):
     renders: dict[str, str] = field(default_factory=dict)  # origin of another program's renders
     code: Code = field(default_factory=Code)
     machine: dict[str, str] | None = None
+    raster_proof: RasterProof | None = None  # of the executor, on a GPU
+    raster_passed_over: list[str] = field(default_factory=list)  # executors that raster=auto did not take, and why
+
+    @property
+    def remark(self) -> str:
+        """What a state in one line must say of a finished trial; "" if nothing."""
+        return "; ".join(filter(None, [self.learnt_nothing, *self.raster_passed_over]))
 
     @property
     def learnt_nothing(self) -> str:

@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from gsbench.errors import InputError
-from gsbench.raster.executors import AUTO, EXECUTORS, resolve
+from gsbench.raster.executors import AUTO, EXECUTORS, names, resolve
+from gsbench.runs.trial_record import RasterProof
 from gsbench.scene.options import MIN_SIZE
 from gsbench.system.install import install_command, version_of
 from gsbench.system.own_modules import allow_modules
@@ -30,6 +31,7 @@ OPTIONAL = {  # module -> what needs it, and the extra that brings it
 }
 NOT_SHOWN = ("scene", "threads", "device")  # columns that only the JSON of `bench` has
 MAX_SIDE = 16_384  # px
+SHOWN_ERRORS = ("image", "gradient of means", "gradient of log_scales", "trained image")  # of a proof, in one line
 MAX_COUNT = 1_000_000_000
 
 
@@ -42,15 +44,71 @@ class Finding(NamedTuple):
 
 
 def doctor(argv: Sequence[str], runs: Path) -> int:
-    """Run the verb: 1 if something is bad."""
+    """Run the verb: 1 if something is bad, or if a proof fails."""
     parser = ArgumentParser("doctor")
-    parser.parse_args(argv)
+    parser.add_argument(
+        "--prove", action="store_true", help="compare a rasterizer with the float64 reference on this machine"
+    )
+    parser.add_argument("--raster", default=AUTO, choices=names(), help="the rasterizer to prove (auto)")
+    parser.add_argument("--device", default="auto", help="where to prove it: auto, cpu, cuda or cuda:1")
+    parser.add_argument("--json", action="store_true", help="print the proof as JSON")
+    options = parser.parse_args(argv)
+    if options.prove:
+        return _prove(options.raster, options.device, options.json)
+    if options.json or options.raster != AUTO or options.device != "auto":
+        raise InputError("doctor: --raster, --device and --json belong to --prove")
     bad = 0
-    for findings in (check_packages(), check_devices(), check_weights(), check_runs(runs)):
+    for findings in (check_packages(), check_devices(), check_proofs(), check_weights(), check_runs(runs)):
         for verdict, topic, text in findings:
             print(f"{verdict:<5} {topic:<12} {text}")
             bad += verdict == "bad"
     return 1 if bad else 0
+
+
+def _prove(raster: str, device_name: str, as_json: bool) -> int:
+    from gsbench.system.device import select_device
+    from gsbench.train.proof import proof_of, stamp_of
+
+    device = select_device(device_name, "--device")
+    name = resolve(raster, device.type).name
+    proof = proof_of(name, device, again=True)
+    if as_json:
+        print(json.dumps(proof.to_json() | {"passed": proof.passed}, indent=2))
+        return 0 if proof.passed else 1
+    print(_describe(proof))
+    for line in proof.failures:
+        print(f"  {line}")
+    if not proof.passed:
+        versions = ", ".join(f"{name} {version}" for name, version in proof.versions.items())
+        print(f"{versions}; please report it with {stamp_of(name, device)}")
+    return 0 if proof.passed else 1
+
+
+def _describe(proof: RasterProof) -> str:
+    """A proof in one line."""
+    verdict = "agrees with" if proof.passed else "departs from"
+    largest = ", ".join(
+        f"{quantity} {proof.errors[quantity]:.1e}" for quantity in SHOWN_ERRORS if quantity in proof.errors
+    )
+    return f"raster={proof.raster} {verdict} the reference on {proof.device} ({proof.seconds:.0f} s): {largest}"
+
+
+def check_proofs() -> Iterator[Finding]:
+    """Findings about the proofs of rasterizers on the devices here; nothing is rendered."""
+    import torch
+
+    from gsbench.train.proof import known_proof
+
+    for place in ("cpu", *(f"cuda:{index}" for index in range(torch.cuda.device_count()))):
+        device = torch.device(place)
+        for executor in EXECUTORS:
+            if executor.obstacle(device.type) is not None:
+                continue
+            proof = known_proof(executor.name, device)
+            if proof is not None:
+                yield Finding("ok" if proof.passed else "bad", "proof", _describe(proof))
+            elif device.type == "cuda" and executor.devices:
+                yield Finding("note", "proof", f"raster={executor.name} on {place}: none yet; its first use makes it")
 
 
 def check_packages() -> Iterator[Finding]:
