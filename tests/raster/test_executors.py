@@ -168,7 +168,10 @@ def footprint_of(out: RenderOutput, **changes: float) -> Callable[..., Footprint
         (lambda out: {"alpha": out.alpha - 0.25}, "alpha is off by up to 2.50e-01"),
         (lambda out: {"image": out.image + torch.nan}, "image is off by up to nan"),
         (lambda out: {"radii": out.radii.long()}, "radii are torch.int64, expected torch.int32"),
-        (lambda out: {"radii": out.radii + (out.radii == out.radii.max())}, "radius is off by up to 1.00e+00 at Gaussian"),
+        (
+            lambda out: {"radii": out.radii + (out.radii == out.radii.max())},
+            "radius is off by up to 1.00e+00 at Gaussian",
+        ),
         (lambda out: {"screen_points": torch.zeros(20, 2)}, "gradient of screen_points is missing"),
         (
             lambda out: {"footprint": footprint_of(out, pixels=3)},

@@ -55,11 +55,14 @@ LOSS_TOLERANCE = 1e-4  # relative, at each step; the CPU's kernels depart by 5e-
 TRAINED_TOLERANCE = 2e-3  # of the image after the steps; the CPU's kernels depart by 1e-6
 
 
-def prove(rasterizer: Rasterizer, device: torch.device, scenes: tuple[Case, ...] = SCENES) -> RasterProof:
+def prove(
+    rasterizer: Rasterizer, device: torch.device, scenes: tuple[Case, ...] = SCENES, loss: Loss | None = None
+) -> RasterProof:
     """Compare ``rasterizer`` on ``device`` with the reference; some seconds, and the compilation of its kernels.
 
     All ``scenes`` are rendered, with gradients; again, for equal bits; and the first is trained for ten steps. An
-    executor that is known to depart where alpha is clamped, and in radii (gsplat), is compared elsewhere.
+    executor that is known to depart where alpha is clamped, and in radii (gsplat), is compared elsewhere. ``loss``
+    is by default that of a training on ``device``.
     """
     started = time.perf_counter()
     executor = find_executor(rasterizer.name)
@@ -68,7 +71,7 @@ def prove(rasterizer: Rasterizer, device: torch.device, scenes: tuple[Case, ...]
     failures: list[str] = []
     largest: dict[str, float] = {}
     try:
-        for error in _errors(rasterizer, device, scenes, executor):
+        for error in _errors(rasterizer, device, scenes, executor, loss or PhotometricLoss()):
             largest[error.quantity] = max(error.off, largest.get(error.quantity, 0.0))
             if error.is_departure:
                 failures.append(str(error))
@@ -87,7 +90,7 @@ def prove(rasterizer: Rasterizer, device: torch.device, scenes: tuple[Case, ...]
 
 
 def _errors(
-    rasterizer: Rasterizer, device: torch.device, scenes: tuple[Case, ...], executor: Executor
+    rasterizer: Rasterizer, device: torch.device, scenes: tuple[Case, ...], executor: Executor, loss: Loss
 ) -> Iterator[Error]:
     place = str(device)
     first = [_bits(rasterizer, case, place) for case in scenes] if executor.same_bits else []
@@ -99,7 +102,7 @@ def _errors(
         again = _bits(rasterizer, case, place)
         unequal = [name for name in bits if bits[name] != again[name]]
         yield Error(str(case), "bits of a second run", float(len(unequal)), 0.5, ", ".join(unequal), " tensors")
-    yield from _training_errors(rasterizer, device, scenes[0])
+    yield from _training_errors(rasterizer, device, scenes[0], loss)
 
 
 def _bits(rasterizer: Rasterizer, case: Case, device: str) -> dict[str, bytes]:
@@ -108,7 +111,7 @@ def _bits(rasterizer: Rasterizer, case: Case, device: str) -> dict[str, bytes]:
     return {name: tensor.detach().cpu().numpy().tobytes() for name, tensor in tensors.items()}
 
 
-def _training_errors(rasterizer: Rasterizer, device: torch.device, case: Case) -> Iterator[Error]:
+def _training_errors(rasterizer: Rasterizer, device: torch.device, case: Case, loss: Loss) -> Iterator[Error]:
     """The errors of ten steps with the loss and Adam of the device, in float32, against torch's in float64."""
     other = dataclasses.replace(case, count=case.count + 1)  # another random scene, to be learnt
     with torch.no_grad():
@@ -116,9 +119,11 @@ def _training_errors(rasterizer: Rasterizer, device: torch.device, case: Case) -
             other.gaussians(), case.camera(), case.sh_degree, torch.zeros(3, dtype=torch.float64)
         ).image.clamp(0, 1)  # fmt: skip
     expected, image = _train(ReferenceRasterizer(), case, target, torch_photometric_loss)
-    found, own_image = _train(rasterizer, case, target.to(device, torch.float32), PhotometricLoss())
-    for step, (loss, reference) in enumerate(zip(found, expected, strict=True), start=1):
-        yield Error(str(case), "loss", abs(loss / reference - 1), LOSS_TOLERANCE, f"training step {step}", " of itself")
+    found, own_image = _train(rasterizer, case, target.to(device, torch.float32), loss)
+    for step, (value, reference) in enumerate(zip(found, expected, strict=True), start=1):
+        yield Error(
+            str(case), "loss", abs(value / reference - 1), LOSS_TOLERANCE, f"training step {step}", " of itself"
+        )
     off = (own_image.double().cpu() - image).abs()
     yield Error(str(case), "trained image", float(off.max()), TRAINED_TOLERANCE, f"training step {STEPS}")
 
@@ -264,7 +269,8 @@ def create_proven(name: str, device: torch.device, threads: int | None = None) -
         if not reason:
             return Proven(create_rasterizer(executor.name, device, threads), proof, tuple(passed_over))
         passed_over.append(f"raster={executor.name} is not used: {reason}")
-        log.warning("%s", passed_over[-1])
+        if name == AUTO:
+            log.warning("%s", passed_over[-1])
     raise InputError(f"{'; '.join(passed_over)}; device=cpu trains without a GPU")
 
 

@@ -1,0 +1,302 @@
+"""The proof of an executor: it passes sound kernels, catches planted faults, and is made once for each version."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import stat
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import gsbench
+from gsbench.cli import run
+from gsbench.errors import InputError
+from gsbench.raster.contract import Case
+from gsbench.raster.cpu import CpuRasterizer
+from gsbench.raster.executors import EXECUTORS
+from gsbench.raster.reference import ReferenceRasterizer
+from gsbench.runs.trial_record import RasterProof
+from gsbench.system.isolate import CrashError
+from gsbench.train import proof as module
+from gsbench.train.proof import create_proven, known_proof, proof_of, prove, stamp_of
+from tests.conftest import ROOT
+from tests.raster.conftest import interpreter_fault
+
+CPU = torch.device("cpu")
+TINY = Case(7, 5, 20, sh_degree=3)
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    return tmp_path / "cache/gsbench/proofs"
+
+
+def passing(raster: str = "triton", failures: tuple[str, ...] = ()) -> RasterProof:
+    return RasterProof(
+        raster=raster, device="a GPU", versions={"torch": "2"}, errors={}, failures=[*failures], seconds=1.0
+    )
+
+
+def test_the_kernels_of_the_cpu_pass_with_room_to_spare() -> None:
+    proof = prove(CpuRasterizer(), CPU)
+    assert proof.failures == []
+    assert {"image", "gradient of means", "splitting matrix", "footprint (pixels)", "loss"} <= proof.errors.keys()
+    assert proof.errors["bits of a second run"] == 0
+    assert all(error < 1e-5 for error in proof.errors.values()), proof.errors
+
+
+def test_a_departure_names_the_quantity_and_the_place() -> None:
+    class Wrong(CpuRasterizer):
+        def render(self, *arguments, **options):  # type: ignore[no-untyped-def]
+            output = super().render(*arguments, **options)
+            change = torch.zeros_like(output.image)
+            change[2, 4] = 0.25
+            output.image = output.image + change
+            return output
+
+    failures = prove(Wrong(), CPU, (TINY,)).failures
+    assert "7x5-n20-sh3: image is off by up to 2.50e-01 at pixel (4, 2)" in failures
+    assert any("training step 1" in line for line in failures)
+
+
+def test_an_error_of_the_driver_is_a_failure_and_memory_that_is_full_is_not() -> None:
+    class Broken(ReferenceRasterizer):
+        error: Exception = RuntimeError("CUDA error: an illegal memory access\nmore")
+
+        def render(self, *arguments, **options):  # type: ignore[no-untyped-def]
+            raise self.error
+
+    assert prove(Broken(), CPU, (TINY,)).failures == ["RuntimeError: CUDA error: an illegal memory access"]
+    Broken.error = torch.OutOfMemoryError("full")
+    with pytest.raises(torch.OutOfMemoryError):
+        prove(Broken(), CPU, (TINY,))
+
+
+def test_bits_that_differ_between_runs_are_caught_where_they_are_promised() -> None:
+    class Restless(CpuRasterizer):
+        count = 0
+
+        def render(self, *arguments, **options):  # type: ignore[no-untyped-def]
+            output = super().render(*arguments, **options)
+            Restless.count += 1
+            output.image = output.image * (1 + 1e-6 * (Restless.count % 3))
+            return output
+
+    (line,) = [line for line in prove(Restless(), CPU, (TINY,)).failures if "second run" in line]
+    assert "image" in line
+
+
+# ---- once for what it depends on
+
+
+def test_a_proof_is_kept_and_made_again_for_another_version(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[str] = []
+    monkeypatch.setattr(module, "prove_apart", lambda raster, device: made.append(raster) or passing(raster))
+    assert known_proof("cpu", CPU) is None
+    for _ in range(2):
+        assert proof_of("cpu", CPU).passed
+    assert made == ["cpu"]
+    assert proof_of("cpu", CPU, again=True).passed
+    assert len(made) == 2
+    for name in ("driver", "torch", "triton", "kernels"):
+        versions = module.versions_on(CPU) | {name: "another"}
+        monkeypatch.setattr(module, "versions_on", lambda device, versions=versions: versions)
+        proof_of("cpu", CPU)
+    assert len(made) == 6
+    assert len(list(cache.glob("cpu-*.json"))) == 5
+
+
+@pytest.mark.parametrize("source", ["raster/triton/composite.py", "raster/staged.py", "train/loss_triton.py"])
+def test_a_change_of_the_kernels_calls_for_a_new_proof(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, source: str
+) -> None:
+    before = module.versions_on(CPU)
+    package = tmp_path / "gsbench"
+    shutil.copytree(module.PACKAGE, package, ignore=shutil.ignore_patterns("__pycache__"))
+    monkeypatch.setattr(module, "PACKAGE", package)
+    assert module.versions_on(CPU) == before
+    with (package / source).open("a") as stream:
+        stream.write("# changed\n")
+    changed = module.versions_on(CPU)
+    assert {name for name in before if before[name] != changed[name]} == {"kernels"}
+
+
+def test_a_failed_proof_is_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    results = [passing("cpu", failures=("image is off",)), passing("cpu")]
+    monkeypatch.setattr(module, "prove_apart", lambda *_: results.pop(0))
+    assert not proof_of("cpu", CPU).passed
+    assert known_proof("cpu", CPU).failures == ["image is off"]
+    assert proof_of("cpu", CPU).passed
+
+
+def test_a_cache_that_cannot_be_written_proves_each_time_and_says_so(
+    cache: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    made: list[str] = []
+    monkeypatch.setattr(module, "prove_apart", lambda raster, device: made.append(raster) or passing(raster))
+    cache.parent.mkdir(parents=True)
+    cache.write_text("a file where the folder should be")
+    for _ in range(2):
+        assert proof_of("cpu", CPU).passed
+    assert len(made) == 2
+    assert "each process repeats it" in caplog.text
+    cache.unlink()
+    cache.mkdir()
+    cache.chmod(stat.S_IRUSR | stat.S_IXUSR)
+    assert proof_of("cpu", CPU).passed
+    assert len(made) == 3
+
+
+def test_a_crash_of_the_process_is_a_failure(monkeypatch: pytest.MonkeyPatch) -> None:
+    def crash(*_: object, **__: object) -> None:
+        raise CrashError("the proof of raster=cpu crashed (SIGSEGV); its last lines: none")
+
+    monkeypatch.setattr(module, "run_isolated", crash)
+    assert "SIGSEGV" in proof_of("cpu", CPU).failures[0]
+
+
+@pytest.mark.slow
+def test_two_processes_prove_once(tmp_path: Path) -> None:
+    code = "import torch; from gsbench.train.proof import proof_of; assert proof_of('cpu', torch.device('cpu')).passed"
+    environment = os.environ | {"XDG_CACHE_HOME": str(tmp_path / "cache")}
+    script = f"import logging; logging.basicConfig(level=logging.INFO)\n{code}"
+
+    def process(_: int) -> str:
+        done = subprocess.run(
+            [sys.executable, "-c", script], env=environment, capture_output=True, text=True, timeout=600, check=True
+        )
+        return done.stderr
+
+    with ThreadPoolExecutor(2) as pool:
+        logs = list(pool.map(process, range(2)))
+    assert sorted("comparing it with the reference" in text for text in logs) == [False, True]
+
+
+# ---- which executor is taken
+
+
+@pytest.fixture
+def gpu(monkeypatch: pytest.MonkeyPatch) -> dict[str, list[str]]:
+    """A GPU on which all executors seem to be installed. The dictionary maps executors to their failures."""
+    failures: dict[str, list[str]] = {}
+    monkeypatch.setattr(type(EXECUTORS[0]), "is_installed", property(lambda self: True))
+    monkeypatch.setattr(module, "create_rasterizer", lambda name, *_: name)
+    monkeypatch.setattr(module, "_device_name", lambda device: "a GPU")
+    monkeypatch.setattr(module, "prove_apart", lambda raster, _: passing(raster, tuple(failures.get(raster, []))))
+    return failures
+
+
+@pytest.mark.parametrize(
+    ("failing", "taken"),
+    [([], "triton"), (["triton"], "gsplat"), (["triton", "gsplat"], "reference"), (["gsplat"], "triton")],
+)
+def test_auto_takes_the_next_that_passes(gpu: dict[str, list[str]], failing: list[str], taken: str, caplog) -> None:
+    gpu |= {name: ["33x49-n50-sh3: image is off by up to 3.00e-01 at pixel (4, 2)", "alpha"] for name in failing}
+    chosen = create_proven("auto", torch.device("cuda"))
+    assert chosen.rasterizer == taken
+    assert chosen.proof.raster == taken
+    over = failing[: len(chosen.passed_over)]
+    assert [line.split()[0] for line in chosen.passed_over] == [f"raster={name}" for name in over]
+    for line in chosen.passed_over:
+        assert "image is off by up to 3.00e-01 at pixel (4, 2) (and 1 more); torch 2; please report it with " in line
+        assert json.loads(Path(line.split()[-1]).read_text())["failures"] == gpu["triton"]
+        assert line in caplog.text
+
+
+def test_a_named_executor_that_fails_is_an_error(gpu: dict[str, list[str]]) -> None:
+    gpu["triton"] = ["alpha is off"]
+    with pytest.raises(InputError, match=r"raster=triton is not used: it departs .* alpha is off.*device=cpu trains"):
+        create_proven("triton", torch.device("cuda"))
+    gpu |= {name: ["alpha is off"] for name in ("gsplat", "reference")}
+    with pytest.raises(InputError, match=r"raster=triton .*raster=gsplat .*raster=reference "):
+        create_proven("auto", torch.device("cuda"))
+
+
+def test_nothing_is_proven_on_a_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "prove_apart", None)
+    chosen = create_proven("auto", CPU)
+    assert (chosen.rasterizer.name, chosen.proof, chosen.passed_over) == ("cpu", None, ())
+
+
+def test_doctor_proves_on_request_and_shows_what_is_known(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    made = {"cpu": passing("cpu")}
+    monkeypatch.setattr(module, "prove_apart", lambda raster, device: made[raster])
+    assert run(["doctor", "--prove", "--raster", "cpu", "--device", "cpu", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert (told["raster"], told["passed"], told["seconds"]) == ("cpu", True, 1.0)
+    made["cpu"] = passing("cpu", ("image is off",))
+    assert run(["doctor", "--prove", "--raster", "cpu", "--device", "cpu"]) == 1
+    assert f"image is off\ntorch 2; please report it with {stamp_of('cpu', CPU)}" in capsys.readouterr().out
+    assert run(["doctor"]) == 1
+    assert "bad   proof        raster=cpu departs from the reference on a GPU" in capsys.readouterr().out
+    assert run(["doctor", "--json"]) == 2
+
+
+# ---- faults in the kernels, each planted in a copy of gsbench that Triton's interpreter runs
+
+COMPOSITE, PROJECTION, GEOMETRY = (f"raster/triton/{name}.py" for name in ("composite", "projection", "geometry"))
+FAULTS = {
+    "none": ("raster/triton/layout.py", "SEGMENT = tl.constexpr(256)", "SEGMENT = tl.constexpr(8)"),
+    "a sign": (COMPOSITE, "tl.fma(light, shine, -behind)", "tl.fma(light, shine, behind)"),
+    "a missing term of the light behind": (COMPOSITE, "behind = tl.fma(weight, shine, behind)", "pass"),
+    "no state at the border of a segment": (COMPOSITE, "light = tl.load(border + TRANSMITTANCE)", "pass"),
+    "a segment from the wrong entry": (COMPOSITE, "tl.cdiv(least - begin, SEGMENT)", "((least - begin) // SEGMENT)"),
+    "swapped channels": (COMPOSITE, "tl.fma(weight, record[7], green)", "tl.fma(weight, record[8], green)"),
+    "a footprint of one pixel too many": (
+        COMPOSITE, "blended = (power >= LOG2_ALPHA_MIN) & (position < seen)", "blended = power >= LOG2_ALPHA_MIN"),
+    "stale rows": (PROJECTION, "written = first + k <= tl.load(", "written = -1 <= tl.load("),
+    "a missing term of the position's gradient": (PROJECTION, "view_z = -(through_focal * inverse_z + ", "view_z = -("),
+    "a sign of the quaternion's gradient": (PROJECTION, "qz * w_x - qx * w_z", "qz * w_x + qx * w_z"),
+    "a missing term of the splitting matrix": (PROJECTION, "q11 - e * h", "q11"),
+    "a factor in harmonics of degree 3": (GEOMETRY, "8 * T2 * yz", "4 * T2 * yz"),
+    "a swapped axis": (GEOMETRY, "offset[0] * v.r10 + offset[1] * v.r11", "offset[0] * v.r11 + offset[1] * v.r10"),
+    "a weight of the loss": ("train/loss_triton.py", "(W0, W1, W2, W3, W4, W5)[k]", "(W0, W1, W2, W3, W5, W4)[k]"),
+}  # fmt: skip
+# Small, for the interpreter: two rows of blocks, lists of several segments, harmonics of all degrees, stopped pixels.
+SCENE = "Case(18, 17, 40, sh_degree=3, log_scale=-1.0, logit=2.0, spread=0.4)"
+PROVE = f"""
+import json, torch
+import tests.raster.conftest  # makes the interpreter faster
+from gsbench.raster.contract import Case
+from gsbench.raster.triton.executor import TritonRasterizer
+from gsbench.train.loss_triton import TritonLoss
+from gsbench.train.proof import prove
+print(json.dumps(prove(TritonRasterizer(), torch.device("cpu"), ({SCENE},), TritonLoss(0.2)).failures))
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_planted_fault_is_caught(tmp_path: Path, fault: str) -> None:
+    triton = pytest.importorskip("triton")
+    if reason := interpreter_fault(triton.__version__, np.__version__):
+        pytest.skip(reason)
+    package = tmp_path / "gsbench"
+    shutil.copytree(Path(gsbench.__file__).parent, package, ignore=shutil.ignore_patterns("__pycache__"))
+    for source, sound, faulty in {FAULTS["none"], FAULTS[fault]}:
+        text = (package / source).read_text()
+        assert text.count(sound) == 1
+        (package / source).write_text(text.replace(sound, faulty))
+    environment = os.environ | {
+        "TRITON_INTERPRET": "1",
+        "OMP_NUM_THREADS": "1",
+        "PYTHONPATH": os.pathsep.join([str(tmp_path), str(ROOT)]),
+        "XDG_CACHE_HOME": str(tmp_path / "cache"),
+    }
+    words = [sys.executable, "-c", PROVE]
+    done = subprocess.run(
+        words, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=900, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    failures = json.loads(done.stdout.splitlines()[-1])
+    assert bool(failures) == (fault != "none"), failures
