@@ -25,6 +25,7 @@ from gsbench.raster.reference import ReferenceRasterizer
 from gsbench.runs.trial_record import RasterProof
 from gsbench.system.isolate import CrashError
 from gsbench.train import proof as module
+from gsbench.train.loss import torch_photometric_loss
 from gsbench.train.proof import create_proven, known_proof, proof_of, prove, stamp_of
 from tests.conftest import ROOT
 from tests.raster.conftest import interpreter_fault
@@ -64,7 +65,12 @@ def test_a_departure_names_the_quantity_and_the_place() -> None:
 
     failures = prove(Wrong(), CPU, (TINY,)).failures
     assert "7x5-n20-sh3: image is off by up to 2.50e-01 at pixel (4, 2)" in failures
-    assert any("training step 1" in line for line in failures)
+    assert all(line.startswith("7x5-n20-sh3: ") for line in failures)
+
+
+def test_a_fault_of_the_loss_is_seen_in_the_training_steps() -> None:
+    proof = prove(CpuRasterizer(), CPU, (TINY,), lambda image, target: torch_photometric_loss(image, target, 0.21))
+    assert "7x5-n20-sh3: loss is off by up to" in proof.failures[0]
 
 
 def test_an_error_of_the_driver_is_a_failure_and_memory_that_is_full_is_not() -> None:

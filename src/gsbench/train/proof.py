@@ -70,11 +70,19 @@ def prove(
         scenes = tuple(dataclasses.replace(case, logit=-4.0) for case in scenes)
     failures: list[str] = []
     largest: dict[str, float] = {}
+    parts = [
+        _render_errors(rasterizer, device, scenes, executor),
+        _repeat_errors(rasterizer, device, scenes) if executor.same_bits else (),
+        _training_errors(rasterizer, device, scenes[0], loss or PhotometricLoss()),
+    ]
     try:
-        for error in _errors(rasterizer, device, scenes, executor, loss or PhotometricLoss()):
-            largest[error.quantity] = max(error.off, largest.get(error.quantity, 0.0))
-            if error.is_departure:
-                failures.append(str(error))
+        for errors in parts:
+            for error in errors:
+                largest[error.quantity] = max(error.off, largest.get(error.quantity, 0.0))
+                if error.is_departure:
+                    failures.append(str(error))
+            if failures:  # what follows would say no more
+                break
     except (torch.OutOfMemoryError, InputError):
         raise
     except Exception as error:  # noqa: BLE001 - whatever a compiler or a driver raises is the result of the proof
@@ -89,20 +97,21 @@ def prove(
     )
 
 
-def _errors(
-    rasterizer: Rasterizer, device: torch.device, scenes: tuple[Case, ...], executor: Executor, loss: Loss
+def _render_errors(
+    rasterizer: Rasterizer, device: torch.device, scenes: tuple[Case, ...], executor: Executor
 ) -> Iterator[Error]:
-    place = str(device)
-    first = [_bits(rasterizer, case, place) for case in scenes] if executor.same_bits else []
     for case in scenes:
-        errors = measure(rasterizer, case, place)
+        errors = measure(rasterizer, case, str(device))
         yield from errors if executor.keeps_contract else [e for e in errors if e.quantity != "radius"]
-    # Again after other scenes, so that memory which was used before is seen.
-    for case, bits in zip(scenes, first, strict=False):
-        again = _bits(rasterizer, case, place)
+
+
+def _repeat_errors(rasterizer: Rasterizer, device: torch.device, scenes: tuple[Case, ...]) -> Iterator[Error]:
+    first = [_bits(rasterizer, case, str(device)) for case in scenes]
+    # Again after the other scenes, so that memory which was used before is seen.
+    for case, bits in zip(scenes, first, strict=True):
+        again = _bits(rasterizer, case, str(device))
         unequal = [name for name in bits if bits[name] != again[name]]
         yield Error(str(case), "bits of a second run", float(len(unequal)), 0.5, ", ".join(unequal), " tensors")
-    yield from _training_errors(rasterizer, device, scenes[0], loss)
 
 
 def _bits(rasterizer: Rasterizer, case: Case, device: str) -> dict[str, bytes]:
