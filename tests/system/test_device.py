@@ -39,8 +39,7 @@ def rounding() -> Iterator[None]:
 def test_a_device_is_chosen_or_refused(
     rounding: None, name: str, gpus: int, answer: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: gpus > 0)
-    monkeypatch.setattr(torch.cuda, "device_count", lambda: gpus)
+    pretend(monkeypatch, gpus)
     if " " in answer:
         with pytest.raises(InputError, match=f"device={name}.*{answer}"):
             select_device(name)
@@ -56,11 +55,28 @@ def test_what_torch_has_reserved_and_does_not_use_is_free(monkeypatch: pytest.Mo
     assert free_bytes(torch.device("cpu")) is None
 
 
-def test_no_gpu_rounds_float32_to_tf32(rounding: None, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("name", ["auto", "cuda", "cuda:1"])
+def test_no_gpu_rounds_float32_to_tf32(rounding: None, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     select_device("cpu")
     assert torch.backends.cudnn.allow_tf32
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
-    assert select_device("cuda:1") == torch.device("cuda:1")
+    pretend(monkeypatch, 2)
+    assert select_device(name).type == "cuda"
     assert not torch.backends.cudnn.allow_tf32
     assert not torch.backends.cuda.matmul.allow_tf32
+
+
+def test_a_gpu_that_another_program_holds_is_named(rounding: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    def held(device: torch.device) -> None:
+        raise RuntimeError("CUDA error: all CUDA-capable devices are busy or unavailable\nCUDA kernel errors might ...")
+
+    pretend(monkeypatch, 1)
+    monkeypatch.setattr(torch.cuda, "mem_get_info", held)
+    with pytest.raises(InputError, match=r"device=auto: CUDA error: .* unavailable; does another program hold"):
+        select_device("auto")
+
+
+def pretend(monkeypatch: pytest.MonkeyPatch, gpus: int) -> None:
+    """Let torch seem to find so many GPUs."""
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: gpus > 0)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: gpus)
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (1, 2))

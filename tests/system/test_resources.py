@@ -47,3 +47,4 @@ def test_trials_at_once_suit_cores_memory_and_gpus(
     monkeypatch.setattr("gsbench.system.resources.installed_gpus", lambda: ["0"] * gpus)
     monkeypatch.setattr("psutil.virtual_memory", lambda: SimpleNamespace(total=gigabytes * 10**9))
     assert trials_at_once.__wrapped__(most, "auto") == expected
+    assert trials_at_once.__wrapped__(most, "cuda:1") == 1  # all trials are on that GPU

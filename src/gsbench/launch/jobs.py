@@ -36,7 +36,7 @@ from gsbench.runs.trial_record import TrialRecord
 from gsbench.system.isolate import error_tail
 from gsbench.system.locks import BusyError, hold
 from gsbench.system.own_modules import adopt_modules, allowed_modules
-from gsbench.system.resources import assign_gpu, assign_threads, take_slot
+from gsbench.system.resources import assign_gpu, assign_threads, names_one_gpu, take_slot
 from gsbench.system.stopping import SIGNALS, SIGNALS_WITHOUT_INTERRUPT, Stopped, interrupts_ignored, stop_on_signals
 from gsbench.tracking import Mirror
 from gsbench.words import counted
@@ -143,7 +143,8 @@ class TrialJob:
             ):
                 if launch["name"] == "local":
                     slot = stack.enter_context(take_slot(TrialFolder.of(self.values).runs, launch["parallel"]))
-                    assign_gpu(slot, self.visible_gpus)
+                    if not names_one_gpu(self.values["device"]):  # else its number counts the GPUs of the parent
+                        assign_gpu(slot, self.visible_gpus)
                 assign_threads(self.values["threads"], launch["parallel"])
                 # With launch=local, the sweep's own process mirrors all of its trials.
                 mirror = stack.enter_context(Mirror(idle=launch["name"] == "local"))

@@ -146,6 +146,11 @@ def _recorded_failures(values: dict[str, Any], folder: TrialFolder) -> Iterator[
             except SystemExit as ended:
                 text = f"code of the trial ended the process (exit code {ended.code}) instead of returning"
                 raise TrainingError(text) from ended
+            except torch.OutOfMemoryError as error:
+                raise TrainingError(
+                    f"the memory of device={values['device']} is full: lower scene.max_size or the number of trials at "
+                    "once (launch.parallel), or end other programs on that device"
+                ) from error
     except Exception as error:
         log.debug("the trial failed", exc_info=True)
         kind = type(error).__name__

@@ -8,12 +8,12 @@ from gsbench.errors import InputError
 def select_device(name: str, setting: str = "device") -> torch.device:
     """Return the device called ``name``; ``auto`` is the GPU if torch can use one, else the CPU.
 
-    Raises InputError, which names the ``setting``, for a device that is not there.
+    On a GPU, float32 is then not rounded to TF32 (`disable_tf32`). Raises InputError, which names the ``setting``, for
+    a device that is not there or that another program holds.
     """
-    if name == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    available = "cuda" if torch.cuda.is_available() else "cpu"
     try:
-        device = torch.device(name)
+        device = torch.device(available if name == "auto" else name)
     except RuntimeError as error:
         raise InputError(f"{setting}={name} is not known to torch; use auto, cpu, cuda or cuda:1") from error
     if device.type == "cuda" and not torch.cuda.is_available():
@@ -24,6 +24,13 @@ def select_device(name: str, setting: str = "device") -> torch.device:
         raise InputError(f"{setting}={name}: there are {torch.cuda.device_count()} CUDA devices, numbered from 0")
     if device.type == "cuda":
         disable_tf32()
+        try:
+            torch.cuda.mem_get_info(device)
+        except RuntimeError as error:
+            reason = str(error).partition("\n")[0]
+            raise InputError(
+                f"{setting}={name}: {reason}; does another program hold the GPU (see nvidia-smi)?"
+            ) from error
     return device
 
 

@@ -54,6 +54,8 @@ def available_threads(parallel: int = 1) -> int:
 @cache
 def trials_at_once(max_gaussians: int | None, device: str) -> int:
     """A good number of trials at once: the number of GPUs, if they train, else by cores and memory."""
+    if names_one_gpu(device):
+        return 1
     if device != "cpu" and (gpus := installed_gpus()):
         return len(gpus)
     cores = available_cores()
@@ -86,6 +88,11 @@ def assign_gpu(slot: int, visible: str | None) -> None:
         os.environ["CUDA_VISIBLE_DEVICES"] = gpus[slot % len(gpus)]
     elif visible is None:
         os.environ.pop("CUDA_VISIBLE_DEVICES", None)  # submitit has set it to an empty value
+
+
+def names_one_gpu(device: str) -> bool:
+    """Whether the setting ``device`` names a GPU by its number, such as cuda:1, which all trials then use."""
+    return device.startswith("cuda:")
 
 
 def installed_gpus() -> list[str]:
