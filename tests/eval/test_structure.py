@@ -188,7 +188,7 @@ def test_views_that_are_flat_in_part_are_measured() -> None:
 
 def test_metrics_that_are_not_asked_for_leave_no_trace() -> None:
     evaluator, image = Evaluator(PAPER, lpips=[], flip=False), np.zeros((9, 9, 3), np.uint8)
-    assert further_keys() == tuple(FUNCTIONS)
+    assert set(FUNCTIONS) < set(further_keys())
     assert not {*evaluator.unavailable, *evaluator.evaluate_view(image, image)} & {*further_keys()}
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import stat
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -154,11 +153,6 @@ def test_a_cache_that_cannot_be_written_proves_each_time_and_says_so(
         assert proof_of("cpu", CPU).passed
     assert len(made) == 2
     assert "each process repeats it" in caplog.text
-    cache.unlink()
-    cache.mkdir()
-    cache.chmod(stat.S_IRUSR | stat.S_IXUSR)
-    assert proof_of("cpu", CPU).passed
-    assert len(made) == 3
 
 
 def test_a_crash_of_the_process_is_a_failure(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -269,7 +263,7 @@ FAULTS = {
     "a weight of the loss": ("train/loss_triton.py", "(W0, W1, W2, W3, W4, W5)[k]", "(W0, W1, W2, W3, W5, W4)[k]"),
 }  # fmt: skip
 # Small, for the interpreter: two rows of blocks, lists of several segments, harmonics of all degrees, stopped pixels.
-SCENE = "Case(18, 17, 40, sh_degree=3, log_scale=-1.0, logit=2.0, spread=0.4)"
+SCENE = "Case(18, 17, 40, sh_degree=3, log_scale=-1.0, logit=-1.0, spread=0.4)"
 PROVE = f"""
 import json, torch
 import tests.raster.conftest  # makes the interpreter faster

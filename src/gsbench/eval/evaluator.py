@@ -18,7 +18,8 @@ from torch import Tensor
 
 from gsbench.errors import InputError, TrainingError
 from gsbench.eval import metrics, structure
-from gsbench.eval.facts import LPIPS, METRICS, MORE, facts_of, further_keys, lpips_variants
+from gsbench.eval.color_correction import Corrected
+from gsbench.eval.facts import CORRECTED, LPIPS, METRICS, MORE, facts_of, further_keys, lpips_variants
 from gsbench.eval.images import as_unit_range, in_double_precision, replace_ignored
 from gsbench.eval.lpips import Lpips, load_lpips
 from gsbench.eval.metric import MaskedMetric, Metric, UnavailableError
@@ -131,6 +132,11 @@ def _require_size(image: Tensor, min_side: int) -> None:
         raise UnavailableError(f"a view is {width}x{height} px, below {min_side} px a side")
 
 
+def _corrected(key: str) -> Callable[[MetricContext], Metric]:
+    """The metric ``key`` after a correction of the colours."""
+    return lambda context: Corrected(MEASURES[key](context))
+
+
 # Each metric of `gsbench.eval.facts.METRICS` for a context. Raises UnavailableError if weights or packages are missing.
 MEASURES: dict[str, Callable[[MetricContext], Metric]] = {
     "psnr": Psnr,
@@ -145,6 +151,10 @@ MEASURES: dict[str, Callable[[MetricContext], Metric]] = {
     "fsim": lambda _: StructuralMetric(structure.fsim, structure.FSIM_MIN_SIZE),
     "gmsd": lambda _: StructuralMetric(metrics.gmsd, metrics.GMSD_MIN_SIZE),
 }
+
+
+MEASURES |= {f"{key}{CORRECTED}": _corrected(key) for key in list(MEASURES) if f"{key}{CORRECTED}" in further_keys()}
+MEASURES["cc_gain"] = lambda context: Corrected(Psnr(context), gain=True)
 
 
 class Evaluator:

@@ -3,7 +3,7 @@
 A metric of your own needs no entry here: ``eval.extra.NAME._target_=mine.MyMetric`` (docs/metric.md).
 """
 
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Annotated, Literal
 
 from annotated_types import Interval, Predicate
@@ -48,7 +48,16 @@ def _structural(key: str, label: str, direction: Literal[-1, 1], highest: float,
     return MetricFacts(key, label, direction, 4, "", 0.002, MORE, 0.0, highest, words)
 
 
-METRICS = (  # `gsbench.eval.evaluator.MEASURES` has the class of each
+CORRECTED = "_cc"  # ends the key of a metric that is measured after an affine correction of the colours
+
+
+def _corrected(facts: MetricFacts) -> MetricFacts:
+    """``facts`` of the same metric after the correction, computed if ``eval.more`` names it."""
+    key, label = f"{facts.key}{CORRECTED}", f"{facts.label} cc"
+    return replace(facts, key=key, label=label, setting=MORE, words=f"{facts.label} after a correction of the colours")
+
+
+_PLAIN = (  # `gsbench.eval.evaluator.MEASURES` has the class of each
     MetricFacts("psnr", "PSNR", 1, 2, "dB", 0.1, lowest=0.0, words="mean squared error, logarithmic"),
     MetricFacts("ssim", "SSIM", 1, 3, "", 0.005, "", -1.0, 1.0, "means, contrast and structure in windows of 11 px"),
     _lpips("vgg_raw", "LPIPS VGG raw", "distance of what vgg sees, fed [0, 1]"),
@@ -63,6 +72,13 @@ METRICS = (  # `gsbench.eval.evaluator.MEASURES` has the class of each
     _structural("fsim", "FSIMc", 1, 1.0, "edges and lines: phase congruency, contrast and colour there"),
     _structural("gmsd", "GMSD", -1, 0.5, "how unevenly the gradients agree"),
 )
+_CORRECTED = tuple(
+    _corrected(facts) for facts in _PLAIN if facts.key in ("psnr", "ssim") or facts.key.startswith(LPIPS)
+)
+GAIN = MetricFacts(
+    "cc_gain", "gain by cc", 0, 2, "dB", setting=MORE, words="what the correction of the colours adds to PSNR"
+)
+METRICS = (*_PLAIN, *_CORRECTED, GAIN)
 # A fact about the trained model instead of its pictures, measured separately in the evaluation.
 FPS = MetricFacts(
     "fps", "speed", 1, 2, "frames/s", None, "eval.fps", 0.0, words="renders of the test views at one size"
@@ -77,7 +93,7 @@ def known_keys() -> tuple[str, ...]:
 
 def lpips_variants() -> tuple[str, ...]:
     """The values allowed in ``eval.lpips``."""
-    return tuple(facts.key.removeprefix(LPIPS) for facts in METRICS if facts.key.startswith(LPIPS))
+    return tuple(facts.key.removeprefix(LPIPS) for facts in METRICS if facts.setting == "eval.lpips")
 
 
 def further_keys() -> tuple[str, ...]:

@@ -145,7 +145,7 @@ def _warn_of_activated(vertices: NDArray[Any], path: Path) -> None:
 
 
 def _look_like_lengths(vertices: NDArray[Any]) -> bool:
-    """Whether the stored scales are more plausible as lengths than as logarithms of lengths.
+    """Return whether the stored scales are more plausible as lengths than as logarithms of lengths.
 
     Both can be positive everywhere: the logarithms are in a scene that is measured in millimetres.
     """

@@ -201,7 +201,7 @@ class TrialRecord(Record):
 
     @property
     def remark(self) -> str:
-        """What a state in one line must say of a finished trial; "" if nothing."""
+        """A line for the state of a finished trial: why its results may surprise; "" if they do not."""
         return "; ".join(filter(None, [self.learnt_nothing, *self.raster_passed_over]))
 
     @property

@@ -91,15 +91,20 @@ def assign_gpu(slot: int, visible: str | None) -> None:
 
 
 def names_one_gpu(device: str) -> bool:
-    """Whether the setting ``device`` names a GPU by its number, such as cuda:1, which all trials then use."""
+    """Return whether the setting ``device`` names a GPU by its number, such as cuda:1, which all trials then use."""
     return device.startswith("cuda:")
 
 
 def installed_gpus() -> list[str]:
     """The indices of the NVIDIA GPUs of this machine, from its driver."""
+    return nvidia_smi("index")
+
+
+def nvidia_smi(query: str) -> list[str]:
+    """The answers of ``nvidia-smi`` to ``--query-gpu=QUERY``, one for each GPU; [] without a driver."""
     try:
         listing = subprocess.run(
-            ["nvidia-smi", "--query-gpu=index", "--format=csv,noheader"],
+            ["nvidia-smi", f"--query-gpu={query}", "--format=csv,noheader"],
             capture_output=True,
             text=True,
             timeout=60,

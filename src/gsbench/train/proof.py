@@ -36,6 +36,7 @@ from gsbench.system.install import version_of
 from gsbench.system.isolate import CrashError, run_isolated
 from gsbench.system.locks import hold
 from gsbench.system.machine import cpu_name
+from gsbench.system.resources import nvidia_smi
 from gsbench.train.loss import Loss, PhotometricLoss, torch_photometric_loss
 
 log = logging.getLogger(__name__)
@@ -78,7 +79,7 @@ def prove(
     try:
         for errors in parts:
             for error in errors:
-                largest[error.quantity] = max(error.off, largest.get(error.quantity, 0.0))
+                largest[error.quantity] = max(largest.get(error.quantity, 0.0), error.off)
                 if error.is_departure:
                     failures.append(str(error))
             if failures:  # what follows would say no more
@@ -116,7 +117,9 @@ def _repeat_errors(rasterizer: Rasterizer, device: torch.device, scenes: tuple[C
 
 def _bits(rasterizer: Rasterizer, case: Case, device: str) -> dict[str, bytes]:
     output, gradients = render_with_gradients(rasterizer, case, torch.float32, device)
-    tensors = {"image": output.image, "alpha": output.alpha, **gradients}
+    tensors = {"image": output.image, "alpha": output.alpha, "radii": output.radii, **gradients}
+    if output.footprint is not None:
+        tensors |= {f"footprint ({name})": values for name, values in vars(output.footprint()).items()}
     return {name: tensor.detach().cpu().numpy().tobytes() for name, tensor in tensors.items()}
 
 
@@ -153,7 +156,7 @@ def _train(rasterizer: Rasterizer, case: Case, target: Tensor, loss: Loss) -> tu
 
 
 def versions_on(device: torch.device) -> dict[str, str]:
-    """What the kernels on ``device`` are made of and by: another value of any calls for a new proof."""
+    """Versions and digests of all that makes the kernels on ``device``: a change of any calls for a new proof."""
     digest = hashlib.sha256()
     for source in SOURCES:
         root = PACKAGE / source
@@ -166,11 +169,11 @@ def versions_on(device: torch.device) -> dict[str, str]:
 
 
 def _driver() -> str:
-    """The version of NVIDIA's kernel module; "" where there is none."""
+    """The version of NVIDIA's driver; "" where there is none. In WSL only nvidia-smi knows it."""
     try:
         return Path("/sys/module/nvidia/version").read_text(encoding="utf-8").strip()
     except OSError:
-        return ""
+        return next(iter(nvidia_smi("driver_version")), "") if torch.cuda.is_available() else ""
 
 
 def _device_name(device: torch.device) -> str:
@@ -198,6 +201,10 @@ def prove_apart(raster: str, device: str) -> RasterProof:
     """`prove` the executor called ``raster`` in a process of its own, where a fault cannot take this one along."""
     try:
         return run_isolated(_prove_by_name, raster, device, what=f"the proof of raster={raster}")
+    except torch.OutOfMemoryError as error:
+        raise InputError(
+            f"device={device} has no memory left to compare raster={raster} with the reference: end other programs there"
+        ) from error
     except CrashError as error:
         place = torch.device(device)
         versions = versions_on(place)

@@ -1,0 +1,85 @@
+"""The correction of colours before metrics, against numpy's least squares and maps that are known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from gsbench.eval.color_correction import color_corrected
+from gsbench.eval.evaluator import Evaluator
+from gsbench.eval.protocol import PAPER, STANDARD
+
+RANDOM = np.random.default_rng(0)
+TRUTH = RANDOM.uniform(0.2, 0.8, (24, 30, 3))
+MATRIX = np.array([[0.8, 0.1, 0.0], [0.05, 0.7, 0.1], [-0.1, 0.0, 0.9]])
+OFFSET = np.array([0.02, 0.05, 0.1])
+
+
+def corrected(image: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None) -> np.ndarray:
+    counted = None if mask is None else torch.from_numpy(mask)
+    return color_corrected(torch.from_numpy(image), torch.from_numpy(truth), counted).numpy()
+
+
+def by_numpy(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """The definition with numpy's solver, one pixel set a channel."""
+    found, goal = image.reshape(-1, 3), truth.reshape(-1, 3)
+    low, high = 0.5 / 255, 1 - 0.5 / 255
+    for _ in range(5):
+        inside = ((found > low) & (found < high)).all(axis=1)
+        columns = []
+        for channel in range(3):
+            used = inside & (goal[:, channel] > low) & (goal[:, channel] < high)
+            matrix = np.column_stack([found, np.ones(len(found))])
+            row, *_ = np.linalg.lstsq(matrix[used], goal[used, channel], rcond=None)
+            columns.append(matrix @ row)
+        found = np.clip(np.column_stack(columns), 0, 1)
+    return found.reshape(image.shape)
+
+
+def test_an_affine_change_of_colours_is_undone() -> None:
+    changed = TRUTH @ MATRIX.T + OFFSET
+    np.testing.assert_allclose(corrected(changed, TRUTH), TRUTH, atol=1e-9)
+
+
+def test_it_is_numpys_least_squares_where_pixels_are_clipped() -> None:
+    truth = RANDOM.uniform(0, 1, (24, 30, 3))
+    truth[:3] = 1.0
+    noisy = np.clip(1.6 * truth @ MATRIX.T + RANDOM.normal(0, 0.05, truth.shape), 0, 1)
+    result = corrected(noisy, truth)
+    np.testing.assert_allclose(result, by_numpy(noisy, truth), atol=1e-9)
+    assert np.abs(result - truth)[3:].mean() < 0.5 * np.abs(noisy - truth)[3:].mean()
+
+
+def test_pixels_that_a_mask_ignores_do_not_count() -> None:
+    changed = TRUTH @ MATRIX.T + OFFSET
+    mask = np.ones(TRUTH.shape[:2], dtype=bool)
+    mask[:8] = False
+    changed[:8] = 0.5
+    np.testing.assert_allclose(corrected(changed, TRUTH, mask)[8:], TRUTH[8:], atol=1e-9)
+
+
+@pytest.mark.parametrize("value", [0.0, 0.5, 1.0])
+def test_a_render_of_one_colour_is_finite(value: float) -> None:
+    result = corrected(np.full_like(TRUTH, value), TRUTH)
+    assert np.isfinite(result).all()
+    if value == 0.5:  # the best of one colour is the mean
+        np.testing.assert_allclose(result, np.broadcast_to(TRUTH.mean(axis=(0, 1)), TRUTH.shape), atol=1e-9)
+    else:  # all pixels are clipped: nothing is known
+        np.testing.assert_array_equal(result, value)
+
+
+@pytest.mark.parametrize("protocol", [PAPER, STANDARD])
+def test_the_metrics_are_those_of_the_corrected_render(protocol) -> None:
+    more = ["psnr_cc", "ssim_cc", "cc_gain"]
+    evaluator = Evaluator(protocol, lpips=[], flip=False, more=more)
+    darker = (TRUTH * 0.6 * 255 + 0.5).astype(np.uint8)
+    photograph = (TRUTH * 255 + 0.5).astype(np.uint8)
+    values = evaluator.evaluate_view(darker, photograph)
+    again = evaluator.evaluate_view(torch.from_numpy(by_numpy(darker / 255, photograph / 255)), photograph)
+    assert values["psnr_cc"] > values["psnr"] + 20
+    assert values["cc_gain"] == pytest.approx(values["psnr_cc"] - values["psnr"])
+    assert values["psnr_cc"] == pytest.approx(again["psnr"], abs=2.5)  # `again` is rounded to 8 bits, as a render is
+    assert values["ssim_cc"] == pytest.approx(again["ssim"], abs=1e-3)
+    same = evaluator.evaluate_view(photograph, photograph)
+    assert (same["psnr_cc"], same["cc_gain"]) == (100.0, 0.0)
