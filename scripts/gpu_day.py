@@ -1,186 +1,261 @@
-"""The Python parts of gpu_day.sh: the machine's facts, whether renders are equal bit by bit, the table of results."""
+"""The Python part of gpu_day.sh: what is carried along, the plan of the parts, the runner, and the tables.
+
+Parts run in rows: those of a row side by side, the rows one after the other. A row has an absolute end, so a part that
+hangs takes time from no later row, and a part that ends early gives its time to them. Until packages are unpacked,
+only the standard library is here.
+"""
 
 from __future__ import annotations
 
-import argparse
+import contextlib
+import io
 import json
+import lzma
+import os
+import shutil
+import signal
+import subprocess
 import sys
+import tarfile
+import time
+import zipfile
 from collections.abc import Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-NOTHING = "-"
-MODEL = "bench-model"
+PYTHON = os.environ["PYTHON"]
+BROUGHT, STATE, OUT = (Path(os.environ[k]) for k in ("GPU_DAY_BROUGHT", "GPU_DAY_STATE", "OUT"))
+RESULTS = STATE / "results"
+TINY = bool(os.environ.get("GPU_DAY_TINY"))
+PACKAGES = ["hydra-core", "omegaconf", "pydantic", "pydantic_core", "annotated-types", "typing-inspection"]
+PACKAGES += ["flip-evaluator", "plyfile", "pycolmap", "gsplat"]
+SOURCES = ["antlr4-python3-runtime"]  # packages without wheels
+UNUSED = ["gsplat/cuda/csrc/third_party/glm/doc", "gsplat/cuda/csrc/third_party/glm/test"]
+PLATFORMS = [f"manylinux{name}_x86_64" for name in ("_2_28", "_2_27", "_2_17", "2014", "1")]
+WEIGHTS = ["squeezenet1_1*.pth", "lpips_v0.1_squeeze.pth", "squeeze.pth"]
+SQUEEZED = [{"id": lzma.FILTER_X86}, {"id": lzma.FILTER_LZMA2, "preset": 6, "dict_size": 1 << 26}]
+ARMS = ("adc", "volumetric", "volumetric_once")
+COUNTS = ("3",) if TINY else ("100000", "1000000", "3000000")
+SIZE, SMALL = ("16x16", "16x16") if TINY else ("1600x1060", "48x32")
+DEVICE = "cpu" if TINY else "cuda"
+PEER = "cpu" if TINY else "gsplat"
+SECONDS = 540  # the plan's length
+GRACE = 8.0  # seconds from SIGTERM, at which a training writes its checkpoint, to SIGKILL
+PACK_EVERY = 20.0  # seconds
+MOST_KEPT = 2_000_000  # bytes of a file, its end
+KEPT = ("results.json", "failed.json", "log.txt", "metrics.jsonl", "events.jsonl", "per_view.csv")
 
 
-def machine() -> dict[str, str]:
-    """The GPU and the versions on which the measurements depend."""
-    from importlib.metadata import version
-
-    import torch
-    import triton
-
-    import gsbench
-
-    has_gpu = torch.cuda.is_available()
-    return {
-        "gpu": torch.cuda.get_device_name() if has_gpu else "none (Triton's interpreter)",
-        "cuda": str(torch.version.cuda),
-        "torch": torch.__version__,
-        "triton": triton.__version__,
-        "numpy": version("numpy"),
-        "python": sys.version.split()[0],
-        "gsbench": gsbench.__version__,
-    }
+@dataclass(frozen=True)
+class Part:
+    name: str
+    command: list[str]
+    needs: str | None = None  # the part that must have ended well
+    environment: dict[str, str] = field(default_factory=dict)
 
 
-def bits(device: str, width: int, height: int, count: int) -> list[str]:
-    """The names of outputs that differ among three runs of render, loss and gradients.
-
-    The runs are on new memory, on used memory, and by new objects with new memory pools.
-    """
-    import torch
-
-    from gsbench.bench.scenes import make_scene
-    from gsbench.raster.triton.executor import TritonRasterizer
-    from gsbench.train.loss_triton import TritonLoss
-
-    gaussians, scene = make_scene("skewed", width, height, count)
-    target = torch.from_numpy(scene.train[0].image).to(device)
-    background = torch.zeros(3, device=device)
-
-    def run(rasterizer: TritonRasterizer, loss: TritonLoss) -> dict[str, torch.Tensor]:
-        leaves = gaussians.map(lambda tensor: tensor.to(device).requires_grad_())
-        output = rasterizer.render(leaves, scene.train[0].camera, 3, background, absolute_gradient=True)
-        value = loss(output.image, target)[0]
-        value.backward()
-        outputs = {"image": output.image, "alpha": output.alpha, "radii": output.radii, "loss": value}
-        outputs |= {"screen": output.screen_points.grad, "absolute": output.screen_gradient_abs}
-        outputs |= {f"gradient of {name}": tensor.grad for name, tensor in leaves.tensors().items()}
-        return {name: tensor.detach().cpu() for name, tensor in outputs.items()}
-
-    rasterizer, loss = TritonRasterizer(), TritonLoss(0.2)
-    first = run(rasterizer, loss)
-    others = [run(rasterizer, loss), run(TritonRasterizer(), TritonLoss(0.2))]
-    if not first["gradient of means"].abs().max() > 0:
-        raise RuntimeError("nothing was seen: equal bits would say nothing")
-    return sorted({name for other in others for name, tensor in first.items() if not torch.equal(tensor, other[name])})
+@dataclass(frozen=True)
+class Row:
+    until: float  # seconds after the begin, in a plan of SECONDS
+    parts: list[Part]
+    alone: bool = False  # nothing else may run: the compilation pauses
 
 
-def table(results: Path) -> str:
-    """All results as Markdown."""
-    return "\n\n".join(part for part in (_head(results), _speed(results), _training(results)) if part)
+def gsbench(*words: str) -> list[str]:
+    return [PYTHON, "-m", "gsbench.cli", *words]
 
 
-def _head(results: Path) -> str:
-    facts = _read(results / "machine.out") or {}
-    lines = [f"Measured on: {', '.join(f'{name} {value}' for name, value in facts.items()) or 'unknown'}.", ""]
-    ends = _ends(results)
-    contract = _last_line(results / "contract.out")
-    lines += [f"- contract: {_end(ends, 'contract')}{f' ({contract})' if contract else ''}"]
-    lines += [f"- the same bits, three times: {_end(ends, 'bits')}{_differing(results)}"]
-    lines += [f"- memory checker: {_end(ends, 'memcheck')}"]
-    failed = [f"{name} ({code})" for name, code in ends.items() if code != "0"]
-    return "\n".join(lines + ([f"- **did not end well**: {', '.join(failed)}"] if failed else []))
+def own(*words: str) -> list[str]:
+    return [PYTHON, "scripts/gpu_day.py", *words]
 
 
-def _differing(results: Path) -> str:
-    differing = (_read(results / "bits.out") or {}).get("differing")
-    return f"; different: {', '.join(differing)}" if differing else ""
+def bench(name: str, raster: str, count: str, needs: str | None = None) -> Part:
+    words = ["--raster", raster, "--count", count, "--size", SIZE, "--kernels", "--json"]
+    words += ["--repeats", "1" if TINY else "10"]
+    return Part(f"bench-{name}", gsbench("bench", *words), needs)
 
 
-def _ends(results: Path) -> dict[str, str]:
-    """The exit code of each step's last run."""
-    file = results / "steps.tsv"
-    rows = [line.split("\t") for line in file.read_text().splitlines()] if file.is_file() else []
-    return {row[0]: row[1] for row in rows}
+def proof(raster: str, needs: str | None = None) -> Part:
+    return Part(f"proof-{raster}", gsbench("doctor", "--prove", "--raster", raster, "--json"), needs)
 
 
-def _end(ends: dict[str, str], name: str) -> str:
-    return {"0": "yes", None: "not tried"}.get(ends.get(name), f"NO (exit {ends.get(name)})")
+def training(arm: str, seed: int) -> Part:
+    words = ["scene=colmap", f"scene.path={STATE / 'brought/bonsai'}", "init=dataset", "train=paper"]
+    words += ["eval.at=[7000]", "eval.download=false"]
+    if TINY:
+        words = ["scene=courtyard", "scene.views=8", "scene.width=32", "scene.height=24"]
+        words += ["init=random", "init.count=6", "train=7k", "train.iterations=2", "eval.download=false"]
+    words += [f"densify={arm}", f"seed={seed}", "raster=triton", f"device={DEVICE}", "tracking=none"]
+    return Part(f"train-{arm}-{seed}", gsbench(f"name=gpu_day-{arm}-{seed}", *words))
 
 
-def _benches(results: Path) -> Iterator[tuple[str, list[dict[str, Any]]]]:
-    for file in sorted(results.glob("bench-*.out"), key=_order):
-        if rows := _read(file):
-            yield ("a trained bonsai" if file.stem == MODEL else rows[0]["scene"]), rows
+def sanitizer(tool: str) -> Part:
+    """Without caching, each tensor is its own allocation, so that overruns are seen."""
+    words = ["compute-sanitizer", "--tool", tool, "--error-exitcode", "9"]
+    paths = {"PATH": f"{os.environ['PATH']}:/usr/local/cuda/bin", "PYTORCH_NO_CUDA_MEMORY_CACHING": "1"}
+    return Part(tool, words + own("bits", DEVICE, SMALL, "100" if not TINY else "3", "1"), None, paths)
 
 
-def _order(file: Path) -> tuple[bool, str, int]:
-    scene, _, count = file.stem.removeprefix("bench-").rpartition("-")
-    return file.stem == MODEL, scene, int(count) if count.isdigit() else 0
+def plan(seed: int = 0) -> list[Row]:
+    """All parts, the most telling first; the trainings with ``seed``."""
+    tests = "triton and nothing_to_see" if TINY else "triton or on_a_gpu"
+    files = ["tests/raster/test_contract.py", "tests/raster/test_gsplat.py"]
+    pytest = [PYTHON, "-m", "pytest", "-q", "-p", "no:cacheprovider", *files, "-k", tests]
+    bits = own("bits", DEVICE, SIZE, COUNTS[0], "3")
+    return [
+        Row(25, [Part("install", own("unpack"))]),
+        Row(95, [Part("machine", own("machine")), proof("triton")]),
+        Row(155, [Part("contract", pytest), Part("bits", bits)]),
+        *(Row(180 + 30 * k, [bench(f"triton-{n}", "triton", n)], True) for k, n in enumerate(COUNTS)),
+        Row(450, [training(arm, seed) for arm in ARMS]),
+        Row(490, [bench(PEER, PEER, ",".join(COUNTS), COMPILATION)]),
+        Row(504, [proof(PEER, COMPILATION)]),
+        Row(SECONDS, [sanitizer("memcheck"), sanitizer("racecheck")]),
+    ]
 
 
-def _speed(results: Path) -> str:
-    columns = ("forward_ms", "loss_ms", "backward_ms", "adam_ms", "step_ms", "steps_per_second", "peak_memory_mb")
-    lines = []
-    for scene, rows in _benches(results):
-        for row in rows:
-            times = " | ".join(_number(row.get(column)) for column in columns)
-            ratio = f"{row['step_ratio']:.2f}"
-            lines.append(f"| {scene} | {row['count']:,} | {row['size']} | `{row['raster']}` | {times} | {ratio} |")
-    names = ("forward", "loss", "backward", "Adam", "step", "steps/s", "peak MiB")
-    header = "| scene | Gaussians | size | rasterizer | " + " | ".join(names) + " | of triton's step |"
-    return "\n".join([header, "|" + "---|" * (5 + len(names)), *lines]) if lines else ""
+def compilation() -> Part:
+    """The compilation of gsplat, on the idle cores from the installation on; in a trial run nothing is compiled."""
+    command = ["nice", "-n", "19", PYTHON, "-c", "from gsplat.cuda._backend import _C; assert _C"]
+    return Part(COMPILATION, [PYTHON, "-c", ""] if TINY else command, None, {"MAX_JOBS": "12"})
 
 
-def _training(results: Path) -> str:
-    lines = []
-    for file in sorted(results.glob("train-*.json")):
-        record = _read(file) or {}
-        metrics = record.get("metrics", {})
-        cells = (
-            f"`{record.get('raster', NOTHING)}`",
-            _number(record.get("iterations"), 0),
-            f"{record.get('num_gaussians', 0):,}",
-            _number(record.get("seconds", {}).get("train")),
-            _number(record.get("peak_memory_mb"), 0),
-            _number(metrics.get("psnr"), 2),
-            _number(metrics.get("ssim"), 4),
-        )
-        lines.append("| " + " | ".join(cells) + " |")
-    header = "| training | iterations | Gaussians | seconds | peak MiB | PSNR | SSIM |\n|---|---|---|---|---|---|---|"
-    return "\n".join([header, *lines]) if lines else ""
+class Runner:
+    """Runs rows of parts within ``seconds``; keeps what each part says and how it ends, in $OUT at once."""
+
+    def __init__(self, verb: str, seconds: float) -> None:
+        self.archive = OUT / f"gpu_day-{verb}.tar.gz"
+        self.begin, self.seconds, self.packed = time.monotonic(), seconds, 0.0
+        self.running: dict[str, tuple[subprocess.Popen[bytes], float]] = {}  # by name, with its begin
+        self.codes: dict[str, int | str] = {}  # an exit code, minus a signal, or why there is none
+        RESULTS.mkdir(parents=True, exist_ok=True)
+        OUT.mkdir(parents=True, exist_ok=True)
+
+    def now(self) -> float:
+        return time.monotonic() - self.begin
+
+    def start(self, part: Part) -> None:
+        if part.needs and self.codes.get(part.needs) != 0:
+            return self.record(part.name, f"{part.needs} is missing", 0.0)
+        environment = os.environ | part.environment
+        try:
+            with open(RESULTS / f"{part.name}.out", "wb") as output, open(RESULTS / f"{part.name}.log", "wb") as log:
+                process = subprocess.Popen(
+                    part.command, stdout=output, stderr=log, stdin=subprocess.DEVNULL, env=environment,
+                    start_new_session=True,
+                )
+        except OSError as error:
+            return self.record(part.name, f"not tried: {error}", 0.0)
+        self.running[part.name] = process, self.now()
+
+    def record(self, name: str, code: int | str, seconds: float) -> None:
+        self.codes[name] = code
+        with (RESULTS / "parts.jsonl").open("a") as file:
+            file.write(json.dumps({"part": name, "end": code, "seconds": round(seconds, 1)}) + "\n")
+        print(f"{self.now():4.0f} s  {name}: {code} after {seconds:.0f} s", flush=True)
+        for kind in ("log", "out") if code != 0 else ():
+            file = RESULTS / f"{name}.{kind}"
+            print("\n".join((file.read_text(errors="replace") if file.exists() else "").splitlines()[-8:]))
+        keep_training(name)
+        self.pack()
+
+    def wait(self, names: list[str], until: float) -> None:
+        """Wait for the parts; end those that are not done at ``until``."""
+        while left := [name for name in names if name in self.running]:
+            for name in left:
+                process, begin = self.running[name]
+                if process.poll() is not None:
+                    del self.running[name]
+                    signal_session(process.pid, signal.SIGKILL)  # what it left behind
+                    self.record(name, process.returncode, self.now() - begin)
+            if self.now() >= until:
+                return self.end([name for name in left if name in self.running], "out of time")
+            if self.now() - self.packed > PACK_EVERY:
+                for name in left:
+                    keep_training(name)
+                self.pack()
+            time.sleep(0.1)
+
+    def end(self, names: list[str], cause: str) -> None:
+        """End parts: first by SIGTERM, so that trainings write a checkpoint, then by SIGKILL, and wait for none."""
+        until = self.now() + min(GRACE, self.seconds / 10)
+        for name in names:
+            signal_session(self.running[name][0].pid, signal.SIGCONT, signal.SIGTERM)
+        while self.now() < until and any(self.running[name][0].poll() is None for name in names):
+            time.sleep(0.1)
+        for name in names:
+            process, begin = self.running.pop(name)
+            signal_session(process.pid, signal.SIGKILL)
+            self.record(name, cause, self.now() - begin)
+
+    def run(self, rows: list[Row], length: float) -> bool:
+        """Run ``rows``, whose plan has the given ``length``; whether all parts ended well."""
+        try:
+            for row in rows:
+                until = row.until * self.seconds / length
+                names = [part.name for part in row.parts]
+                self.pause(row.alone)
+                if any(part.needs == COMPILATION for part in row.parts):
+                    self.wait([COMPILATION], until - (until - self.now()) / 2)
+                for part in row.parts:
+                    self.start(part)
+                self.wait(names, until)
+                if "install" in names:
+                    self.start(compilation())
+        finally:
+            self.end(list(self.running), "out of time")
+            write(OUT / "table.md", table(RESULTS).encode())
+        return all(code == 0 for code in self.codes.values())
+
+    def pause(self, paused: bool) -> None:
+        if COMPILATION in self.running:
+            pid = self.running[COMPILATION][0].pid
+            signal_session(pid, signal.SIGSTOP if paused else signal.SIGCONT)
+
+    def pack(self) -> None:
+        """Write all results so far to the archive, whole or not at all."""
+        self.packed = self.now()
+        stream = io.BytesIO()
+        with tarfile.open(fileobj=stream, mode="w:gz") as archive:
+            for file in sorted(path for path in RESULTS.rglob("*") if path.is_file()):
+                content = file.read_bytes()[-MOST_KEPT:]
+                entry = tarfile.TarInfo(str(file.relative_to(STATE)))
+                entry.size = len(content)
+                archive.addfile(entry, io.BytesIO(content))
+        write(self.archive, stream.getvalue())
 
 
-def _number(value: float | None, digits: int = 2) -> str:
-    return NOTHING if value is None else f"{value:.{digits}f}"
+def signal_session(session: int, *signals: int) -> None:
+    """Send signals to all processes of a session; ninja gives each compiler a process group of its own."""
+    for number in signals:
+        for stat in Path("/proc").glob("[0-9]*/stat"):
+            with contextlib.suppress(OSError):  # it has just ended
+                fields = stat.read_text().rpartition(")")[2].split()
+                if int(fields[3]) == session:
+                    os.kill(int(stat.parent.name), number)
 
 
-def _read(file: Path) -> Any:
-    """The JSON in ``file``; None if it is missing or damaged."""
-    try:
-        return json.loads(file.read_text())
-    except (OSError, ValueError):
-        return None
+def write(path: Path, content: bytes) -> None:
+    path.with_suffix(".new").write_bytes(content)
+    path.with_suffix(".new").replace(path)
 
 
-def _last_line(file: Path) -> str:
-    lines = file.read_text().splitlines() if file.is_file() else []
-    return lines[-1].strip("= ") if lines else ""
+def keep_training(name: str) -> None:
+    """Copy the small files of a training, finished or not, and one picture to the results."""
+    for trial in (STATE / "runs" / f"gpu_day-{name.removeprefix('train-')}").glob("*/*/*-seed*"):
+        target = RESULTS / name
+        target.mkdir(exist_ok=True)
+        for file in [trial / kept for kept in KEPT] + sorted(trial.glob("renders/*.png"))[:1]:
+            if file.is_file():
+                shutil.copyfile(file, target / file.name)
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__)
-    verbs = parser.add_subparsers(dest="verb", required=True)
-    verbs.add_parser("machine", help="GPU and versions as JSON")
-    same = verbs.add_parser("bits", help="whether runs have the same bits, as JSON; 1 if they have not")
-    same.add_argument("device")
-    same.add_argument("size", help="WIDTHxHEIGHT")
-    same.add_argument("count", type=int)
-    verbs.add_parser("table", help="Markdown from a folder of results").add_argument("results", type=Path)
-    options = parser.parse_args()
-    if options.verb == "machine":
-        print(json.dumps(machine()))
-    elif options.verb == "table":
-        print(table(options.results))
-    else:
-        width, _, height = options.size.partition("x")
-        differing = bits(options.device, int(width), int(height), options.count)
-        print(json.dumps({"differing": differing}))
-        return 1 if differing else 0
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+def rest(seconds: float, names: list[str]) -> bool:
+    """Run the named parts, else those of ``all`` that did not end well, else trainings of the next seed."""
+    ends = read_ends(RESULTS)
+    known = [row for seed in range(SEEDS) for row in plan(seed)]
+    names = names or [name for name, end in ends.items() if end != 0]
+    if not names:
+        seed = next(seed for seed in range(SEEDS) if ends.get(f"train-{ARMS[0]}-{seed}") != 0)
+        names = [f"train-{arm}-{seed}" for arm in ARMS]
