@@ -1,8 +1,6 @@
-"""The Python part of gpu_day.sh: what is carried along, the plan of the parts, the runner, and the tables.
+"""The Python part of gpu_day.sh. Parts of a row run side by side, rows one after the other.
 
-Parts run in rows: those of a row side by side, the rows one after the other. A row has an absolute end, so a part that
-hangs takes time from no later row, and a part that ends early gives its time to them. Until packages are unpacked,
-only the standard library is here.
+A row has an absolute end: a part that hangs takes no time from later rows, and one that ends early gives them its time.
 """
 
 from __future__ import annotations
@@ -17,222 +15,197 @@ import signal
 import subprocess
 import sys
 import tarfile
+import tempfile
 import time
 import zipfile
-from collections.abc import Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 PYTHON = os.environ["PYTHON"]
 BROUGHT, STATE, OUT = (Path(os.environ[k]) for k in ("GPU_DAY_BROUGHT", "GPU_DAY_STATE", "OUT"))
-RESULTS = STATE / "results"
-TINY = bool(os.environ.get("GPU_DAY_TINY"))
-PACKAGES = ["hydra-core", "omegaconf", "pydantic", "pydantic_core", "annotated-types", "typing-inspection"]
-PACKAGES += ["flip-evaluator", "plyfile", "pycolmap", "gsplat"]
-SOURCES = ["antlr4-python3-runtime"]  # packages without wheels
-UNUSED = ["gsplat/cuda/csrc/third_party/glm/doc", "gsplat/cuda/csrc/third_party/glm/test"]
-PLATFORMS = [f"manylinux{name}_x86_64" for name in ("_2_28", "_2_27", "_2_17", "2014", "1")]
-WEIGHTS = ["squeezenet1_1*.pth", "lpips_v0.1_squeeze.pth", "squeeze.pth"]
+RESULTS, ARCHIVE, ENDS = STATE / "results", BROUGHT / "brought.tar.xz", "parts.jsonl"
+PACKAGES = "hydra-core omegaconf pydantic pydantic_core annotated-types typing-inspection flip-evaluator plyfile"
+PACKAGES += " pycolmap gsplat antlr4-python3-runtime"
+UNUSED = tuple(f"site/gsplat/cuda/csrc/third_party/glm/{name}" for name in ("doc", "test"))
+WEIGHTS = ("squeezenet1_1*.pth", "lpips_v0.1_squeeze.pth")
+MOST_CARRIED = 45  # MiB
 SQUEEZED = [{"id": lzma.FILTER_X86}, {"id": lzma.FILTER_LZMA2, "preset": 6, "dict_size": 1 << 26}]
-ARMS = ("adc", "volumetric", "volumetric_once")
+TINY = bool(os.environ.get("GPU_DAY_TINY"))
 COUNTS = ("3",) if TINY else ("100000", "1000000", "3000000")
-SIZE, SMALL = ("16x16", "16x16") if TINY else ("1600x1060", "48x32")
-DEVICE = "cpu" if TINY else "cuda"
 PEER = "cpu" if TINY else "gsplat"
-SECONDS = 540  # the plan's length
-GRACE = 8.0  # seconds from SIGTERM, at which a training writes its checkpoint, to SIGKILL
+ARMS, SEEDS = ("adc", "volumetric", "volumetric_once"), range(20)
+COMPILATION = "compilation"  # of gsplat, on idle cores; a trial run has nothing to compile
+COMPILE = "0" if TINY else "from gsplat.cuda._backend import _C; assert _C"
+SANITIZERS = ("memcheck", "racecheck")
+SECONDS = {"all": 540, "rest": 200}
+BENCHED = ("raster", "count", "size", "forward_ms", "loss_ms", "backward_ms", "adam_ms", "step_ms")
+BENCHED += ("steps_per_second", "fps", "peak_memory_mb")
+TRAINED = ("iterations", "num_gaussians", "training s", "peak_memory_mb", "psnr", "ssim", "lpips_squeeze", "flip")
 PACK_EVERY = 20.0  # seconds
-MOST_KEPT = 2_000_000  # bytes of a file, its end
+MOST_KEPT = 2_000_000  # bytes of a file
 KEPT = ("results.json", "failed.json", "log.txt", "metrics.jsonl", "events.jsonl", "per_view.csv")
 
 
-@dataclass(frozen=True)
-class Part:
+class Part(NamedTuple):
     name: str
     command: list[str]
-    needs: str | None = None  # the part that must have ended well
-    environment: dict[str, str] = field(default_factory=dict)
+    needs: str = ""  # the part that must have ended well
 
 
-@dataclass(frozen=True)
-class Row:
-    until: float  # seconds after the begin, in a plan of SECONDS
+class Row(NamedTuple):
     parts: list[Part]
-    alone: bool = False  # nothing else may run: the compilation pauses
+    seconds: float  # of the plan
+    alone: bool = False  # for timing: the compilation pauses
+    grace: float = 1.0  # seconds from SIGTERM, at which a training writes its checkpoint, to SIGKILL
 
 
-def gsbench(*words: str) -> list[str]:
-    return [PYTHON, "-m", "gsbench.cli", *words]
+def gsbench(name: str, words: str, needs: str = "") -> Part:
+    return Part(name, [PYTHON, "-m", "gsbench.cli", *words.split()], needs)
 
 
-def own(*words: str) -> list[str]:
-    return [PYTHON, "scripts/gpu_day.py", *words]
-
-
-def bench(name: str, raster: str, count: str, needs: str | None = None) -> Part:
-    words = ["--raster", raster, "--count", count, "--size", SIZE, "--kernels", "--json"]
-    words += ["--repeats", "1" if TINY else "10"]
-    return Part(f"bench-{name}", gsbench("bench", *words), needs)
-
-
-def proof(raster: str, needs: str | None = None) -> Part:
-    return Part(f"proof-{raster}", gsbench("doctor", "--prove", "--raster", raster, "--json"), needs)
+def bench(name: str, raster: str, count: str, needs: str = "") -> Part:
+    at = "16x16 --repeats 1" if TINY else "1600x1060 --repeats 10"
+    words = f"bench --raster {raster} --count {count} --kernels --json --size {at}"
+    return gsbench(f"bench-{name}", words, needs)
 
 
 def training(arm: str, seed: int) -> Part:
-    words = ["scene=colmap", f"scene.path={STATE / 'brought/bonsai'}", "init=dataset", "train=paper"]
-    words += ["eval.at=[7000]", "eval.download=false"]
+    words = f"scene=colmap scene.path={STATE}/bonsai init=dataset train=paper eval.at=[7000] device=cuda"
     if TINY:
-        words = ["scene=courtyard", "scene.views=8", "scene.width=32", "scene.height=24"]
-        words += ["init=random", "init.count=6", "train=7k", "train.iterations=2", "eval.download=false"]
-    words += [f"densify={arm}", f"seed={seed}", "raster=triton", f"device={DEVICE}", "tracking=none"]
-    return Part(f"train-{arm}-{seed}", gsbench(f"name=gpu_day-{arm}-{seed}", *words))
+        words = "scene=courtyard scene.views=8 scene.width=32 scene.height=24 init=random init.count=6"
+        words += " train=7k train.iterations=2 device=cpu"
+    words += f" densify={arm} seed={seed} raster=triton tracking=none eval.download=false"
+    return gsbench(f"train-{arm}-{seed}", f"name=gpu_day-{arm}-{seed} {words}")
 
 
-def sanitizer(tool: str) -> Part:
-    """Without caching, each tensor is its own allocation, so that overruns are seen."""
-    words = ["compute-sanitizer", "--tool", tool, "--error-exitcode", "9"]
-    paths = {"PATH": f"{os.environ['PATH']}:/usr/local/cuda/bin", "PYTORCH_NO_CUDA_MEMORY_CACHING": "1"}
-    return Part(tool, words + own("bits", DEVICE, SMALL, "100" if not TINY else "3", "1"), None, paths)
+def check(name: str, words: str, needs: str = "", tool: str = "") -> Part:
+    """Tests, below a ``tool`` of compute-sanitizer if one is named. It needs an allocation for each tensor."""
+    checker = "env PYTORCH_NO_CUDA_MEMORY_CACHING=1 compute-sanitizer --error-exitcode 9 --tool"
+    before = [*checker.split(), tool] if tool else []
+    command = [*before, PYTHON, "-m", "pytest", "-q", "-p", "no:cacheprovider", *words.split(";")]
+    return Part(name, command, needs)
 
 
 def plan(seed: int = 0) -> list[Row]:
     """All parts, the most telling first; the trainings with ``seed``."""
-    tests = "triton and nothing_to_see" if TINY else "triton or on_a_gpu"
-    files = ["tests/raster/test_contract.py", "tests/raster/test_gsplat.py"]
-    pytest = [PYTHON, "-m", "pytest", "-q", "-p", "no:cacheprovider", *files, "-k", tests]
-    bits = own("bits", DEVICE, SIZE, COUNTS[0], "3")
+    contract, bits = "tests/raster/test_contract.py;-k;", "tests/raster/test_same_bits.py"
+    some = " and nothing_to_see" if TINY else ""
+    of_peer = f"tests/raster/test_gsplat.py;{contract}on_a_gpu or {PEER}{some}"
+    prove = "doctor --json --prove --raster"
+    peer = [gsbench(f"proof-{PEER}", f"{prove} {PEER}", COMPILATION)]
+    peer += [check(f"contract-{PEER}", of_peer, COMPILATION)]
     return [
-        Row(25, [Part("install", own("unpack"))]),
-        Row(95, [Part("machine", own("machine")), proof("triton")]),
-        Row(155, [Part("contract", pytest), Part("bits", bits)]),
-        *(Row(180 + 30 * k, [bench(f"triton-{n}", "triton", n)], True) for k, n in enumerate(COUNTS)),
-        Row(450, [training(arm, seed) for arm in ARMS]),
-        Row(490, [bench(PEER, PEER, ",".join(COUNTS), COMPILATION)]),
-        Row(504, [proof(PEER, COMPILATION)]),
-        Row(SECONDS, [sanitizer("memcheck"), sanitizer("racecheck")]),
+        Row([Part("install", [PYTHON, "-m", "tarfile", "-e", str(ARCHIVE), str(STATE)])], 25),
+        Row([gsbench("proof-triton", f"{prove} triton")], 70),
+        Row([check("contract", f"{contract}triton{some}"), check("bits", bits)], 60),
+        *(Row([bench(f"triton-{n}", "triton", n)], 90 / len(COUNTS), True) for n in COUNTS),
+        Row([training(arm, seed) for arm in ARMS], 200, grace=8.0),
+        Row([bench(PEER, PEER, ",".join(COUNTS), COMPILATION)], 35),
+        Row(peer, 25),
+        Row([check(tool, f"{bits};-k;tiny", tool=tool) for tool in SANITIZERS], 35),
     ]
 
 
-def compilation() -> Part:
-    """The compilation of gsplat, on the idle cores from the installation on; in a trial run nothing is compiled."""
-    command = ["nice", "-n", "19", PYTHON, "-c", "from gsplat.cuda._backend import _C; assert _C"]
-    return Part(COMPILATION, [PYTHON, "-c", ""] if TINY else command, None, {"MAX_JOBS": "12"})
-
-
 class Runner:
-    """Runs rows of parts within ``seconds``; keeps what each part says and how it ends, in $OUT at once."""
+    """Runs rows of parts within ``seconds``. What a part says and how it ends is in $OUT at once."""
 
     def __init__(self, verb: str, seconds: float) -> None:
         self.archive = OUT / f"gpu_day-{verb}.tar.gz"
         self.begin, self.seconds, self.packed = time.monotonic(), seconds, 0.0
         self.running: dict[str, tuple[subprocess.Popen[bytes], float]] = {}  # by name, with its begin
-        self.codes: dict[str, int | str] = {}  # an exit code, minus a signal, or why there is none
-        RESULTS.mkdir(parents=True, exist_ok=True)
-        OUT.mkdir(parents=True, exist_ok=True)
+        self.ends: dict[str, int | str] = {}  # an exit code, minus a signal, or why there is none
 
     def now(self) -> float:
         return time.monotonic() - self.begin
 
     def start(self, part: Part) -> None:
-        if part.needs and self.codes.get(part.needs) != 0:
-            return self.record(part.name, f"{part.needs} is missing", 0.0)
-        environment = os.environ | part.environment
-        try:
-            with open(RESULTS / f"{part.name}.out", "wb") as output, open(RESULTS / f"{part.name}.log", "wb") as log:
-                process = subprocess.Popen(
-                    part.command, stdout=output, stderr=log, stdin=subprocess.DEVNULL, env=environment,
-                    start_new_session=True,
-                )
-        except OSError as error:
-            return self.record(part.name, f"not tried: {error}", 0.0)
+        if part.needs and self.ends.get(part.needs) != 0:
+            return self.record(part.name, f"not tried: no {part.needs}", 0.0)
+        where = RESULTS / part.name
+        with open(f"{where}.out", "wb") as out, open(f"{where}.log", "wb") as log:
+            process = subprocess.Popen(part.command, stdout=out, stderr=log, start_new_session=True)
         self.running[part.name] = process, self.now()
 
-    def record(self, name: str, code: int | str, seconds: float) -> None:
-        self.codes[name] = code
-        with (RESULTS / "parts.jsonl").open("a") as file:
-            file.write(json.dumps({"part": name, "end": code, "seconds": round(seconds, 1)}) + "\n")
-        print(f"{self.now():4.0f} s  {name}: {code} after {seconds:.0f} s", flush=True)
-        for kind in ("log", "out") if code != 0 else ():
-            file = RESULTS / f"{name}.{kind}"
-            print("\n".join((file.read_text(errors="replace") if file.exists() else "").splitlines()[-8:]))
-        keep_training(name)
+    def record(self, name: str, end: int | str, seconds: float) -> None:
+        self.ends[name] = end
+        with (RESULTS / ENDS).open("a") as file:
+            file.write(json.dumps({"part": name, "end": end, "seconds": round(seconds, 1)}) + "\n")
+        print(f"{self.now():4.0f} s  {name}: {end} after {seconds:.0f} s", flush=True)
+        for file in (RESULTS / f"{name}.log", RESULTS / f"{name}.out"):
+            if end != 0 and file.exists():
+                print(*file.read_text(errors="replace").splitlines()[-8:], sep="\n")
         self.pack()
 
     def wait(self, names: list[str], until: float) -> None:
-        """Wait for the parts; end those that are not done at ``until``."""
-        while left := [name for name in names if name in self.running]:
-            for name in left:
-                process, begin = self.running[name]
+        """Wait for the parts until ``until``, in seconds after the begin."""
+        while any(name in self.running for name in names) and self.now() < until:
+            for name, (process, begin) in list(self.running.items()):
                 if process.poll() is not None:
                     del self.running[name]
-                    signal_session(process.pid, signal.SIGKILL)  # what it left behind
                     self.record(name, process.returncode, self.now() - begin)
-            if self.now() >= until:
-                return self.end([name for name in left if name in self.running], "out of time")
             if self.now() - self.packed > PACK_EVERY:
-                for name in left:
-                    keep_training(name)
                 self.pack()
             time.sleep(0.1)
 
-    def end(self, names: list[str], cause: str) -> None:
-        """End parts: first by SIGTERM, so that trainings write a checkpoint, then by SIGKILL, and wait for none."""
-        until = self.now() + min(GRACE, self.seconds / 10)
+    def end(self, names: list[str], grace: float) -> None:
+        """End those parts that still run. A process that even SIGKILL does not end is left behind."""
+        names = [name for name in names if name in self.running]
         for name in names:
             signal_session(self.running[name][0].pid, signal.SIGCONT, signal.SIGTERM)
+        until = self.now() + grace
         while self.now() < until and any(self.running[name][0].poll() is None for name in names):
             time.sleep(0.1)
         for name in names:
             process, begin = self.running.pop(name)
             signal_session(process.pid, signal.SIGKILL)
-            self.record(name, cause, self.now() - begin)
+            self.record(name, "out of time", self.now() - begin)
 
-    def run(self, rows: list[Row], length: float) -> bool:
-        """Run ``rows``, whose plan has the given ``length``; whether all parts ended well."""
+    def run(self, rows: list[Row]) -> bool:
+        """Run ``rows``; whether all parts ended well."""
+        until, planned = 0.0, sum(row.seconds for row in rows)
+        compiles = any(part.needs for row in rows for part in row.parts)
         try:
             for row in rows:
-                until = row.until * self.seconds / length
+                until += row.seconds * self.seconds / planned
                 names = [part.name for part in row.parts]
-                self.pause(row.alone)
-                if any(part.needs == COMPILATION for part in row.parts):
-                    self.wait([COMPILATION], until - (until - self.now()) / 2)
+                if compiles and names != ["install"]:
+                    self.start(Part(COMPILATION, ["nice", "-n", "19", PYTHON, "-c", COMPILE]))
+                    compiles = False
+                if COMPILATION in self.running:
+                    number = signal.SIGSTOP if row.alone else signal.SIGCONT
+                    signal_session(self.running[COMPILATION][0].pid, number)
+                if row.parts[0].needs:
+                    self.wait([COMPILATION], (self.now() + until) / 2)
                 for part in row.parts:
                     self.start(part)
-                self.wait(names, until)
-                if "install" in names:
-                    self.start(compilation())
+                self.wait(names, until - row.grace)
+                self.end(names, row.grace)
         finally:
-            self.end(list(self.running), "out of time")
+            self.end(list(self.running), 1.0)
             write(OUT / "table.md", table(RESULTS).encode())
-        return all(code == 0 for code in self.codes.values())
-
-    def pause(self, paused: bool) -> None:
-        if COMPILATION in self.running:
-            pid = self.running[COMPILATION][0].pid
-            signal_session(pid, signal.SIGSTOP if paused else signal.SIGCONT)
+        return all(end == 0 for end in self.ends.values())
 
     def pack(self) -> None:
-        """Write all results so far to the archive, whole or not at all."""
-        self.packed = self.now()
-        stream = io.BytesIO()
-        with tarfile.open(fileobj=stream, mode="w:gz") as archive:
-            for file in sorted(path for path in RESULTS.rglob("*") if path.is_file()):
-                content = file.read_bytes()[-MOST_KEPT:]
-                entry = tarfile.TarInfo(str(file.relative_to(STATE)))
-                entry.size = len(content)
-                archive.addfile(entry, io.BytesIO(content))
-        write(self.archive, stream.getvalue())
+        """Write all results so far, also of unfinished trainings, to the archive; not if a file vanishes meanwhile."""
+        self.packed, stream = self.now(), io.BytesIO()
+        with contextlib.suppress(OSError), tarfile.open(fileobj=stream, mode="w:gz") as archive:
+            for trial in STATE.glob("runs/gpu_day-*/*/*/*-seed*"):
+                target = RESULTS / f"train-{trial.parents[2].name.removeprefix('gpu_day-')}"
+                target.mkdir(exist_ok=True)
+                for file in [*(trial / kept for kept in KEPT), *sorted(trial.glob("renders/*.png"))[:1]]:
+                    if file.is_file():
+                        shutil.copyfile(file, target / file.name)
+            archive.add(RESULTS, "results", filter=lambda x: x if x.size <= MOST_KEPT else None)
+            archive.close()
+            write(self.archive, stream.getvalue())
 
 
 def signal_session(session: int, *signals: int) -> None:
-    """Send signals to all processes of a session; ninja gives each compiler a process group of its own."""
-    for number in signals:
-        for stat in Path("/proc").glob("[0-9]*/stat"):
-            with contextlib.suppress(OSError):  # it has just ended
-                fields = stat.read_text().rpartition(")")[2].split()
-                if int(fields[3]) == session:
+    """Send signals to all processes of a session: ninja gives each compiler a process group of its own."""
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        with contextlib.suppress(OSError):  # it has just ended
+            if int(stat.read_text().rpartition(")")[2].split()[3]) == session:
+                for number in signals:
                     os.kill(int(stat.parent.name), number)
 
 
@@ -241,21 +214,133 @@ def write(path: Path, content: bytes) -> None:
     path.with_suffix(".new").replace(path)
 
 
-def keep_training(name: str) -> None:
-    """Copy the small files of a training, finished or not, and one picture to the results."""
-    for trial in (STATE / "runs" / f"gpu_day-{name.removeprefix('train-')}").glob("*/*/*-seed*"):
-        target = RESULTS / name
-        target.mkdir(exist_ok=True)
-        for file in [trial / kept for kept in KEPT] + sorted(trial.glob("renders/*.png"))[:1]:
-            if file.is_file():
-                shutil.copyfile(file, target / file.name)
-
-
-def rest(seconds: float, names: list[str]) -> bool:
-    """Run the named parts, else those of ``all`` that did not end well, else trainings of the next seed."""
+def rest(names: list[str]) -> list[Row]:
+    """Rows of the named parts, else of those that did not end well, else of trainings with the next seed."""
     ends = read_ends(RESULTS)
-    known = [row for seed in range(SEEDS) for row in plan(seed)]
-    names = names or [name for name, end in ends.items() if end != 0]
-    if not names:
-        seed = next(seed for seed in range(SEEDS) if ends.get(f"train-{ARMS[0]}-{seed}") != 0)
-        names = [f"train-{arm}-{seed}" for arm in ARMS]
+    names = names or [name for name, record in ends.items() if record["end"] != 0]
+    seed = sum(f"train-{ARMS[0]}-{seed}" in ends for seed in SEEDS)
+    wanted = set(names or [f"train-{arm}-{seed}" for arm in ARMS]) - {COMPILATION}
+    if not (STATE / "site").exists():
+        wanted.add("install")
+    rows = []
+    for row in (row for seed in SEEDS for row in plan(seed)):
+        parts = [part for part in row.parts if part.name in wanted]
+        wanted -= {part.name for part in parts}
+        rows += [row._replace(parts=parts)] if parts else []
+    if wanted:
+        sys.exit(f"there is no part {', '.join(sorted(wanted))}")
+    return rows
+
+
+def wheels() -> None:
+    """Pack packages for Python 3.12 on x86-64, the scene and weights into one archive."""
+    import pycolmap
+
+    from gsbench.scene.colmap import model_points, read_model
+
+    new, pinned = STATE / "new", Path("constraints.txt").read_text().split()
+    shutil.rmtree(new, ignore_errors=True)
+    platforms = [f"--platform=manylinux{x}_x86_64" for x in ("_2_28", "_2_27", "_2_17", "2014", "1")]
+    binary = ["download", "--only-binary=:all:", "--python-version=3.12", *platforms, "-d"]
+    for package in PACKAGES.split():
+        (release,) = (line for line in pinned if line.startswith(f"{package}=="))
+        how = ["wheel", "-w"] if package.startswith("antlr4") else binary  # it has no wheel
+        folder = str(new / "wheels" / package)
+        subprocess.run([PYTHON, "-m", "pip", "-q", *how, folder, "--no-deps", release], check=True)
+        zipfile.ZipFile(next(Path(folder).glob("*.whl"))).extractall(new / "site")
+    for unused in ("wheels", *UNUSED):
+        shutil.rmtree(new / unused, ignore_errors=True)
+    # No training needs the tracks and keypoints, which are 20 MB of bonsai's model. Points keep their order.
+    scene, model_folder = Path(os.environ["GPU_DAY_SCENE"]), new / "bonsai/sparse/0"
+    shutil.copytree(scene / "images", new / "bonsai/images")
+    model = read_model(scene / "sparse/0")
+    cloud = model_points(model)
+    model.delete_all_points2D_and_points3D()
+    for point, color in zip(*cloud, strict=True):
+        model.add_point3D(point, pycolmap.Track(), color)
+    model_folder.mkdir(parents=True)
+    model.write_binary(model_folder)
+    (new / "weights").mkdir()
+    weights = [x for name in WEIGHTS for x in Path(os.environ["GSBENCH_WEIGHTS"]).rglob(name)]
+    for file in weights:
+        shutil.copy(file, new / "weights")
+    with lzma.open(ARCHIVE, "wb", filters=SQUEEZED) as stream, tarfile.open(fileobj=stream, mode="w") as archive:
+        archive.add(new, ".")
+    size = ARCHIVE.stat().st_size / 2**20
+    print(f"{ARCHIVE}: {size:.1f} MiB (at most {MOST_CARRIED}), {len(weights)} files of weights")
+    if size > MOST_CARRIED:
+        sys.exit("too large: leave something out")
+
+
+def read_ends(results: Path) -> dict[str, dict[str, Any]]:
+    """The last record of each part."""
+    file = results / ENDS
+    records = [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
+    return {record["part"]: record for record in records}
+
+
+def read(file: Path, kind: type) -> Any:
+    """The JSON in a file, or an empty ``kind`` if it is missing, was cut off, or is something else."""
+    with contextlib.suppress(OSError, ValueError):
+        value = json.loads(file.read_text())
+        return value if isinstance(value, kind) else kind()
+    return kind()
+
+
+def table(results: Path) -> str:
+    """What the two documents need, as Markdown."""
+    ends = read_ends(results)
+    lines = ["For docs/gpu.md:", ""]
+    for name, record in ends.items():
+        end = "yes" if record["end"] == 0 else f"NO ({record['end']})"
+        facts = [f"- {name}: {end}, {record['seconds']:.0f} s"]
+        if name.startswith("proof-"):
+            proven = read(results / f"{name}.out", dict)
+            facts += [f"{key} {proven.get(key)}" for key in ("device", "versions", "errors")]
+        elif name.startswith(("contract", "bits", *SANITIZERS)) and (results / f"{name}.out").exists():
+            facts += (results / f"{name}.out").read_text(errors="replace").splitlines()[-1:]
+        lines.append("; ".join(facts))
+    lines += ["", "For docs/measurements.md:", "", f"| {' | '.join(BENCHED)} |", "|---" * len(BENCHED) + "|"]
+    rows = [row for file in sorted(results.glob("bench-*.out")) for row in read(file, list)]
+    rows.sort(key=lambda row: (row["count"], row["raster"] != "triton"))
+    lines += [f"| {' | '.join(str(row.get(key, '-')) for key in BENCHED)} |" for row in rows]
+    for row in rows:
+        profile = json.dumps({key: row.get(key) for key in ("kernels_ms", "waits", "waits_ms")})
+        lines += ["", f"{row['raster']}, {row['count']}: {profile}"]
+    lines += ["", f"| training | {' | '.join(TRAINED)} |", "|---" * (1 + len(TRAINED)) + "|"]
+    for folder in sorted(results.glob("train-*/")):
+        record = read(folder / "results.json", dict)
+        record |= record.get("metrics", {}) | {"training s": record.get("seconds", {}).get("train")}
+        lines.append(f"| {folder.name} | {' | '.join(str(record.get(key, '-')) for key in TRAINED)} |")
+    return "\n".join(lines)
+
+
+def tables(folder: Path) -> str:
+    """The tables of all archives in a folder; of a part that ran twice, the later run."""
+    import yaml
+
+    with tempfile.TemporaryDirectory() as work:
+        results, ends = Path(work) / "results", ""
+        for file in sorted(folder.glob("gpu_day-*.tar.gz")):  # all, rest
+            shutil.unpack_archive(file, work, filter="data")
+            ends += (results / ENDS).read_text()
+            (results / ENDS).write_text(ends)
+        scenes = yaml.safe_load(Path("src/gsbench/analysis/paper.yaml").read_text())["table1"]["scenes"]
+        return f"{table(results)}\n\nThe paper (SSIM, PSNR, LPIPS, million, minutes): {scenes['bonsai']}"
+
+
+def main(verb: str, *words: str) -> int:
+    if verb == "wheels":
+        wheels()
+    elif verb == "table":
+        print(tables(Path(words[0])))
+    else:
+        rows = plan() if verb == "all" else rest(list(words[1:]))
+        seconds = float(words[0]) if words else SECONDS[verb]
+        signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
+        return 0 if Runner(verb, seconds).run(rows) else 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(*sys.argv[1:]))
