@@ -1,9 +1,7 @@
 """The Python part of gpu_day.sh. Parts of a row run side by side, rows one after the other.
 
-A row has an absolute end: a part that hangs takes no time from later rows, and one that ends early gives them its time.
+A row has an absolute end: a part that hangs takes no time from later rows; one that is fast gives.
 """
-
-from __future__ import annotations
 
 import contextlib
 import io
@@ -24,23 +22,21 @@ from typing import Any, NamedTuple
 PYTHON = os.environ["PYTHON"]
 BROUGHT, STATE, OUT = (Path(os.environ[k]) for k in ("GPU_DAY_BROUGHT", "GPU_DAY_STATE", "OUT"))
 RESULTS, ARCHIVE, ENDS = STATE / "results", BROUGHT / "brought.tar.xz", "parts.jsonl"
-PACKAGES = "hydra-core omegaconf pydantic pydantic_core annotated-types typing-inspection flip-evaluator plyfile"
-PACKAGES += " pycolmap gsplat antlr4-python3-runtime"
-UNUSED = tuple(f"site/gsplat/cuda/csrc/third_party/glm/{name}" for name in ("doc", "test"))
+PACKAGES = "hydra-core omegaconf pydantic pydantic_core annotated-types typing-inspection"
+PACKAGES += " flip-evaluator plyfile pycolmap gsplat antlr4-python3-runtime"
 WEIGHTS = ("squeezenet1_1*.pth", "lpips_v0.1_squeeze.pth")
 MOST_CARRIED = 45  # MiB
 SQUEEZED = [{"id": lzma.FILTER_X86}, {"id": lzma.FILTER_LZMA2, "preset": 6, "dict_size": 1 << 26}]
 TINY = bool(os.environ.get("GPU_DAY_TINY"))
-COUNTS = ("3",) if TINY else ("100000", "1000000", "3000000")
-PEER = "cpu" if TINY else "gsplat"
+COUNTS, PEER = (("3",), "cpu") if TINY else (("100000", "1000000", "3000000"), "gsplat")
 ARMS, SEEDS = ("adc", "volumetric", "volumetric_once"), range(20)
 COMPILATION = "compilation"  # of gsplat, on idle cores; a trial run has nothing to compile
 COMPILE = "0" if TINY else "from gsplat.cuda._backend import _C; assert _C"
-SANITIZERS = ("memcheck", "racecheck")
 SECONDS = {"all": 540, "rest": 200}
 BENCHED = ("raster", "count", "size", "forward_ms", "loss_ms", "backward_ms", "adam_ms", "step_ms")
 BENCHED += ("steps_per_second", "fps", "peak_memory_mb")
-TRAINED = ("iterations", "num_gaussians", "training s", "peak_memory_mb", "psnr", "ssim", "lpips_squeeze", "flip")
+TRAINED = ("iterations", "num_gaussians", "training_s", "peak_memory_mb", "psnr", "ssim")
+TRAINED += ("lpips_squeeze", "flip")
 PACK_EVERY = 20.0  # seconds
 MOST_KEPT = 2_000_000  # bytes of a file
 KEPT = ("results.json", "failed.json", "log.txt", "metrics.jsonl", "events.jsonl", "per_view.csv")
@@ -54,9 +50,9 @@ class Part(NamedTuple):
 
 class Row(NamedTuple):
     parts: list[Part]
-    seconds: float  # of the plan
+    seconds: float  # of the plan; 0: in the background
     alone: bool = False  # for timing: the compilation pauses
-    grace: float = 1.0  # seconds from SIGTERM, at which a training writes its checkpoint, to SIGKILL
+    grace: float = 1.0  # seconds from SIGTERM, when a training writes its checkpoint, to SIGKILL
 
 
 def gsbench(name: str, words: str, needs: str = "") -> Part:
@@ -79,7 +75,7 @@ def training(arm: str, seed: int) -> Part:
 
 
 def check(name: str, words: str, needs: str = "", tool: str = "") -> Part:
-    """Tests, below a ``tool`` of compute-sanitizer if one is named. It needs an allocation for each tensor."""
+    """Tests, below a ``tool`` of compute-sanitizer, which needs an allocation for each tensor."""
     checker = "env PYTORCH_NO_CUDA_MEMORY_CACHING=1 compute-sanitizer --error-exitcode 9 --tool"
     before = [*checker.split(), tool] if tool else []
     command = [*before, PYTHON, "-m", "pytest", "-q", "-p", "no:cacheprovider", *words.split(";")]
@@ -96,23 +92,24 @@ def plan(seed: int = 0) -> list[Row]:
     peer += [check(f"contract-{PEER}", of_peer, COMPILATION)]
     return [
         Row([Part("install", [PYTHON, "-m", "tarfile", "-e", str(ARCHIVE), str(STATE)])], 25),
+        Row([Part(COMPILATION, ["nice", "-n", "19", PYTHON, "-c", COMPILE])], 0),
         Row([gsbench("proof-triton", f"{prove} triton")], 70),
         Row([check("contract", f"{contract}triton{some}"), check("bits", bits)], 60),
         *(Row([bench(f"triton-{n}", "triton", n)], 90 / len(COUNTS), True) for n in COUNTS),
         Row([training(arm, seed) for arm in ARMS], 200, grace=8.0),
         Row([bench(PEER, PEER, ",".join(COUNTS), COMPILATION)], 35),
         Row(peer, 25),
-        Row([check(tool, f"{bits};-k;tiny", tool=tool) for tool in SANITIZERS], 35),
+        Row([check(tool, f"{bits};-k;tiny", tool=tool) for tool in ("memcheck", "racecheck")], 35),
     ]
 
 
 class Runner:
-    """Runs rows of parts within ``seconds``. What a part says and how it ends is in $OUT at once."""
+    """Runs rows of parts in ``seconds``; what a part says and how it ends is in $OUT at once."""
 
     def __init__(self, verb: str, seconds: float) -> None:
         self.archive = OUT / f"gpu_day-{verb}.tar.gz"
         self.begin, self.seconds, self.packed = time.monotonic(), seconds, 0.0
-        self.running: dict[str, tuple[subprocess.Popen[bytes], float]] = {}  # by name, with its begin
+        self.running: dict[str, tuple[subprocess.Popen[bytes], float]] = {}  # with its begin
         self.ends: dict[str, int | str] = {}  # an exit code, minus a signal, or why there is none
 
     def now(self) -> float:
@@ -148,7 +145,7 @@ class Runner:
             time.sleep(0.1)
 
     def end(self, names: list[str], grace: float) -> None:
-        """End those parts that still run. A process that even SIGKILL does not end is left behind."""
+        """End the parts that still run. Nothing waits for a process that SIGKILL does not end."""
         names = [name for name in names if name in self.running]
         for name in names:
             signal_session(self.running[name][0].pid, signal.SIGCONT, signal.SIGTERM)
@@ -163,14 +160,10 @@ class Runner:
     def run(self, rows: list[Row]) -> bool:
         """Run ``rows``; whether all parts ended well."""
         until, planned = 0.0, sum(row.seconds for row in rows)
-        compiles = any(part.needs for row in rows for part in row.parts)
         try:
             for row in rows:
                 until += row.seconds * self.seconds / planned
                 names = [part.name for part in row.parts]
-                if compiles and names != ["install"]:
-                    self.start(Part(COMPILATION, ["nice", "-n", "19", PYTHON, "-c", COMPILE]))
-                    compiles = False
                 if COMPILATION in self.running:
                     number = signal.SIGSTOP if row.alone else signal.SIGCONT
                     signal_session(self.running[COMPILATION][0].pid, number)
@@ -178,30 +171,32 @@ class Runner:
                     self.wait([COMPILATION], (self.now() + until) / 2)
                 for part in row.parts:
                     self.start(part)
-                self.wait(names, until - row.grace)
-                self.end(names, row.grace)
+                if row.seconds:
+                    self.wait(names, until - row.grace)
+                    self.end(names, row.grace)
         finally:
             self.end(list(self.running), 1.0)
-            write(OUT / "table.md", table(RESULTS).encode())
+            (OUT / "table.md").write_text(table(RESULTS))
         return all(end == 0 for end in self.ends.values())
 
     def pack(self) -> None:
-        """Write all results so far, also of unfinished trainings, to the archive; not if a file vanishes meanwhile."""
+        """Write all results so far to the archive, unless a file vanishes meanwhile."""
         self.packed, stream = self.now(), io.BytesIO()
         with contextlib.suppress(OSError), tarfile.open(fileobj=stream, mode="w:gz") as archive:
             for trial in STATE.glob("runs/gpu_day-*/*/*/*-seed*"):
                 target = RESULTS / f"train-{trial.parents[2].name.removeprefix('gpu_day-')}"
                 target.mkdir(exist_ok=True)
-                for file in [*(trial / kept for kept in KEPT), *sorted(trial.glob("renders/*.png"))[:1]]:
-                    if file.is_file():
-                        shutil.copyfile(file, target / file.name)
+                files = [trial / name for name in KEPT] + sorted(trial.glob("renders/*.png"))[:1]
+                for file in filter(Path.is_file, files):
+                    shutil.copyfile(file, target / file.name)
             archive.add(RESULTS, "results", filter=lambda x: x if x.size <= MOST_KEPT else None)
             archive.close()
-            write(self.archive, stream.getvalue())
+            self.archive.with_suffix(".new").write_bytes(stream.getvalue())
+            self.archive.with_suffix(".new").replace(self.archive)
 
 
 def signal_session(session: int, *signals: int) -> None:
-    """Send signals to all processes of a session: ninja gives each compiler a process group of its own."""
+    """Send signals to a whole session: ninja gives each compiler a process group of its own."""
     for stat in Path("/proc").glob("[0-9]*/stat"):
         with contextlib.suppress(OSError):  # it has just ended
             if int(stat.read_text().rpartition(")")[2].split()[3]) == session:
@@ -209,19 +204,14 @@ def signal_session(session: int, *signals: int) -> None:
                     os.kill(int(stat.parent.name), number)
 
 
-def write(path: Path, content: bytes) -> None:
-    path.with_suffix(".new").write_bytes(content)
-    path.with_suffix(".new").replace(path)
-
-
 def rest(names: list[str]) -> list[Row]:
-    """Rows of the named parts, else of those that did not end well, else of trainings with the next seed."""
+    """Rows of the named parts, else of those that did not end well, else of the next seed."""
     ends = read_ends(RESULTS)
     names = names or [name for name, record in ends.items() if record["end"] != 0]
     seed = sum(f"train-{ARMS[0]}-{seed}" in ends for seed in SEEDS)
-    wanted = set(names or [f"train-{arm}-{seed}" for arm in ARMS]) - {COMPILATION}
-    if not (STATE / "site").exists():
-        wanted.add("install")
+    wanted = set(names or [f"train-{arm}-{seed}" for arm in ARMS])
+    wanted |= {part.needs for row in plan() for part in row.parts if part.name in wanted} - {""}
+    wanted |= set() if (STATE / "site").exists() else {"install"}
     rows = []
     for row in (row for seed in SEEDS for row in plan(seed)):
         parts = [part for part in row.parts if part.name in wanted]
@@ -232,7 +222,7 @@ def rest(names: list[str]) -> list[Row]:
     return rows
 
 
-def wheels() -> None:
+def wheels() -> str:
     """Pack packages for Python 3.12 on x86-64, the scene and weights into one archive."""
     import pycolmap
 
@@ -248,9 +238,9 @@ def wheels() -> None:
         folder = str(new / "wheels" / package)
         subprocess.run([PYTHON, "-m", "pip", "-q", *how, folder, "--no-deps", release], check=True)
         zipfile.ZipFile(next(Path(folder).glob("*.whl"))).extractall(new / "site")
-    for unused in ("wheels", *UNUSED):
+    for unused in ("wheels", "site/gsplat/cuda/csrc/third_party/glm/doc"):  # 20 MB
         shutil.rmtree(new / unused, ignore_errors=True)
-    # No training needs the tracks and keypoints, which are 20 MB of bonsai's model. Points keep their order.
+    # No training needs tracks and keypoints, 20 MB of bonsai's model. Points keep their order.
     scene, model_folder = Path(os.environ["GPU_DAY_SCENE"]), new / "bonsai/sparse/0"
     shutil.copytree(scene / "images", new / "bonsai/images")
     model = read_model(scene / "sparse/0")
@@ -264,23 +254,22 @@ def wheels() -> None:
     weights = [x for name in WEIGHTS for x in Path(os.environ["GSBENCH_WEIGHTS"]).rglob(name)]
     for file in weights:
         shutil.copy(file, new / "weights")
-    with lzma.open(ARCHIVE, "wb", filters=SQUEEZED) as stream, tarfile.open(fileobj=stream, mode="w") as archive:
+    with lzma.open(ARCHIVE, "wb", filters=SQUEEZED) as file, tarfile.open(None, "w", file) as archive:
         archive.add(new, ".")
     size = ARCHIVE.stat().st_size / 2**20
-    print(f"{ARCHIVE}: {size:.1f} MiB (at most {MOST_CARRIED}), {len(weights)} files of weights")
     if size > MOST_CARRIED:
-        sys.exit("too large: leave something out")
+        sys.exit(f"{ARCHIVE} has {size:.1f} MiB, more than {MOST_CARRIED}: leave something out")
+    return f"{ARCHIVE}: {size:.1f} MiB, {len(weights)} files of weights"
 
 
 def read_ends(results: Path) -> dict[str, dict[str, Any]]:
     """The last record of each part."""
-    file = results / ENDS
-    records = [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
-    return {record["part"]: record for record in records}
+    lines = (results / ENDS).read_text().splitlines() if (results / ENDS).exists() else []
+    return {record["part"]: record for record in map(json.loads, lines)}
 
 
 def read(file: Path, kind: type) -> Any:
-    """The JSON in a file, or an empty ``kind`` if it is missing, was cut off, or is something else."""
+    """The JSON in a file, or an empty ``kind`` if it is missing, cut off, or something else."""
     with contextlib.suppress(OSError, ValueError):
         value = json.loads(file.read_text())
         return value if isinstance(value, kind) else kind()
@@ -293,16 +282,16 @@ def table(results: Path) -> str:
     lines = ["For docs/gpu.md:", ""]
     for name, record in ends.items():
         end = "yes" if record["end"] == 0 else f"NO ({record['end']})"
-        facts = [f"- {name}: {end}, {record['seconds']:.0f} s"]
+        facts, out = [f"- {name}: {end}, {record['seconds']:.0f} s"], results / f"{name}.out"
         if name.startswith("proof-"):
-            proven = read(results / f"{name}.out", dict)
+            proven = read(out, dict)
             facts += [f"{key} {proven.get(key)}" for key in ("device", "versions", "errors")]
-        elif name.startswith(("contract", "bits", *SANITIZERS)) and (results / f"{name}.out").exists():
-            facts += (results / f"{name}.out").read_text(errors="replace").splitlines()[-1:]
+        elif name.startswith(("contract", "bits", "memcheck", "racecheck")) and out.exists():
+            facts += out.read_text(errors="replace").splitlines()[-1:]
         lines.append("; ".join(facts))
-    lines += ["", "For docs/measurements.md:", "", f"| {' | '.join(BENCHED)} |", "|---" * len(BENCHED) + "|"]
+    lines += ["", "For docs/measurements.md:", "", f"| {' | '.join(BENCHED)} |"]
+    lines += ["|---" * len(BENCHED) + "|"]
     rows = [row for file in sorted(results.glob("bench-*.out")) for row in read(file, list)]
-    rows.sort(key=lambda row: (row["count"], row["raster"] != "triton"))
     lines += [f"| {' | '.join(str(row.get(key, '-')) for key in BENCHED)} |" for row in rows]
     for row in rows:
         profile = json.dumps({key: row.get(key) for key in ("kernels_ms", "waits", "waits_ms")})
@@ -310,8 +299,9 @@ def table(results: Path) -> str:
     lines += ["", f"| training | {' | '.join(TRAINED)} |", "|---" * (1 + len(TRAINED)) + "|"]
     for folder in sorted(results.glob("train-*/")):
         record = read(folder / "results.json", dict)
-        record |= record.get("metrics", {}) | {"training s": record.get("seconds", {}).get("train")}
-        lines.append(f"| {folder.name} | {' | '.join(str(record.get(key, '-')) for key in TRAINED)} |")
+        record |= record.get("metrics", {}) | {"training_s": record.get("seconds", {}).get("train")}
+        cells = [folder.name, *(str(record.get(key, "-")) for key in TRAINED)]
+        lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
 
 
@@ -325,21 +315,18 @@ def tables(folder: Path) -> str:
             shutil.unpack_archive(file, work, filter="data")
             ends += (results / ENDS).read_text()
             (results / ENDS).write_text(ends)
-        scenes = yaml.safe_load(Path("src/gsbench/analysis/paper.yaml").read_text())["table1"]["scenes"]
-        return f"{table(results)}\n\nThe paper (SSIM, PSNR, LPIPS, million, minutes): {scenes['bonsai']}"
+        paper = yaml.safe_load(Path("src/gsbench/analysis/paper.yaml").read_text())["table1"]
+        said = f"The paper (SSIM, PSNR, LPIPS, million, minutes): {paper['scenes']['bonsai']}"
+        return f"{table(results)}\n\n{said}"
 
 
 def main(verb: str, *words: str) -> int:
-    if verb == "wheels":
-        wheels()
-    elif verb == "table":
-        print(tables(Path(words[0])))
-    else:
-        rows = plan() if verb == "all" else rest(list(words[1:]))
-        seconds = float(words[0]) if words else SECONDS[verb]
-        signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
-        return 0 if Runner(verb, seconds).run(rows) else 1
-    return 0
+    if verb in ("wheels", "table"):
+        print(wheels() if verb == "wheels" else tables(Path(words[0])))
+        return 0
+    signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
+    rows = plan() if verb == "all" else rest(list(words[1:]))
+    return 0 if Runner(verb, float(words[0]) if words else SECONDS[verb]).run(rows) else 1
 
 
 if __name__ == "__main__":
