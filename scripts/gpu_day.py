@@ -13,9 +13,7 @@ import signal
 import subprocess
 import sys
 import tarfile
-import tempfile
 import time
-import zipfile
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -66,10 +64,10 @@ def bench(name: str, raster: str, count: str, needs: str = "") -> Part:
 
 
 def training(arm: str, seed: int) -> Part:
-    words = f"scene=colmap scene.path={STATE}/bonsai init=dataset train=paper eval.at=[7000] device=cuda"
+    words = f"scene=colmap scene.path={STATE}/bonsai init=dataset train=paper eval.at=[7000]"
     if TINY:
-        words = "scene=courtyard scene.views=8 scene.width=32 scene.height=24 init=random init.count=6"
-        words += " train=7k train.iterations=2 device=cpu"
+        words = "scene=courtyard scene.views=8 scene.width=32 scene.height=24 init=random"
+        words += " init.count=6 train=7k train.iterations=2"
     words += f" densify={arm} seed={seed} raster=triton tracking=none eval.download=false"
     return gsbench(f"train-{arm}-{seed}", f"name=gpu_day-{arm}-{seed} {words}")
 
@@ -226,35 +224,37 @@ def wheels() -> str:
     """Pack packages for Python 3.12 on x86-64, the scene and weights into one archive."""
     import pycolmap
 
-    from gsbench.scene.colmap import model_points, read_model
+    from gsbench.scene.colmap import model_points, read_reference
+    from gsbench.scene.readers import read_colmap
 
     new, pinned = STATE / "new", Path("constraints.txt").read_text().split()
     shutil.rmtree(new, ignore_errors=True)
-    platforms = [f"--platform=manylinux{x}_x86_64" for x in ("_2_28", "_2_27", "_2_17", "2014", "1")]
+    platforms = [f"--platform=manylinux{x}_x86_64" for x in ("_2_28", "_2_17", "2014")]
     binary = ["download", "--only-binary=:all:", "--python-version=3.12", *platforms, "-d"]
     for package in PACKAGES.split():
         (release,) = (line for line in pinned if line.startswith(f"{package}=="))
         how = ["wheel", "-w"] if package.startswith("antlr4") else binary  # it has no wheel
         folder = str(new / "wheels" / package)
         subprocess.run([PYTHON, "-m", "pip", "-q", *how, folder, "--no-deps", release], check=True)
-        zipfile.ZipFile(next(Path(folder).glob("*.whl"))).extractall(new / "site")
+        shutil.unpack_archive(next(Path(folder).glob("*.whl")), new / "site", "zip")
     for unused in ("wheels", "site/gsplat/cuda/csrc/third_party/glm/doc"):  # 20 MB
         shutil.rmtree(new / unused, ignore_errors=True)
-    # No training needs tracks and keypoints, 20 MB of bonsai's model. Points keep their order.
-    scene, model_folder = Path(os.environ["GPU_DAY_SCENE"]), new / "bonsai/sparse/0"
-    shutil.copytree(scene / "images", new / "bonsai/images")
-    model = read_model(scene / "sparse/0")
+    # Keypoints and tracks, 20 MB of bonsai's model, only tell which points the chosen images see.
+    capture = read_colmap("bonsai", os.environ["GPU_DAY_SCENE"])
+    model = read_reference(capture)
     cloud = model_points(model)
     model.delete_all_points2D_and_points3D()
     for point, color in zip(*cloud, strict=True):
         model.add_point3D(point, pycolmap.Track(), color)
-    model_folder.mkdir(parents=True)
-    model.write_binary(model_folder)
+    (new / "bonsai/sparse/0").mkdir(parents=True)
+    model.write_binary(new / "bonsai/sparse/0")
+    unseen = set(os.listdir(capture.images)) - set(capture.image_names)
+    shutil.copytree(capture.images, new / "bonsai/images", ignore=lambda *_: unseen)
     (new / "weights").mkdir()
     weights = [x for name in WEIGHTS for x in Path(os.environ["GSBENCH_WEIGHTS"]).rglob(name)]
     for file in weights:
         shutil.copy(file, new / "weights")
-    with lzma.open(ARCHIVE, "wb", filters=SQUEEZED) as file, tarfile.open(None, "w", file) as archive:
+    with lzma.open(ARCHIVE, "wb", filters=SQUEEZED) as xz, tarfile.open(None, "w", xz) as archive:
         archive.add(new, ".")
     size = ARCHIVE.stat().st_size / 2**20
     if size > MOST_CARRIED:
@@ -277,7 +277,7 @@ def read(file: Path, kind: type) -> Any:
 
 
 def table(results: Path) -> str:
-    """What the two documents need, as Markdown."""
+    """Lists and tables for the two documents, as Markdown."""
     ends = read_ends(results)
     lines = ["For docs/gpu.md:", ""]
     for name, record in ends.items():
@@ -309,15 +309,15 @@ def tables(folder: Path) -> str:
     """The tables of all archives in a folder; of a part that ran twice, the later run."""
     import yaml
 
-    with tempfile.TemporaryDirectory() as work:
-        results, ends = Path(work) / "results", ""
-        for file in sorted(folder.glob("gpu_day-*.tar.gz")):  # all, rest
-            shutil.unpack_archive(file, work, filter="data")
-            ends += (results / ENDS).read_text()
-            (results / ENDS).write_text(ends)
-        paper = yaml.safe_load(Path("src/gsbench/analysis/paper.yaml").read_text())["table1"]
-        said = f"The paper (SSIM, PSNR, LPIPS, million, minutes): {paper['scenes']['bonsai']}"
-        return f"{table(results)}\n\n{said}"
+    results, ends = STATE / "tables" / "results", ""
+    shutil.rmtree(results, ignore_errors=True)
+    for file in sorted(folder.glob("gpu_day-*.tar.gz")):  # all, rest
+        shutil.unpack_archive(file, results.parent, filter="data")
+        ends += (results / ENDS).read_text()
+        (results / ENDS).write_text(ends)
+    paper = yaml.safe_load(Path("src/gsbench/analysis/paper.yaml").read_text())["table1"]
+    said = f"The paper (SSIM, PSNR, LPIPS, million, minutes): {paper['scenes']['bonsai']}"
+    return f"{table(results)}\n\n{said}"
 
 
 def main(verb: str, *words: str) -> int:

@@ -204,8 +204,9 @@ def test_without_a_compiled_gsplat_its_parts_are_not_tried(day: Day) -> None:
 
 
 def test_what_it_brings(tmp_path: Path, shared: Path) -> None:
-    """Packages as pinned, and the scene without tracks, with the same points in the same order."""
-    from gsbench.scene.colmap import model_points, read_model
+    """The packages, and the scene without tracks, from which a training takes the same points in the same order."""
+    from gsbench.scene.colmap import model_points, read_reference
+    from gsbench.scene.readers import read_colmap
 
     day = Day(tmp_path)
     scene = shared / "data" / "herz_jesus_p25"
@@ -218,7 +219,7 @@ def test_what_it_brings(tmp_path: Path, shared: Path) -> None:
     there = tmp_path / "there"
     assert {file.name for file in (there / "site").iterdir()} >= {"gsplat", "pycolmap", "antlr4_python3_runtime"}
     assert len(list((there / "bonsai" / "images").iterdir())) == len(list((scene / "images").iterdir()))
-    before, after = read_model(scene / "sparse" / "0"), read_model(there / "bonsai" / "sparse" / "0")
+    before, after = (read_reference(read_colmap("scene", folder)) for folder in (scene, there / "bonsai"))
     for old, new in zip(model_points(before), model_points(after), strict=True):
         assert (old == new).all()
     assert {image.name for image in after.images.values()} == {image.name for image in before.images.values()}

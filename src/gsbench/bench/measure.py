@@ -137,7 +137,7 @@ class Stepper:
 
 
 def per_step(events: Iterable[Any], steps: int, device: torch.device) -> dict[str, dict[str, float]]:
-    """What torch's profiler recorded on ``device`` in ``steps`` steps, for one step.
+    """Times of one step, from what torch's profiler recorded on ``device`` in ``steps`` steps.
 
     ``kernels_ms``: the time of each kernel, the longest first; on a CPU, the own time of each of torch's operators.
     ``waits_ms``: the host's time in each of `WAITING_CALLS`. ``waits``: how often it makes that call.
