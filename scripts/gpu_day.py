@@ -4,7 +4,6 @@ A row has an absolute end: a part that hangs takes no time from later rows; one 
 """
 
 import contextlib
-import io
 import json
 import lzma
 import os
@@ -30,13 +29,10 @@ COUNTS, PEER = (("3",), "cpu") if TINY else (("100000", "1000000", "3000000"), "
 ARMS, SEEDS = ("adc", "volumetric", "volumetric_once"), range(20)
 COMPILATION = "compilation"  # of gsplat, on idle cores; a trial run has nothing to compile
 COMPILE = "0" if TINY else "from gsplat.cuda._backend import _C; assert _C"
-SECONDS = {"all": 540, "rest": 200}
-BENCHED = ("raster", "count", "size", "forward_ms", "loss_ms", "backward_ms", "adam_ms", "step_ms")
-BENCHED += ("steps_per_second", "fps", "peak_memory_mb")
-TRAINED = ("iterations", "num_gaussians", "training_s", "peak_memory_mb", "psnr", "ssim")
-TRAINED += ("lpips_squeeze", "flip")
-PACK_EVERY = 20.0  # seconds
-MOST_KEPT = 2_000_000  # bytes of a file
+BENCHED = "raster count size forward_ms loss_ms backward_ms adam_ms step_ms steps_per_second fps"
+BENCHED += " peak_memory_mb"
+TRAINED = "training iterations num_gaussians train peak_memory_mb psnr ssim lpips_squeeze flip"
+PACK_EVERY, MOST_KEPT = 20.0, 2_000_000  # seconds; bytes of a file
 KEPT = ("results.json", "failed.json", "log.txt", "metrics.jsonl", "events.jsonl", "per_view.csv")
 
 
@@ -179,8 +175,8 @@ class Runner:
 
     def pack(self) -> None:
         """Write all results so far to the archive, unless a file vanishes meanwhile."""
-        self.packed, stream = self.now(), io.BytesIO()
-        with contextlib.suppress(OSError), tarfile.open(fileobj=stream, mode="w:gz") as archive:
+        self.packed, new = self.now(), self.archive.with_suffix(".new")
+        with contextlib.suppress(OSError), tarfile.open(new, "w:gz") as archive:
             for trial in STATE.glob("runs/gpu_day-*/*/*/*-seed*"):
                 target = RESULTS / f"train-{trial.parents[2].name.removeprefix('gpu_day-')}"
                 target.mkdir(exist_ok=True)
@@ -189,8 +185,7 @@ class Runner:
                     shutil.copyfile(file, target / file.name)
             archive.add(RESULTS, "results", filter=lambda x: x if x.size <= MOST_KEPT else None)
             archive.close()
-            self.archive.with_suffix(".new").write_bytes(stream.getvalue())
-            self.archive.with_suffix(".new").replace(self.archive)
+            new.replace(self.archive)
 
 
 def signal_session(session: int, *signals: int) -> None:
@@ -251,9 +246,8 @@ def wheels() -> str:
     unseen = set(os.listdir(capture.images)) - set(capture.image_names)
     shutil.copytree(capture.images, new / "bonsai/images", ignore=lambda *_: unseen)
     (new / "weights").mkdir()
-    weights = [x for name in WEIGHTS for x in Path(os.environ["GSBENCH_WEIGHTS"]).rglob(name)]
-    for file in weights:
-        shutil.copy(file, new / "weights")
+    files = (x for name in WEIGHTS for x in Path(os.environ["GSBENCH_WEIGHTS"]).rglob(name))
+    weights = [shutil.copy(file, new / "weights") for file in files]
     with lzma.open(ARCHIVE, "wb", filters=SQUEEZED) as xz, tarfile.open(None, "w", xz) as archive:
         archive.add(new, ".")
     size = ARCHIVE.stat().st_size / 2**20
@@ -278,9 +272,8 @@ def read(file: Path, kind: type) -> Any:
 
 def table(results: Path) -> str:
     """Lists and tables for the two documents, as Markdown."""
-    ends = read_ends(results)
     lines = ["For docs/gpu.md:", ""]
-    for name, record in ends.items():
+    for name, record in read_ends(results).items():
         end = "yes" if record["end"] == 0 else f"NO ({record['end']})"
         facts, out = [f"- {name}: {end}, {record['seconds']:.0f} s"], results / f"{name}.out"
         if name.startswith("proof-"):
@@ -289,20 +282,26 @@ def table(results: Path) -> str:
         elif name.startswith(("contract", "bits", "memcheck", "racecheck")) and out.exists():
             facts += out.read_text(errors="replace").splitlines()[-1:]
         lines.append("; ".join(facts))
-    lines += ["", "For docs/measurements.md:", "", f"| {' | '.join(BENCHED)} |"]
-    lines += ["|---" * len(BENCHED) + "|"]
     rows = [row for file in sorted(results.glob("bench-*.out")) for row in read(file, list)]
-    lines += [f"| {' | '.join(str(row.get(key, '-')) for key in BENCHED)} |" for row in rows]
+    lines += ["", "For docs/measurements.md:", "", *markdown(BENCHED, rows)]
     for row in rows:
         profile = json.dumps({key: row.get(key) for key in ("kernels_ms", "waits", "waits_ms")})
         lines += ["", f"{row['raster']}, {row['count']}: {profile}"]
-    lines += ["", f"| training | {' | '.join(TRAINED)} |", "|---" * (1 + len(TRAINED)) + "|"]
+    rows = []
     for folder in sorted(results.glob("train-*/")):
-        record = read(folder / "results.json", dict)
-        record |= record.get("metrics", {}) | {"training_s": record.get("seconds", {}).get("train")}
-        cells = [folder.name, *(str(record.get(key, "-")) for key in TRAINED)]
+        record = read(folder / "results.json", dict) | {"training": folder.name}
+        rows.append(record | record.get("metrics", {}) | record.get("seconds", {}))
+    return "\n".join([*lines, "", *markdown(TRAINED, rows)])
+
+
+def markdown(names: str, rows: list[dict[str, Any]]) -> list[str]:
+    """Lines of a table with these columns."""
+    lines = [f"| {names.replace(' ', ' | ')} |", "|---" * len(names.split()) + "|"]
+    for row in rows:
+        values = [row.get(name, "-") for name in names.split()]
+        cells = (f"{x:.5g}" if isinstance(x, float) else str(x) for x in values)
         lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines)
+    return lines
 
 
 def tables(folder: Path) -> str:
@@ -315,9 +314,8 @@ def tables(folder: Path) -> str:
         shutil.unpack_archive(file, results.parent, filter="data")
         ends += (results / ENDS).read_text()
         (results / ENDS).write_text(ends)
-    paper = yaml.safe_load(Path("src/gsbench/analysis/paper.yaml").read_text())["table1"]
-    said = f"The paper (SSIM, PSNR, LPIPS, million, minutes): {paper['scenes']['bonsai']}"
-    return f"{table(results)}\n\n{said}"
+    paper = yaml.safe_load(Path("src/gsbench/analysis/paper.yaml").read_text())["table1"]["scenes"]
+    return f"{table(results)}\n\nPaper (SSIM, PSNR, LPIPS, million, minutes): {paper['bonsai']}"
 
 
 def main(verb: str, *words: str) -> int:
@@ -325,8 +323,9 @@ def main(verb: str, *words: str) -> int:
         print(wheels() if verb == "wheels" else tables(Path(words[0])))
         return 0
     signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
+    seconds = float(words[0]) if words else {"all": 540.0, "rest": 200.0}[verb]
     rows = plan() if verb == "all" else rest(list(words[1:]))
-    return 0 if Runner(verb, float(words[0]) if words else SECONDS[verb]).run(rows) else 1
+    return 0 if Runner(verb, seconds).run(rows) else 1
 
 
 if __name__ == "__main__":

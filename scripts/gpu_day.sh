@@ -2,8 +2,7 @@
 # Checks and measures raster=triton in fifteen minutes on a borrowed machine with a GPU, offline.
 #   scripts/gpu_day.sh wheels                 before, with a network: packs gpu_day/brought.tar.xz
 #   scripts/gpu_day.sh all [SECONDS]          there: every part, one command of nine minutes (540)
-#   scripts/gpu_day.sh rest [SECONDS [PART…]] there: these, else those that did not end well,
-#                                             else trainings of the next seed (200)
+#   scripts/gpu_day.sh rest [SECONDS [PART…]] there: these, what failed, or another seed (200)
 #   scripts/gpu_day.sh table FOLDER           after: tables for docs/gpu.md and docs/measurements.md
 # docs/measurements.md says more. GPU_DAY_TINY=1 tries all without a GPU, in Triton's interpreter.
 set -euo pipefail
@@ -17,5 +16,5 @@ export GSBENCH_WEIGHTS=${GSBENCH_WEIGHTS:-$GPU_DAY_STATE/weights}
 if [ "${GPU_DAY_TINY:-}" ]; then export TRITON_INTERPRET=1 OMP_NUM_THREADS=1; fi
 mkdir -p "$GPU_DAY_BROUGHT" "$GPU_DAY_STATE/results" "$OUT"
 case ${1:-} in wheels | all | rest | table) exec "$PYTHON" scripts/gpu_day.py "$@" ;; esac
-sed -n '2,8s/^# \{0,1\}//p' "${BASH_SOURCE[0]}"
+sed -n '2,7s/^# \{0,1\}//p' "${BASH_SOURCE[0]}"
 exit 2
