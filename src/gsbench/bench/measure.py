@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch.autograd import DeviceType
 from torch.profiler import ProfilerActivity, profile
 
 from gsbench.bench.scenes import SEED, make_scene
@@ -143,7 +142,7 @@ def per_step(events: Iterable[Any], steps: int, device: torch.device) -> dict[st
     ``waits_ms``: the host's time in each of `WAITING_CALLS`. ``waits``: how often it makes that call.
     """
     on_gpu = device.type == "cuda"
-    kind = DeviceType.CUDA if on_gpu else DeviceType.CPU
+    kind = "CUDA" if on_gpu else "CPU"
     times: dict[str, float] = {}
     waits: dict[str, float] = {}
     waits_ms: dict[str, float] = {}
@@ -152,7 +151,7 @@ def per_step(events: Iterable[Any], steps: int, device: torch.device) -> dict[st
         if event.key in WAITING_CALLS:
             waits[event.key] = event.count / steps
             waits_ms[event.key] = round(own_ms, 4)
-        elif event.device_type == kind:
+        elif event.device_type.name == kind:
             times[event.key] = event.self_device_time_total / 1e3 / steps if on_gpu else own_ms
     ordered = sorted(times.items(), key=lambda item: -item[1])
     kernels = {name: round(value, 4) for name, value in ordered[:LONGEST_KERNELS]}
