@@ -184,7 +184,13 @@ def test_a_killed_command_leaves_the_results_so_far_and_no_process(day: Day) -> 
     process.communicate(timeout=60)
     ends = day.results("all")
     assert (ends["proof-triton"], ends["bits"], ends["train-adc-0"]) == (0, 0, "out of time")
+    assert "memcheck" not in ends
     assert not child.exists() or "\nState:\tZ" in (child / "status").read_text()
+
+    # The rest is what failed and what was never reached.
+    assert day.run("rest", "60")[0] == 0
+    rest = day.results("rest")
+    assert (rest["train-adc-0"], rest["memcheck"]) == (0, 0)
 
 
 def test_named_parts_and_a_name_that_is_none(day: Day) -> None:
@@ -240,6 +246,12 @@ def test_a_table_of_two_commands(day: Day) -> None:
     assert "| triton | 3 | 16x16 | - | - | - | - | 1.25 | - | - | - |" in said
     assert 'triton, 3: {"kernels_ms": {"_blend": 0.5}, "waits": {"cudaStreamSynchronize": 1.0}' in said
     assert "| train-volumetric_once-0 | 30000 | 12345 | 99.5 | - | 31.543 | - | - | - |" in said
+
+
+def test_a_sanitizer_that_refuses_the_device_is_not_a_failure_of_the_kernels(day: Day) -> None:
+    (day.out.parent / "compute-sanitizer").write_text("#!/bin/sh\necho '= Error: Device not supported'; exit 1\n")
+    assert day.run("rest", "60", "memcheck")[0] == 1
+    assert "- memcheck: not tried, since" in day.run("table", str(day.out))[1]
 
 
 def test_words_that_it_does_not_know(tmp_path: Path) -> None:
