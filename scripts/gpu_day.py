@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 PYTHON = os.environ["PYTHON"]
 BROUGHT, STATE, OUT = (Path(os.environ[k]) for k in ("GPU_DAY_BROUGHT", "GPU_DAY_STATE", "OUT"))
-RESULTS, ARCHIVE, ENDS = STATE / "results", BROUGHT / "brought.tar.xz", "parts.jsonl"
+RESULTS, ARCHIVE = STATE / "results", BROUGHT / "brought.tar.xz"
 PACKAGES = "hydra-core omegaconf pydantic pydantic_core annotated-types typing-inspection"
 PACKAGES += " flip-evaluator plyfile pycolmap gsplat antlr4-python3-runtime"
 WEIGHTS = ("squeezenet1_1*.pth", "lpips_v0.1_squeeze.pth")
@@ -100,7 +100,7 @@ class Runner:
     """Runs rows of parts in ``seconds``; what a part says and how it ends is in $OUT at once."""
 
     def __init__(self, verb: str, seconds: float) -> None:
-        self.archive = OUT / f"gpu_day-{verb}.tar.gz"
+        self.archive, self.records = OUT / f"gpu_day-{verb}.tar.gz", RESULTS / f"parts-{verb}.jsonl"
         self.begin, self.seconds, self.packed = time.monotonic(), seconds, 0.0
         self.running: dict[str, tuple[subprocess.Popen[bytes], float]] = {}  # with its begin
         self.ends: dict[str, int | str] = {}  # an exit code, minus a signal, or why there is none
@@ -118,7 +118,7 @@ class Runner:
 
     def record(self, name: str, end: int | str, seconds: float) -> None:
         self.ends[name] = end
-        with (RESULTS / ENDS).open("a") as file:
+        with self.records.open("a") as file:
             file.write(json.dumps({"part": name, "end": end, "seconds": round(seconds, 1)}) + "\n")
         print(f"{self.now():4.0f} s  {name}: {end} after {seconds:.0f} s", flush=True)
         for file in (RESULTS / f"{name}.log", RESULTS / f"{name}.out"):
@@ -150,8 +150,8 @@ class Runner:
             signal_session(process.pid, signal.SIGKILL)
             self.record(name, "out of time", self.now() - begin)
 
-    def run(self, rows: list[Row]) -> bool:
-        """Run ``rows``; whether all parts ended well."""
+    def run(self, rows: list[Row]) -> int:
+        """Run ``rows``; 0 if all parts ended well, else 1."""
         until, planned = 0.0, sum(row.seconds for row in rows)
         try:
             for row in rows:
@@ -170,7 +170,7 @@ class Runner:
         finally:
             self.end(list(self.running), 1.0)
             (OUT / "table.md").write_text(table(RESULTS))
-        return all(end == 0 for end in self.ends.values())
+        return 0 if all(end == 0 for end in self.ends.values()) else 1
 
     def pack(self) -> None:
         """Write all results so far to the archive, unless a file vanishes meanwhile."""
@@ -196,14 +196,13 @@ def signal_session(session: int, *signals: int) -> None:
                     os.kill(int(stat.parent.name), number)
 
 
-def rest(names: list[str]) -> list[Row]:
+def rest(names: tuple[str, ...]) -> list[Row]:
     """Rows of the named parts, else of what did not end well in `all`, else of the next seed."""
-    ends = read_ends(RESULTS)
-    planned = {part.name for row in plan() for part in row.parts}
-    failed = {name for name in planned | set(ends) if ends.get(name, {}).get("end") != 0}
-    seed = sum(f"train-{ARMS[0]}-{seed}" in ends for seed in SEEDS)
-    wanted = set(names) or failed or {f"train-{arm}-{seed}" for arm in ARMS}
-    wanted |= {part.needs for row in plan() for part in row.parts if part.name in wanted} - {""}
+    done = {name for name, record in read_ends(RESULTS).items() if record["end"] == 0}
+    parts = [part for row in plan() for part in row.parts]
+    seed = sum(f"train-{ARMS[0]}-{seed}" in done for seed in SEEDS)
+    wanted = set(names) or {x.name for x in parts} - done or {f"train-{arm}-{seed}" for arm in ARMS}
+    wanted |= {part.needs for part in parts if part.name in wanted} - {""}
     wanted |= set() if (STATE / "site").exists() else {"install"}
     rows = []
     for row in (row for seed in SEEDS for row in plan(seed)):
@@ -258,8 +257,9 @@ def wheels() -> str:
 
 def read_ends(results: Path) -> dict[str, dict[str, Any]]:
     """The last record of each part."""
-    lines = (results / ENDS).read_text().splitlines() if (results / ENDS).exists() else []
-    return {record["part"]: record for record in map(json.loads, lines)}
+    files = sorted(results.glob("parts-*.jsonl"))  # all, rest
+    records = (json.loads(line) for file in files for line in file.read_text().splitlines())
+    return {record["part"]: record for record in records}
 
 
 def read(file: Path, kind: type) -> Any:
@@ -310,12 +310,10 @@ def markdown(names: str, rows: list[dict[str, Any]]) -> list[str]:
 
 def tables(folder: Path) -> str:
     """The tables of all archives in a folder; of a part that ran twice, the later run."""
-    results, ends = STATE / "tables" / "results", ""
+    results = STATE / "tables" / "results"
     shutil.rmtree(results, ignore_errors=True)
     for file in sorted(folder.glob("gpu_day-*.tar.gz")):  # all, rest
         shutil.unpack_archive(file, results.parent, filter="data")
-        ends += (results / ENDS).read_text()
-        (results / ENDS).write_text(ends)
     paper = Path("src/gsbench/analysis/paper.yaml").read_text().splitlines()
     (row, *_) = (line.strip() for line in paper if line.startswith("    bonsai:"))
     return f"{table(results)}\n\nThe paper: SSIM, PSNR, LPIPS, million Gaussians, minutes; {row}"
@@ -327,8 +325,7 @@ def main(verb: str, *words: str) -> int:
         return 0
     signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
     seconds = float(words[0]) if words else {"all": 540.0, "rest": 200.0}[verb]
-    rows = plan() if verb == "all" else rest(list(words[1:]))
-    return 0 if Runner(verb, seconds).run(rows) else 1
+    return Runner(verb, seconds).run(plan() if verb == "all" else rest(words[1:]))
 
 
 if __name__ == "__main__":

@@ -117,7 +117,7 @@ class Day:
     def results(self, verb: str) -> dict[str, Any]:
         """How each part ended, of the archive in $OUT; and the names of its files below "files"."""
         with tarfile.open(self.out / f"gpu_day-{verb}.tar.gz") as archive:
-            file = archive.extractfile("results/parts.jsonl")
+            file = archive.extractfile(f"results/parts-{verb}.jsonl")
             assert file is not None
             records = [json.loads(line) for line in file.read().splitlines()]
             return {record["part"]: record["end"] for record in records} | {"files": archive.getnames()}
