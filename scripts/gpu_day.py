@@ -1,186 +1,332 @@
-"""The Python parts of gpu_day.sh: the machine's facts, whether renders are equal bit by bit, the table of results."""
+"""The Python part of gpu_day.sh. Parts of a row run side by side, rows one after the other.
 
-from __future__ import annotations
+A row has an absolute end: a part that hangs takes no time from later rows; one that is fast gives.
+"""
 
-import argparse
+import contextlib
 import json
+import lzma
+import os
+import shutil
+import signal
+import subprocess
 import sys
-from collections.abc import Iterator
+import tarfile
+import time
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-NOTHING = "-"
-MODEL = "bench-model"
-
-
-def machine() -> dict[str, str]:
-    """The GPU and the versions on which the measurements depend."""
-    from importlib.metadata import version
-
-    import torch
-    import triton
-
-    import gsbench
-
-    has_gpu = torch.cuda.is_available()
-    return {
-        "gpu": torch.cuda.get_device_name() if has_gpu else "none (Triton's interpreter)",
-        "cuda": str(torch.version.cuda),
-        "torch": torch.__version__,
-        "triton": triton.__version__,
-        "numpy": version("numpy"),
-        "python": sys.version.split()[0],
-        "gsbench": gsbench.__version__,
-    }
+PYTHON = os.environ["PYTHON"]
+BROUGHT, STATE, OUT = (Path(os.environ[k]) for k in ("GPU_DAY_BROUGHT", "GPU_DAY_STATE", "OUT"))
+RESULTS, ARCHIVE = STATE / "results", BROUGHT / "brought.tar.xz"
+PACKAGES = "hydra-core omegaconf pydantic pydantic_core annotated-types typing-inspection"
+PACKAGES += " flip-evaluator plyfile pycolmap gsplat antlr4-python3-runtime"
+WEIGHTS = ("squeezenet1_1*.pth", "lpips_v0.1_squeeze.pth")
+MOST_CARRIED = 45  # MiB
+SQUEEZED = [{"id": lzma.FILTER_X86}, {"id": lzma.FILTER_LZMA2, "preset": 6, "dict_size": 1 << 26}]
+TINY = bool(os.environ.get("GPU_DAY_TINY"))
+COUNTS, PEER = (("3",), "cpu") if TINY else (("100000", "1000000", "3000000"), "gsplat")
+ARMS, SEEDS = ("adc", "volumetric", "volumetric_once"), range(20)
+COMPILATION = "compilation"  # of gsplat, on idle cores; a trial run has nothing to compile
+COMPILE = "0" if TINY else "from gsplat.cuda._backend import _C; assert _C"
+BENCHED = "raster count size forward_ms loss_ms backward_ms adam_ms step_ms steps_per_second fps"
+BENCHED += " peak_memory_mb"
+TRAINED = "training iterations num_gaussians train peak_memory_mb psnr ssim lpips_squeeze flip"
+PACK_EVERY, MOST_KEPT = 20.0, 2_000_000  # seconds; bytes of a file
+KEPT = ("results.json", "failed.json", "log.txt", "metrics.jsonl", "events.jsonl", "per_view.csv")
 
 
-def bits(device: str, width: int, height: int, count: int) -> list[str]:
-    """The names of outputs that differ among three runs of render, loss and gradients.
+class Part(NamedTuple):
+    name: str
+    command: list[str]
+    needs: str = ""  # the part that must have ended well
 
-    The runs are on new memory, on used memory, and by new objects with new memory pools.
-    """
-    import torch
 
-    from gsbench.bench.scenes import make_scene
-    from gsbench.raster.triton.executor import TritonRasterizer
-    from gsbench.train.loss_triton import TritonLoss
+class Row(NamedTuple):
+    parts: list[Part]
+    seconds: float  # of the plan; 0: in the background
+    alone: bool = False  # for timing: the compilation pauses
+    grace: float = 1.0  # seconds from SIGTERM, when a training writes its checkpoint, to SIGKILL
 
-    gaussians, scene = make_scene("skewed", width, height, count)
-    target = torch.from_numpy(scene.train[0].image).to(device)
-    background = torch.zeros(3, device=device)
 
-    def run(rasterizer: TritonRasterizer, loss: TritonLoss) -> dict[str, torch.Tensor]:
-        leaves = gaussians.map(lambda tensor: tensor.to(device).requires_grad_())
-        output = rasterizer.render(leaves, scene.train[0].camera, 3, background, absolute_gradient=True)
-        value = loss(output.image, target)[0]
-        value.backward()
-        outputs = {"image": output.image, "alpha": output.alpha, "radii": output.radii, "loss": value}
-        outputs |= {"screen": output.screen_points.grad, "absolute": output.screen_gradient_abs}
-        outputs |= {f"gradient of {name}": tensor.grad for name, tensor in leaves.tensors().items()}
-        return {name: tensor.detach().cpu() for name, tensor in outputs.items()}
+def gsbench(name: str, words: str, needs: str = "") -> Part:
+    return Part(name, [PYTHON, "-m", "gsbench.cli", *words.split()], needs)
 
-    rasterizer, loss = TritonRasterizer(), TritonLoss(0.2)
-    first = run(rasterizer, loss)
-    others = [run(rasterizer, loss), run(TritonRasterizer(), TritonLoss(0.2))]
-    if not first["gradient of means"].abs().max() > 0:
-        raise RuntimeError("nothing was seen: equal bits would say nothing")
-    return sorted({name for other in others for name, tensor in first.items() if not torch.equal(tensor, other[name])})
+
+def bench(name: str, raster: str, count: str, needs: str = "") -> Part:
+    at = "16x16 --repeats 1" if TINY else "1600x1060 --repeats 10"
+    words = f"bench --raster {raster} --count {count} --kernels --json --size {at}"
+    return gsbench(f"bench-{name}", words, needs)
+
+
+def training(arm: str, seed: int) -> Part:
+    words = f"scene=colmap scene.path={STATE}/bonsai init=dataset train=paper eval.at=[7000]"
+    if TINY:
+        words = "scene=courtyard scene.views=8 scene.width=32 scene.height=24 init=random"
+        words += " init.count=6 train=7k train.iterations=2"
+    words += f" densify={arm} seed={seed} raster=triton tracking=none eval.download=false"
+    return gsbench(f"train-{arm}-{seed}", f"name=gpu_day-{arm}-{seed} {words}")
+
+
+def check(name: str, words: str, needs: str = "", tool: str = "") -> Part:
+    """Tests, below a ``tool`` of compute-sanitizer, which needs an allocation for each tensor."""
+    checker = "env PYTORCH_NO_CUDA_MEMORY_CACHING=1 compute-sanitizer --error-exitcode 9 --tool"
+    before = [*checker.split(), tool] if tool else []
+    command = [*before, PYTHON, "-m", "pytest", "-q", "-p", "no:cacheprovider", *words.split(";")]
+    return Part(name, command, needs)
+
+
+def plan(seed: int = 0) -> list[Row]:
+    """All parts, the most telling first; the trainings with ``seed``."""
+    contract, bits = "tests/raster/test_contract.py;-k;", "tests/raster/test_same_bits.py"
+    some = " and nothing_to_see" if TINY else ""
+    of_peer = f"tests/raster/test_gsplat.py;{contract}on_a_gpu or {PEER}{some}"
+    peer = [gsbench(f"proof-{PEER}", f"doctor --json --prove --raster {PEER}", COMPILATION)]
+    peer += [check(f"contract-{PEER}", of_peer, COMPILATION)]
+    return [
+        Row([Part("install", [PYTHON, "-m", "tarfile", "-e", str(ARCHIVE), str(STATE)])], 25),
+        Row([Part(COMPILATION, ["nice", "-n", "19", PYTHON, "-c", COMPILE])], 0),
+        Row([gsbench("proof-triton", "doctor --json --prove --raster triton")], 70),
+        Row([check("contract", f"{contract}triton{some}"), check("bits", bits)], 60),
+        *(Row([bench(f"triton-{n}", "triton", n)], 90 / len(COUNTS), True) for n in COUNTS),
+        Row([training(arm, seed) for arm in ARMS], 200, grace=8.0),
+        Row([bench(PEER, PEER, ",".join(COUNTS), COMPILATION)], 35),
+        Row(peer, 25),
+        Row([check(tool, f"{bits};-k;tiny", tool=tool) for tool in ("memcheck", "racecheck")], 35),
+    ]
+
+
+class Runner:
+    """Runs rows of parts in ``seconds``; what a part says and how it ends is in $OUT at once."""
+
+    def __init__(self, verb: str, seconds: float) -> None:
+        self.archive, self.records = OUT / f"gpu_day-{verb}.tar.gz", RESULTS / f"parts-{verb}.jsonl"
+        self.begin, self.seconds, self.packed = time.monotonic(), seconds, 0.0
+        self.running: dict[str, tuple[subprocess.Popen[bytes], float]] = {}  # with its begin
+        self.ends: dict[str, int | str] = {}  # an exit code, minus a signal, or why there is none
+
+    def now(self) -> float:
+        return time.monotonic() - self.begin
+
+    def start(self, part: Part) -> None:
+        if part.needs and self.ends.get(part.needs) != 0:
+            return self.record(part.name, f"not tried: no {part.needs}", 0.0)
+        where = RESULTS / part.name
+        with open(f"{where}.out", "wb") as out, open(f"{where}.log", "wb") as log:
+            process = subprocess.Popen(part.command, stdout=out, stderr=log, start_new_session=True)
+        self.running[part.name] = process, self.now()
+
+    def record(self, name: str, end: int | str, seconds: float) -> None:
+        self.ends[name] = end
+        with self.records.open("a") as file:
+            file.write(json.dumps({"part": name, "end": end, "seconds": round(seconds, 1)}) + "\n")
+        print(f"{self.now():4.0f} s  {name}: {end} after {seconds:.0f} s", flush=True)
+        for file in (RESULTS / f"{name}.log", RESULTS / f"{name}.out"):
+            if end != 0 and file.exists():
+                print(*file.read_text(errors="replace").splitlines()[-8:], sep="\n")
+        self.pack()
+
+    def wait(self, names: list[str], until: float) -> None:
+        """Wait for the parts until ``until``, in seconds after the begin."""
+        while any(name in self.running for name in names) and self.now() < until:
+            for name, (process, begin) in list(self.running.items()):
+                if process.poll() is not None:
+                    del self.running[name]
+                    self.record(name, process.returncode, self.now() - begin)
+            if self.now() - self.packed > PACK_EVERY:
+                self.pack()
+            time.sleep(0.1)
+
+    def end(self, names: list[str], grace: float) -> None:
+        """End the parts that still run. Nothing waits for a process that SIGKILL does not end."""
+        names = [name for name in names if name in self.running]
+        for name in names:
+            signal_session(self.running[name][0].pid, signal.SIGCONT, signal.SIGTERM)
+        until = self.now() + grace
+        while self.now() < until and any(self.running[name][0].poll() is None for name in names):
+            time.sleep(0.1)
+        for name in names:
+            process, begin = self.running.pop(name)
+            signal_session(process.pid, signal.SIGKILL)
+            self.record(name, "out of time", self.now() - begin)
+
+    def run(self, rows: list[Row]) -> int:
+        """Run ``rows``; 0 if all parts ended well, else 1."""
+        until, planned = 0.0, sum(row.seconds for row in rows)
+        try:
+            for row in rows:
+                until += row.seconds * self.seconds / planned
+                names = [part.name for part in row.parts]
+                if COMPILATION in self.running:
+                    number = signal.SIGSTOP if row.alone else signal.SIGCONT
+                    signal_session(self.running[COMPILATION][0].pid, number)
+                if row.parts[0].needs:
+                    self.wait([COMPILATION], (self.now() + until) / 2)
+                for part in row.parts:
+                    self.start(part)
+                if row.seconds:
+                    self.wait(names, until - row.grace)
+                    self.end(names, row.grace)
+        finally:
+            self.end(list(self.running), 1.0)
+            (OUT / "table.md").write_text(table(RESULTS))
+        return 0 if all(end == 0 for end in self.ends.values()) else 1
+
+    def pack(self) -> None:
+        """Write all results so far to the archive, unless a file vanishes meanwhile."""
+        self.packed, new = self.now(), self.archive.with_suffix(".new")
+        with contextlib.suppress(OSError), tarfile.open(new, "w:gz") as archive:
+            for trial in STATE.glob("runs/gpu_day-*/*/*/*-seed*"):
+                target = RESULTS / f"train-{trial.parents[2].name.removeprefix('gpu_day-')}"
+                target.mkdir(exist_ok=True)
+                files = [trial / name for name in KEPT] + sorted(trial.glob("renders/*.png"))[:1]
+                for file in filter(Path.is_file, files):
+                    shutil.copyfile(file, target / file.name)
+            archive.add(RESULTS, "results", filter=lambda x: x if x.size <= MOST_KEPT else None)
+            archive.close()
+            new.replace(self.archive)
+
+
+def signal_session(session: int, *signals: int) -> None:
+    """Send signals to a whole session: ninja gives each compiler a process group of its own."""
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        with contextlib.suppress(OSError):  # it has just ended
+            if int(stat.read_text().rpartition(")")[2].split()[3]) == session:
+                for number in signals:
+                    os.kill(int(stat.parent.name), number)
+
+
+def rest(names: tuple[str, ...]) -> list[Row]:
+    """Rows of the named parts, else of what did not end well in `all`, else of the next seed."""
+    done = {name for name, record in read_ends(RESULTS).items() if record["end"] == 0}
+    parts = [part for row in plan() for part in row.parts]
+    seed = sum(f"train-{ARMS[0]}-{seed}" in done for seed in SEEDS)
+    wanted = set(names) or {x.name for x in parts} - done or {f"train-{arm}-{seed}" for arm in ARMS}
+    wanted |= {part.needs for part in parts if part.name in wanted} - {""}
+    wanted |= set() if (STATE / "site").exists() else {"install"}
+    rows = []
+    for row in (row for seed in SEEDS for row in plan(seed)):
+        parts = [part for part in row.parts if part.name in wanted]
+        wanted -= {part.name for part in parts}
+        rows += [row._replace(parts=parts)] if parts else []
+    if wanted:
+        sys.exit(f"there is no part {', '.join(sorted(wanted))}")
+    return rows
+
+
+def wheels() -> str:
+    """Pack packages for Python 3.12 on x86-64, the scene and weights into one archive."""
+    import pycolmap
+
+    from gsbench.scene.colmap import model_points, read_reference
+    from gsbench.scene.readers import read_colmap
+
+    new, pinned = STATE / "new", Path("constraints.txt").read_text().split()
+    shutil.rmtree(new, ignore_errors=True)
+    platforms = [f"--platform=manylinux{x}_x86_64" for x in ("_2_28", "_2_17", "2014")]
+    binary = ["download", "--only-binary=:all:", "--python-version=3.12", *platforms, "-d"]
+    for package in PACKAGES.split():
+        (release,) = (line for line in pinned if line.startswith(f"{package}=="))
+        how = ["wheel", "-w"] if package.startswith("antlr4") else binary  # it has no wheel
+        folder = str(new / "wheels" / package)
+        subprocess.run([PYTHON, "-m", "pip", "-q", *how, folder, "--no-deps", release], check=True)
+        shutil.unpack_archive(next(Path(folder).glob("*.whl")), new / "site", "zip")
+    for unused in ("wheels", "site/gsplat/cuda/csrc/third_party/glm/doc"):  # 20 MB
+        shutil.rmtree(new / unused, ignore_errors=True)
+    # Keypoints and tracks, 20 MB of bonsai's model, only tell which points the chosen images see.
+    capture = read_colmap("bonsai", os.environ["GPU_DAY_SCENE"])
+    model = read_reference(capture)
+    cloud = model_points(model)
+    model.delete_all_points2D_and_points3D()
+    for point, color in zip(*cloud, strict=True):
+        model.add_point3D(point, pycolmap.Track(), color)
+    (new / "bonsai/sparse/0").mkdir(parents=True)
+    model.write_binary(new / "bonsai/sparse/0")
+    unseen = set(os.listdir(capture.images)) - set(capture.image_names)
+    shutil.copytree(capture.images, new / "bonsai/images", ignore=lambda *_: unseen)
+    (new / "weights").mkdir()
+    files = (x for name in WEIGHTS for x in Path(os.environ["GSBENCH_WEIGHTS"]).rglob(name))
+    weights = [shutil.copy(file, new / "weights") for file in files]
+    with lzma.open(ARCHIVE, "wb", filters=SQUEEZED) as xz, tarfile.open(None, "w", xz) as archive:
+        archive.add(new, ".")
+    size = ARCHIVE.stat().st_size / 2**20
+    if size > MOST_CARRIED:
+        sys.exit(f"{ARCHIVE} has {size:.1f} MiB, more than {MOST_CARRIED}: leave something out")
+    return f"{ARCHIVE}: {size:.1f} MiB, {len(weights)} files of weights"
+
+
+def read_ends(results: Path) -> dict[str, dict[str, Any]]:
+    """The last record of each part."""
+    files = sorted(results.glob("parts-*.jsonl"))  # all, rest
+    records = (json.loads(line) for file in files for line in file.read_text().splitlines())
+    return {record["part"]: record for record in records}
+
+
+def read(file: Path, kind: type) -> Any:
+    """The JSON in a file, or an empty ``kind`` if it is missing, cut off, or something else."""
+    with contextlib.suppress(OSError, ValueError):
+        value = json.loads(file.read_text())
+        return value if isinstance(value, kind) else kind()
+    return kind()
 
 
 def table(results: Path) -> str:
-    """All results as Markdown."""
-    return "\n\n".join(part for part in (_head(results), _speed(results), _training(results)) if part)
+    """Lists and tables for the two documents, as Markdown."""
+    lines = ["For docs/gpu.md:", ""]
+    for name, record in read_ends(results).items():
+        end = "yes" if record["end"] == 0 else f"NO ({record['end']})"
+        out = results / f"{name}.out"
+        text = out.read_text(errors="replace") if out.exists() else ""
+        if "Device not supported" in text:  # says compute-sanitizer
+            end = "not tried, since compute-sanitizer does not support the device"
+        facts = [f"- {name}: {end}, {record['seconds']:.0f} s"]
+        if name.startswith("proof-"):
+            proven = read(out, dict)
+            facts += [f"{key} {proven.get(key)}" for key in ("device", "versions", "errors")]
+        elif name.startswith(("contract", "bits", "memcheck", "racecheck")):
+            facts += text.splitlines()[-1:]
+        lines.append("; ".join(facts))
+    rows = [row for file in sorted(results.glob("bench-*.out")) for row in read(file, list)]
+    lines += ["", "For docs/measurements.md:", "", *markdown(BENCHED, rows)]
+    for row in rows:
+        profile = json.dumps({key: row.get(key) for key in ("kernels_ms", "waits", "waits_ms")})
+        lines += ["", f"{row['raster']}, {row['count']}: {profile}"]
+    rows = []
+    for folder in sorted(results.glob("train-*/")):
+        record = read(folder / "results.json", dict) | {"training": folder.name}
+        rows.append(record | record.get("metrics", {}) | record.get("seconds", {}))
+    return "\n".join([*lines, "", *markdown(TRAINED, rows)])
 
 
-def _head(results: Path) -> str:
-    facts = _read(results / "machine.out") or {}
-    lines = [f"Measured on: {', '.join(f'{name} {value}' for name, value in facts.items()) or 'unknown'}.", ""]
-    ends = _ends(results)
-    contract = _last_line(results / "contract.out")
-    lines += [f"- contract: {_end(ends, 'contract')}{f' ({contract})' if contract else ''}"]
-    lines += [f"- the same bits, three times: {_end(ends, 'bits')}{_differing(results)}"]
-    lines += [f"- memory checker: {_end(ends, 'memcheck')}"]
-    failed = [f"{name} ({code})" for name, code in ends.items() if code != "0"]
-    return "\n".join(lines + ([f"- **did not end well**: {', '.join(failed)}"] if failed else []))
+def markdown(names: str, rows: list[dict[str, Any]]) -> list[str]:
+    """Lines of a table with these columns."""
+    lines = [f"| {names.replace(' ', ' | ')} |", "|---" * len(names.split()) + "|"]
+    for row in rows:
+        values = [row.get(name, "-") for name in names.split()]
+        cells = (f"{x:.5g}" if isinstance(x, float) else str(x) for x in values)
+        lines.append(f"| {' | '.join(cells)} |")
+    return lines
 
 
-def _differing(results: Path) -> str:
-    differing = (_read(results / "bits.out") or {}).get("differing")
-    return f"; different: {', '.join(differing)}" if differing else ""
+def tables(folder: Path) -> str:
+    """The tables of all archives in a folder; of a part that ran twice, the later run."""
+    results = STATE / "tables" / "results"
+    shutil.rmtree(results, ignore_errors=True)
+    for file in sorted(folder.glob("gpu_day-*.tar.gz")):  # all, rest
+        shutil.unpack_archive(file, results.parent, filter="data")
+    paper = Path("src/gsbench/analysis/paper.yaml").read_text().splitlines()
+    (row, *_) = (line.strip() for line in paper if line.startswith("    bonsai:"))
+    return f"{table(results)}\n\nThe paper: SSIM, PSNR, LPIPS, million Gaussians, minutes; {row}"
 
 
-def _ends(results: Path) -> dict[str, str]:
-    """The exit code of each step's last run."""
-    file = results / "steps.tsv"
-    rows = [line.split("\t") for line in file.read_text().splitlines()] if file.is_file() else []
-    return {row[0]: row[1] for row in rows}
-
-
-def _end(ends: dict[str, str], name: str) -> str:
-    return {"0": "yes", None: "not tried"}.get(ends.get(name), f"NO (exit {ends.get(name)})")
-
-
-def _benches(results: Path) -> Iterator[tuple[str, list[dict[str, Any]]]]:
-    for file in sorted(results.glob("bench-*.out"), key=_order):
-        if rows := _read(file):
-            yield ("a trained bonsai" if file.stem == MODEL else rows[0]["scene"]), rows
-
-
-def _order(file: Path) -> tuple[bool, str, int]:
-    scene, _, count = file.stem.removeprefix("bench-").rpartition("-")
-    return file.stem == MODEL, scene, int(count) if count.isdigit() else 0
-
-
-def _speed(results: Path) -> str:
-    columns = ("forward_ms", "loss_ms", "backward_ms", "adam_ms", "step_ms", "steps_per_second", "peak_memory_mb")
-    lines = []
-    for scene, rows in _benches(results):
-        for row in rows:
-            times = " | ".join(_number(row.get(column)) for column in columns)
-            ratio = f"{row['step_ratio']:.2f}"
-            lines.append(f"| {scene} | {row['count']:,} | {row['size']} | `{row['raster']}` | {times} | {ratio} |")
-    names = ("forward", "loss", "backward", "Adam", "step", "steps/s", "peak MiB")
-    header = "| scene | Gaussians | size | rasterizer | " + " | ".join(names) + " | of triton's step |"
-    return "\n".join([header, "|" + "---|" * (5 + len(names)), *lines]) if lines else ""
-
-
-def _training(results: Path) -> str:
-    lines = []
-    for file in sorted(results.glob("train-*.json")):
-        record = _read(file) or {}
-        metrics = record.get("metrics", {})
-        cells = (
-            f"`{record.get('raster', NOTHING)}`",
-            _number(record.get("iterations"), 0),
-            f"{record.get('num_gaussians', 0):,}",
-            _number(record.get("seconds", {}).get("train")),
-            _number(record.get("peak_memory_mb"), 0),
-            _number(metrics.get("psnr"), 2),
-            _number(metrics.get("ssim"), 4),
-        )
-        lines.append("| " + " | ".join(cells) + " |")
-    header = "| training | iterations | Gaussians | seconds | peak MiB | PSNR | SSIM |\n|---|---|---|---|---|---|---|"
-    return "\n".join([header, *lines]) if lines else ""
-
-
-def _number(value: float | None, digits: int = 2) -> str:
-    return NOTHING if value is None else f"{value:.{digits}f}"
-
-
-def _read(file: Path) -> Any:
-    """The JSON in ``file``; None if it is missing or damaged."""
-    try:
-        return json.loads(file.read_text())
-    except (OSError, ValueError):
-        return None
-
-
-def _last_line(file: Path) -> str:
-    lines = file.read_text().splitlines() if file.is_file() else []
-    return lines[-1].strip("= ") if lines else ""
-
-
-def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__)
-    verbs = parser.add_subparsers(dest="verb", required=True)
-    verbs.add_parser("machine", help="GPU and versions as JSON")
-    same = verbs.add_parser("bits", help="whether runs have the same bits, as JSON; 1 if they have not")
-    same.add_argument("device")
-    same.add_argument("size", help="WIDTHxHEIGHT")
-    same.add_argument("count", type=int)
-    verbs.add_parser("table", help="Markdown from a folder of results").add_argument("results", type=Path)
-    options = parser.parse_args()
-    if options.verb == "machine":
-        print(json.dumps(machine()))
-    elif options.verb == "table":
-        print(table(options.results))
-    else:
-        width, _, height = options.size.partition("x")
-        differing = bits(options.device, int(width), int(height), options.count)
-        print(json.dumps({"differing": differing}))
-        return 1 if differing else 0
-    return 0
+def main(verb: str, *words: str) -> int:
+    if verb in ("wheels", "table"):
+        print(wheels() if verb == "wheels" else tables(Path(words[0])))
+        return 0
+    signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
+    seconds = float(words[0]) if words else {"all": 540.0, "rest": 200.0}[verb]
+    return Runner(verb, seconds).run(plan() if verb == "all" else rest(words[1:]))
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(main(*sys.argv[1:]))

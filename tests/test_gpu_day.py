@@ -1,14 +1,18 @@
-"""scripts/gpu_day.sh as a whole without a GPU, so that no line of it fails for the first time where time is short."""
+"""scripts/gpu_day.sh without a GPU: no line of it may fail for the first time where time is short."""
 
 from __future__ import annotations
 
 import json
 import os
 import re
+import signal
 import subprocess
 import sys
+import tarfile
+import time
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -16,82 +20,261 @@ from tests.raster.conftest import interpreter_fault
 
 ROOT = Path(__file__).resolve().parents[1]
 SCRIPT = ROOT / "scripts" / "gpu_day.sh"
-# As compute-sanitizer is called: its own options, then the command.
-CHECKER = """#!/bin/sh
-while :; do case $1 in --tool | --error-exitcode) shift 2 ;; *) break ;; esac; done
-exec "$@"
+# In place of Python: parts fail, hang, or are killed as a test wants; others give what real ones give.
+# Anything else, such as the script itself, is run by Python.
+STAND_IN = r"""#!{python} -IS
+import json, os, signal, sys, time
+words = sys.argv[1:]
+line = " ".join(words)
+if words[:2] == ["-m", "pip"]:
+    folder = words[words.index("-d" if "download" in words else "-w") + 1]
+    os.makedirs(folder)
+    import zipfile
+    name = words[-1].partition("==")[0].replace("-", "_")
+    with zipfile.ZipFile(f"{{folder}}/{{name}}-1-py3-none-any.whl", "w") as file:
+        file.writestr(f"{{name}}/__init__.py", "")
+    sys.exit()
+for part, (pattern, fault) in json.loads(os.environ["FAULTS"]).items():
+    if pattern in line:
+        print("before", part, file=sys.stderr, flush=True)
+        if fault == "fail":
+            sys.exit("broken on purpose")
+        if fault == "kill":
+            os.kill(os.getpid(), signal.SIGKILL)
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        import subprocess
+        child = subprocess.Popen(["sleep", "987"], process_group=0)  # as ninja starts a compiler
+        print(child.pid, flush=True)
+        time.sleep(987)
+# The interpreter takes minutes for the proof of triton, so that is never the real one.
+fake = not os.environ.get("REAL") or line.endswith("--prove --raster triton")
+if not fake or "gpu_day.py" in line or words[:2] == ["-m", "tarfile"]:
+    os.execv({python!r}, [{python!r}, *words])
+if "doctor" in words:
+    raster = words[words.index("--raster") + 1]
+    print(json.dumps({{"raster": raster, "passed": True, "device": "a GPU", "versions": {{"triton": "3.6.0"}},
+                      "errors": {{"image": 1e-6}}, "seconds": 9.5}}))
+elif "bench" in words:
+    row = {{"raster": words[words.index("--raster") + 1], "size": "16x16", "count": 3, "step_ms": 1.25,
+           "kernels_ms": {{"_blend": 0.5}}, "waits": {{"cudaStreamSynchronize": 1.0}}, "waits_ms": {{}}}}
+    print(json.dumps([row]))
+elif "pytest" in words:
+    print("....\n3 passed in 1.2s")
+elif "gsbench.cli" in words:
+    name = words[2].partition("=")[2]
+    trial = f"{{os.environ['GSBENCH_RUNS']}}/{{name}}/bonsai/dataset-x/12345678-seed0"
+    os.makedirs(trial, exist_ok=True)
+    with open(f"{{trial}}/results.json", "w") as file:
+        json.dump({{"iterations": 30000, "num_gaussians": 12345, "metrics": {{"psnr": 31.54321}},
+                   "seconds": {{"train": 99.5}}}}, file)
 """
 
-pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="needs bash and Triton")
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="needs bash, /proc and Triton")
 
 
-def run(state: Path, *words: str) -> subprocess.CompletedProcess[str]:
-    environment = os.environ | {
-        "GPU_DAY_TINY": "1",
-        "GPU_DAY_STATE": str(state),
-        "GPU_DAY_BROUGHT": str(state / "nothing"),
-        "OUT": str(state),
-        "PYTHON": sys.executable,
-        "PATH": f"{state}{os.pathsep}{os.environ['PATH']}",
+class Day:
+    """The script with its folders below ``folder``, and the stand-in for Python."""
+
+    def __init__(self, folder: Path) -> None:
+        self.out, self.state = folder / "out", folder / "state"
+        stand_in = folder / "python"
+        stand_in.write_text(STAND_IN.format(python=sys.executable))
+        stand_in.chmod(0o755)
+        sanitizer = folder / "compute-sanitizer"  # its own options, then the command
+        sanitizer.write_text('#!/bin/sh\nshift 4\nexec "$@"\n')
+        sanitizer.chmod(0o755)
+        self.out.mkdir()
+        self.environment = os.environ | {
+            "GPU_DAY_TINY": "1",
+            "GPU_DAY_STATE": str(self.state),
+            "GPU_DAY_BROUGHT": str(folder / "brought"),
+            "OUT": str(self.out),
+            "PYTHON": str(stand_in),
+            "PATH": f"{folder}{os.pathsep}{os.environ['PATH']}",
+            "FAULTS": "{}",
+        }
+
+    def bring(self) -> None:
+        """An archive as `wheels` makes it."""
+        brought = Path(self.environment["GPU_DAY_BROUGHT"])
+        (brought / "site").mkdir(parents=True)
+        with tarfile.open(brought / "brought.tar.xz", "w:xz") as archive:
+            archive.add(brought / "site", "site")
+
+    def start(
+        self, *words: str, faults: dict[str, tuple[str, str]] | None = None, **more: str
+    ) -> subprocess.Popen[str]:
+        environment = self.environment | {"FAULTS": json.dumps(faults or {})} | more
+        return subprocess.Popen(
+            ["bash", str(SCRIPT), *words], env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
+        )
+
+    def run(self, *words: str, faults: dict[str, tuple[str, str]] | None = None, **more: str) -> tuple[int, str]:
+        with self.start(*words, faults=faults, **more) as process:
+            said, _ = process.communicate(timeout=1700)
+        return process.returncode, said
+
+    def results(self, verb: str) -> dict[str, Any]:
+        """How each part ended, of the archive in $OUT; and the names of its files below "files"."""
+        with tarfile.open(self.out / f"gpu_day-{verb}.tar.gz") as archive:
+            file = archive.extractfile(f"results/parts-{verb}.jsonl")
+            assert file is not None
+            records = [json.loads(line) for line in file.read().splitlines()]
+            return {record["part"]: record["end"] for record in records} | {"files": archive.getnames()}
+
+
+@pytest.fixture
+def day(tmp_path: Path) -> Day:
+    made = Day(tmp_path)
+    made.bring()
+    return made
+
+
+def test_parts_that_fail_hang_or_are_killed_cost_no_other_part(day: Day) -> None:
+    faults = {
+        "proof-triton": ("doctor --json --prove --raster triton", "hang"),
+        "contract": ("test_contract.py -k triton", "kill"),
+        "bench-triton-3": ("--raster triton --count", "fail"),
+        "train-volumetric-0": ("densify=volumetric ", "hang"),
     }
-    return subprocess.run(
-        ["bash", str(SCRIPT), *words], env=environment, capture_output=True, text=True, check=False, timeout=1500
+    begin = time.monotonic()
+    code, said = day.run("all", "45", faults=faults)
+    assert time.monotonic() - begin < 48
+    assert code == 1, said
+    ends = day.results("all")
+    files = ends.pop("files")
+    assert {name: end for name, end in ends.items() if end != 0} == {
+        "proof-triton": "out of time",
+        "contract": -signal.SIGKILL,
+        "bench-triton-3": 1,
+        "train-volumetric-0": "out of time",
+    }
+    well = {"install", "bits", "compilation", "train-adc-0", "train-volumetric_once-0", "bench-cpu", "proof-cpu"}
+    assert ends.keys() - faults.keys() == well | {"contract-cpu", "memcheck", "racecheck"}
+    assert {"results/train-adc-0/results.json", "results/bench-cpu.out", "results/proof-triton.log"} <= set(files)
+    assert "broken on purpose" in said  # the end of what it wrote
+    for name in ("proof-triton", "train-volumetric-0"):  # what a part left behind has ended, too
+        child = Path("/proc") / (day.state / "results" / f"{name}.out").read_text().strip()
+        assert not child.exists() or "\nState:\tZ" in (child / "status").read_text()
+    table = (day.out / "table.md").read_text()
+    assert "- proof-triton: NO (out of time), " in table
+    assert "- contract: NO (-9), " in table
+
+    # The rest is what did not end well; then there is time for another seed.
+    code, said = day.run("rest", "60")
+    assert code == 0, said
+    assert {name for name, end in day.results("rest").items() if end != 0} == {"files"}
+    assert "bits" not in said
+    code, said = day.run("rest", "60")
+    assert code == 0, said
+    assert set(re.findall(r"(\S+): 0 after", said)) == {
+        f"train-{arm}-1" for arm in ("adc", "volumetric", "volumetric_once")
+    }
+
+
+def test_a_killed_command_leaves_the_results_so_far_and_no_process(day: Day) -> None:
+    process = day.start("all", "300", faults={"train-adc-0": ("densify=adc ", "hang")})
+    marker = day.state / "results" / "train-adc-0.out"
+    until = time.monotonic() + 60
+    while not (marker.exists() and marker.read_text()) and time.monotonic() < until:
+        time.sleep(0.1)
+    child = Path("/proc") / marker.read_text().strip()
+    assert child.exists()
+    process.send_signal(signal.SIGTERM)
+    process.communicate(timeout=60)
+    ends = day.results("all")
+    assert (ends["proof-triton"], ends["bits"], ends["train-adc-0"]) == (0, 0, "out of time")
+    assert "memcheck" not in ends
+    assert not child.exists() or "\nState:\tZ" in (child / "status").read_text()
+
+    # The rest is what failed and what was never reached.
+    assert day.run("rest", "60")[0] == 0
+    rest = day.results("rest")
+    assert (rest["train-adc-0"], rest["memcheck"]) == (0, 0)
+
+
+def test_named_parts_and_a_name_that_is_none(day: Day) -> None:
+    code, said = day.run("rest", "60", "bits", "train-adc-3")
+    assert code == 0, said
+    assert day.results("rest").keys() == {"install", "bits", "train-adc-3", "files"}
+    assert day.run("rest", "60", "bites")[1].endswith("there is no part bites\n")
+
+
+def test_without_a_compiled_gsplat_its_parts_are_not_tried(day: Day) -> None:
+    code, _ = day.run("all", "45", faults={"compilation": ("-c 0", "fail")})
+    ends = day.results("all")
+    assert (code, ends["compilation"]) == (1, 1)
+    assert {name for name, end in ends.items() if end == "not tried: no compilation"} == {
+        "bench-cpu",
+        "proof-cpu",
+        "contract-cpu",
+    }
+
+
+def test_what_it_brings(tmp_path: Path, shared: Path) -> None:
+    """The packages, and the scene without tracks, of which a training takes the same points in order."""
+    from gsbench.scene.colmap import model_points, read_reference
+    from gsbench.scene.readers import read_colmap
+
+    day = Day(tmp_path)
+    scene = shared / "data" / "herz_jesus_p25"
+    more = {"GPU_DAY_SCENE": str(scene), "GSBENCH_WEIGHTS": str(shared / "weights")}
+    code, said = day.run("wheels", **more)
+    assert code == 0, said
+    assert re.search(r"brought.tar.xz: \d\.\d MiB, 2 files of weights", said)
+    with tarfile.open(tmp_path / "brought" / "brought.tar.xz") as archive:
+        archive.extractall(tmp_path / "there", filter="data")
+    there = tmp_path / "there"
+    assert {file.name for file in (there / "site").iterdir()} >= {"gsplat", "pycolmap", "antlr4_python3_runtime"}
+    assert len(list((there / "bonsai" / "images").iterdir())) == len(list((scene / "images").iterdir()))
+    before, after = (read_reference(read_colmap("scene", folder)) for folder in (scene, there / "bonsai"))
+    for old, new in zip(model_points(before), model_points(after), strict=True):
+        assert (old == new).all()
+    assert {image.name for image in after.images.values()} == {image.name for image in before.images.values()}
+    assert len(list((there / "weights").iterdir())) == 2
+
+
+def test_a_table_of_two_commands(day: Day) -> None:
+    assert day.run("all", "45", faults={"bits": ("test_same_bits.py", "fail")})[0] == 1
+    assert day.run("rest", "60", "bits")[0] == 0
+    code, said = day.run("table", str(day.out))
+    assert code == 0
+    assert re.search(
+        r"^- proof-triton: yes, \d+ s; device a GPU; versions .*3.6.0.*; errors .*image", said, re.MULTILINE
     )
+    assert re.search(r"^- bits: yes, \d+ s; 3 passed in 1.2s$", said, re.MULTILINE)
+    assert "| triton | 3 | 16x16 | - | - | - | - | 1.25 | - | - | - |" in said
+    assert 'triton, 3: {"kernels_ms": {"_blend": 0.5}, "waits": {"cudaStreamSynchronize": 1.0}' in said
+    assert "| train-volumetric_once-0 | 30000 | 12345 | 99.5 | - | 31.543 | - | - | - |" in said
 
 
-@pytest.mark.slow
-def test_the_whole_day_in_the_interpreter(tmp_path: Path) -> None:
-    triton = pytest.importorskip("triton")
-    if fault := interpreter_fault(triton.__version__, version("numpy")):
-        pytest.skip(fault)
-    (tmp_path / "compute-sanitizer").write_text(CHECKER)
-    (tmp_path / "compute-sanitizer").chmod(0o755)
-    for part in ("setup", "check", "speed", "train"):
-        done = run(tmp_path, part)
-        assert done.returncode == 0, done.stdout + done.stderr
-        assert (tmp_path / f"gpu_day-{part}.tar.gz").stat().st_size > 0
-    said = run(tmp_path, "table").stdout
-    assert "- contract: yes (" in said
-    assert "- the same bits, three times: yes\n" in said
-    assert "- memory checker: yes" in said
-    assert "did not end well" not in said
-    assert re.search(r"^\| trained \| 3 \| 16x16 \| `triton` \| [\d.]+ \|", said, re.MULTILINE)
-    assert re.search(r"^\| a trained bonsai \| \d+ \| 16x16 \| `cpu` \|", said, re.MULTILINE)
-    assert re.search(r"^\| `triton` \| 2 \| \d+ \| [\d.]+ \| \d+ \| [\d.]+ \| [\d.]+ \|$", said, re.MULTILINE)
-
-
-def test_what_it_brings_is_pinned() -> None:
-    """Each package that is brought along stands in constraints.txt under that name."""
-    pinned = {line.split("==")[0] for line in (ROOT / "constraints.txt").read_text().splitlines()}
-    text = SCRIPT.read_text()
-    (wheels,), (sources,) = (re.findall(rf"^{name}=\(([^)]+)\)", text, re.MULTILINE) for name in ("WHEELS", "SOURCES"))
-    assert set(wheels.split()) | set(sources.split()) <= pinned
-    assert "gsplat" in wheels
-
-
-def test_a_table_of_what_failed(tmp_path: Path) -> None:
-    """A day on which little went well still gives a table, which says so."""
-    results = tmp_path / "results"
-    results.mkdir()
-    assert run(tmp_path, "table").stdout.startswith("Measured on: unknown.")
-    (results / "steps.tsv").write_text("contract\t1\t9\nbits\t1\t5\nbench-random-10\tlate\t0\ncontract\t0\t8\n")
-    (results / "contract.out").write_text("....\n==== 31 passed in 9 s ====\n")
-    (results / "bits.out").write_text(json.dumps({"differing": ["image", "gradient of means"]}))
-    (results / "bench-random-10.out").write_text("")
-    row = {"raster": "triton", "scene": "random", "count": 1000, "size": "16x16", "step_ms": 1.234, "step_ratio": 1.0}
-    (results / "bench-random-1000.out").write_text(json.dumps([row]))
-    (results / "train-gsplat.json").write_text(json.dumps({"raster": "gsplat", "num_gaussians": 12345, "metrics": {}}))
-    said = run(tmp_path, "table").stdout
-    assert "- contract: yes (31 passed in 9 s)" in said
-    assert "NO (exit 1); different: image, gradient of means" in said
-    assert "- memory checker: not tried" in said
-    assert "**did not end well**: bits (1), bench-random-10 (late)" in said
-    assert "| random | 1,000 | 16x16 | `triton` | - | - | - | - | 1.23 | - | - | 1.00 |" in said
-    assert "| `gsplat` | - | 12,345 | - | - | - | - |" in said
+def test_a_sanitizer_that_refuses_the_device_is_not_a_failure_of_the_kernels(day: Day) -> None:
+    (day.out.parent / "compute-sanitizer").write_text("#!/bin/sh\necho '= Error: Device not supported'; exit 1\n")
+    assert day.run("rest", "60", "memcheck")[0] == 1
+    assert "- memcheck: not tried, since" in day.run("table", str(day.out))[1]
 
 
 def test_words_that_it_does_not_know(tmp_path: Path) -> None:
-    done = run(tmp_path, "everything")
-    assert done.returncode == 2
-    assert "scripts/gpu_day.sh wheels" in done.stdout
-    assert "exit" not in done.stdout
+    code, said = Day(tmp_path).run("everything")
+    assert code == 2
+    assert "scripts/gpu_day.sh wheels" in said
+    assert "exec" not in said
+
+
+@pytest.mark.slow
+def test_the_whole_day_in_the_interpreter(day: Day) -> None:
+    triton = pytest.importorskip("triton")
+    if fault := interpreter_fault(triton.__version__, version("numpy")):
+        pytest.skip(fault)
+    code, said = day.run("all", "1600", REAL="1")
+    assert code == 0, said
+    said = day.run("table", str(day.out), REAL="1")[1]
+    assert "NO (" not in said
+    proof = r"^- proof-cpu: yes, \d+ s; device .+; versions \{.*'torch'.*; errors \{.*'image'"
+    assert re.search(proof, said, re.MULTILINE)
+    assert re.search(r"^- contract: yes, \d+ s; \d+ passed", said, re.MULTILINE)
+    assert re.search(r"^- memcheck: yes, \d+ s; 1 passed", said, re.MULTILINE)
+    assert re.search(r"^\| triton \| 3 \| 16x16 \| [\d.]+ \|", said, re.MULTILINE)
+    assert re.search(
+        r"^\| train-volumetric-0 \| 2 \| \d+ \| [\d.]+ \| [\d.]+ \| [\d.]+ \| [\d.]+ \|", said, re.MULTILINE
+    )

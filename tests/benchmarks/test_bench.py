@@ -9,8 +9,10 @@ from pathlib import Path
 
 import pytest
 import torch
+from torch.autograd import DeviceType
+from torch.autograd.profiler_util import FunctionEventAvg
 
-from gsbench.bench.measure import Setting, Stepper, run_bench
+from gsbench.bench.measure import LONGEST_KERNELS, Setting, Stepper, per_step, run_bench
 from gsbench.bench.scenes import (
     SCENES,
     camera_before,
@@ -53,6 +55,34 @@ def test_turns_are_compared_with_the_first_and_whole_steps_are_made() -> None:
     assert (first["scene"], first["device"]) == ("random", "cpu")
     assert min(first["steps_per_second"], second["steps_per_second"]) > 0
     assert min(first["fps"], second["fps"]) > 0
+
+
+def test_kernels_of_a_step_and_waits() -> None:
+    """On a CPU the profiler sees torch's operators; nothing waits."""
+    (row,) = run_bench(["cpu"], [(40, 30)], [50], repeats=1, memory=False, kernels=True)
+    assert row["kernels_ms"]["_Render"] > 0
+    assert list(row["kernels_ms"])[-1] == "all others"
+    assert row["waits"] == row["waits_ms"] == {}
+
+
+def test_times_on_a_gpu_are_of_kernels_alone() -> None:
+    """Events as torch's profiler gives them: an operator's launch counts neither as a kernel nor as a wait."""
+
+    def event(key: str, kind: DeviceType, count: int, cpu: float, gpu: float) -> FunctionEventAvg:
+        average = FunctionEventAvg()
+        average.key, average.device_type, average.count = key, kind, count
+        average.self_cpu_time_total, average.self_device_time_total = cpu, gpu
+        return average
+
+    kernels = [event(f"kernel{k}", DeviceType.CUDA, 10, 0.0, 1e3 * (k + 1)) for k in range(LONGEST_KERNELS + 2)]
+    others = [event("aten::sort", DeviceType.CPU, 10, 7e4, 5e4)]
+    waits = [event("cudaStreamSynchronize", DeviceType.CPU, 15, 2e4, 0.0)]
+    found = per_step([*kernels, *others, *waits], 10, torch.device("cuda"))
+    assert found["kernels_ms"]["kernel13"] == pytest.approx(1.4)
+    assert list(found["kernels_ms"])[:2] == ["kernel13", "kernel12"]
+    assert found["kernels_ms"]["all others"] == pytest.approx(0.1 + 0.2)
+    assert sum(found["kernels_ms"].values()) == pytest.approx(sum(range(1, 15)) / 10)
+    assert (found["waits"], found["waits_ms"]) == ({"cudaStreamSynchronize": 1.5}, {"cudaStreamSynchronize": 2.0})
 
 
 def test_whole_steps_leave_the_scene_as_it_is() -> None:

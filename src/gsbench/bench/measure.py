@@ -3,11 +3,13 @@
 import itertools
 import statistics
 import time
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
+from torch.profiler import ProfilerActivity, profile
 
 from gsbench.bench.scenes import SEED, make_scene
 from gsbench.densify import ADC
@@ -29,6 +31,15 @@ NEVER = 10**9  # iterations
 # normal range, where Intel processors need some 150 cycles per operation (at 1e-30 Adam took 35 ms for 6).
 ZERO_RATE = 1e-20
 STEPS_AT_ONCE = {"cpu": 1, "cuda": 10}  # whole steps between two readings of the clock and of the losses
+LONGEST_KERNELS = 12  # that get a name of their own
+# Calls of CUDA's runtime in which the host waits for the GPU. A copy waits only if it goes to pageable memory.
+WAITING_CALLS = (
+    "cudaStreamSynchronize",
+    "cudaDeviceSynchronize",
+    "cudaEventSynchronize",
+    "cudaMemcpyAsync",
+    "cudaMemcpy",
+)
 UNUSED_FOLDER = Path("/nonexistent")  # for snapshots, which are off
 
 
@@ -107,10 +118,45 @@ class Stepper:
                 self.trainer.render(0)
         return frames / (self._now() - begin)
 
+    def profiled_steps(self) -> dict[str, dict[str, float]]:
+        """The kernels of whole training steps, and the host's waits for them, as `per_step` describes them."""
+        steps = STEPS_AT_ONCE[self.device.type]
+        gpu = [ProfilerActivity.CUDA] if self.device.type == "cuda" else []
+        self._now()
+        with profile(activities=[ProfilerActivity.CPU, *gpu], acc_events=True) as profiler:
+            for _ in range(steps):
+                self.trainer.iterate(UNUSED_FOLDER)
+            self.trainer.losses.wait()
+        return per_step(profiler.key_averages(), steps, self.device)
+
     def _now(self) -> float:
         if self.device.type == "cuda":
             torch.cuda.synchronize()
         return time.perf_counter()
+
+
+def per_step(events: Iterable[Any], steps: int, device: torch.device) -> dict[str, dict[str, float]]:
+    """Times of one step, from what torch's profiler recorded on ``device`` in ``steps`` steps.
+
+    ``kernels_ms``: the time of each kernel, the longest first; on a CPU, the own time of each of torch's operators.
+    ``waits_ms``: the host's time in each of `WAITING_CALLS`. ``waits``: how often it makes that call.
+    """
+    on_gpu = device.type == "cuda"
+    kind = "CUDA" if on_gpu else "CPU"
+    times: dict[str, float] = {}
+    waits: dict[str, float] = {}
+    waits_ms: dict[str, float] = {}
+    for event in events:
+        own_ms = event.self_cpu_time_total / 1e3 / steps
+        if event.key in WAITING_CALLS:
+            waits[event.key] = event.count / steps
+            waits_ms[event.key] = round(own_ms, 4)
+        elif event.device_type.name == kind:
+            times[event.key] = event.self_device_time_total / 1e3 / steps if on_gpu else own_ms
+    ordered = sorted(times.items(), key=lambda item: -item[1])
+    kernels = {name: round(value, 4) for name, value in ordered[:LONGEST_KERNELS]}
+    kernels["all others"] = round(sum(value for _, value in ordered[LONGEST_KERNELS:]), 4)
+    return {"kernels_ms": kernels, "waits": waits, "waits_ms": waits_ms}
 
 
 def device_of(raster: str) -> torch.device:
@@ -154,6 +200,7 @@ def run_bench(
     threads: int | None = None,
     memory: bool = True,
     scene: str = "trained",
+    kernels: bool = False,
 ) -> list[dict[str, Any]]:
     """Time the training step with each of ``rasters`` for each image size (width, height) and count of Gaussians.
 
@@ -167,19 +214,20 @@ def run_bench(
     - ``steps_per_second``: whole training steps, without waits in between;
     - ``fps``: frames per second of rendering alone;
     - ``peak_memory_mb``: of a fresh process that makes the same steps (on a GPU: torch's allocations there); None if
-      ``memory`` is False.
+      ``memory`` is False;
+    - with ``kernels``, also the columns of `per_step`, of steps that are not timed otherwise.
     """
     rows = []
     with progress("bench") as report:
         for width, height in sizes:
             for count in counts if ply is None else [0]:
                 setting = Setting(scene, width, height, count, ply, threads)
-                rows += _compare(rasters, setting, repeats, memory, report)
+                rows += _compare(rasters, setting, repeats, memory, kernels, report)
     return rows
 
 
 def _compare(
-    rasters: list[str], setting: Setting, repeats: int, memory: bool, report: Progress
+    rasters: list[str], setting: Setting, repeats: int, memory: bool, kernels: bool, report: Progress
 ) -> list[dict[str, Any]]:
     model = f"{setting.count:,} Gaussians" if setting.ply is None else setting.ply.name
     what, turns = f"{setting.width}x{setting.height}, {model}", WARM_UP_STEPS + repeats
@@ -203,7 +251,8 @@ def _compare(
             "count": stepper.count,
         }
         row |= {key: round(statistics.median(s[key] for s in samples[raster]), 3) for key in samples[raster][0]}
-        rows.append(row | {"threads": stepper.threads, "device": stepper.device.type, "peak_memory_mb": None})
+        row |= {"threads": stepper.threads, "device": stepper.device.type, "peak_memory_mb": None}
+        rows.append(row | (stepper.profiled_steps() if kernels else {}))
     del steppers, stepper  # frees memory for the processes below
     if memory:
         setting = replace(setting, ply=setting.ply and setting.ply.absolute())

@@ -221,6 +221,9 @@ def _bench_parser() -> ArgumentParser:
     parser.add_argument("--threads", type=_count, help="CPU threads (default: as many as torch takes)")
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.add_argument(
+        "--kernels", action="store_true", help="with --json: add the time of each kernel, and of waits for the GPU"
+    )
+    parser.add_argument(
         "--no-memory", action="store_true", help="do not measure peak memory, in processes of their own"
     )
     return parser
@@ -236,6 +239,8 @@ def bench(argv: Sequence[str], _runs: Path | None = None) -> int:
         raise InputError(str(error)) from error
     if options.ply is not None and not options.ply.is_file():
         raise InputError(f"--ply: {options.ply} does not exist")
+    if options.kernels and not options.json:
+        raise InputError("--kernels has no place in the table: add --json")
     rasters = options.raster.split(",")
     if AUTO in rasters:
         raise InputError(f"--raster {AUTO} is a choice among executors: name those to time")
@@ -244,7 +249,15 @@ def bench(argv: Sequence[str], _runs: Path | None = None) -> int:
     from gsbench.bench.measure import run_bench
 
     rows = run_bench(
-        rasters, sizes, counts, options.ply, options.repeats, options.threads, not options.no_memory, options.scene
+        rasters,
+        sizes,
+        counts,
+        options.ply,
+        options.repeats,
+        options.threads,
+        not options.no_memory,
+        options.scene,
+        options.kernels,
     )
     print(json.dumps(rows, indent=2) if options.json else table(rows))
     return 0
