@@ -34,7 +34,7 @@ from gsbench.files import checked_runs_folder, make_runs_folder, write_json
 from gsbench.runs.experiments import SearchPoint, TuningRecord, make_home, metric_and_question
 from gsbench.runs.keys import flatten
 from gsbench.runs.layout import TUNING
-from gsbench.settings import check_settings
+from gsbench.settings import check_settings, check_values
 from gsbench.system.install import install_command
 from gsbench.words import counted, did_you_mean, listed
 
@@ -135,7 +135,8 @@ def tuned_jobs(
     Raises InputError for wrong ``settings`` (``hydra.sweeper.tune``) or intervals, and GsbenchError if no point of an
     arm could be judged.
     """
-    tune = TuneSettings(**OmegaConf.to_container(OmegaConf.create(settings)))  # type: ignore[arg-type]
+    given: Any = OmegaConf.to_container(OmegaConf.create(settings))
+    tune = TuneSettings(**check_values(TuneSettings, given, PLACE))
     untuned = [list(job) for job in jobs]
     if not tune.points or not any(intervals):
         return untuned
