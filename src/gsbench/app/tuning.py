@@ -25,6 +25,7 @@ from hydra.core.override_parser.types import Override
 from omegaconf import OmegaConf
 from pydantic import NonNegativeInt, PositiveInt
 
+from gsbench.app.sweep import DEFAULT_METRIC, Sweep
 from gsbench.claims.stopping import facts_for
 from gsbench.config.command_words import bare_key, check_makes_trials, grid_points, key_of, parse_word
 from gsbench.config.compose import Trial
@@ -43,12 +44,9 @@ if TYPE_CHECKING:
     from optuna.distributions import BaseDistribution
     from optuna.trial import Trial as Proposal
 
-    from gsbench.app.command import Sweep
-
 log = logging.getLogger(__name__)
 
 PLACE = "hydra.sweeper.tune"
-DEFAULT_METRIC = "psnr"
 DEFAULT_POINTS = 20
 SEED = "seed"
 NOT_TUNED = ("scene", "eval", "launch", "tracking", "hydra")  # groups that say how all arms are run and judged

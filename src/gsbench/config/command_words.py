@@ -4,7 +4,7 @@ import re
 import shlex
 from collections.abc import Sequence
 from functools import cache
-from itertools import accumulate, product
+from itertools import accumulate, islice, product
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,7 @@ IN_TRIAL_PATH = ("name", "seed")  # not in the configuration's hash, but in the 
 OPTIONS = ("-m", "--multirun", "--dry-run", "--config-dir", "--cfg", "--info", "--help", "--version")
 # Settings that are texts, by the last part of their keys.
 TEXTS = ("name", "runs", "path", "images", "sparse", "masks", "train_list", "test_list", "weights", "uri", "version")
+MAX_POINTS = 1_000_000  # values of one list; more would fill the memory
 MAX_BRACKETS = 40  # open at once in a word, since Hydra's parser recurses into them
 KEY = re.compile(r"[+~]*\w+([./]\w+)*")
 
@@ -246,11 +247,14 @@ def grid_points(overrides: Sequence[Override]) -> list[list[str]]:
         if override.is_sweep_override():
             check_sweep(override)
             try:
-                choices[key] = [f"{key}={value}" for value in override.sweep_string_iterator()]
+                values = islice(override.sweep_string_iterator(), MAX_POINTS + 1)
+                choices[key] = [f"{key}={value}" for value in values]
             except ValueError as error:  # such as a range with a step of 0
                 raise InputError(f"{override.input_line}: {error}") from error
             if not choices[key]:
                 raise InputError(f"{override.input_line} lists no value")
+            if len(choices[key]) > MAX_POINTS:
+                raise InputError(f"{override.input_line} lists more than {MAX_POINTS:,} values")
         else:
             choices[key] = [key if override.is_delete() else f"{key}={override.get_value_element_as_str()}"]
     return [list(point) for point in product(*choices.values())]
