@@ -146,7 +146,8 @@ def tuned_jobs(
     if sweep.task.look_only:
         print(_describe(searches))
     if not _search(sweep, list(tuned.values())):
-        print("what it will choose is not known yet: the arms are listed as they are")
+        print(f"then the trials of the sweep ({len(jobs)}) with the values found, which are not known yet")
+        sweep.task.handle = lambda trials: []  # trials with other values are not listed
         return untuned
     best_words = {arm: _best_words(search) for arm, search in tuned.items()}
     return [[*job, *best_words.get(trial.folder.parent.name, ())] for job, trial in zip(jobs, trials, strict=True)]
@@ -210,7 +211,7 @@ def _describe(searches: Sequence[ArmSearch]) -> str:
     trials = {search.record.arm: len(search.jobs) * len(first.seeds) for search in searches if search.ranges}
     untuned = [search.record.arm for search in searches if not search.ranges]
     return (
-        f"tunes first: {counted(first.wanted, 'point')} each for {listed(list(trials))}, by {first.metric} "
+        f"a search tunes first: {counted(first.wanted, 'point')} each for {listed(list(trials))}, by {first.metric} "
         f"of validation views on {listed(first.scenes)} with {counted(len(first.seeds), 'seed')}, "
         f"{sum(trials.values()) * first.wanted} trainings" + (f"; not tuned: {listed(untuned)}" if untuned else "")
     )

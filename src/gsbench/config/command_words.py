@@ -23,6 +23,7 @@ GROUPS = ("scene", "init", "densify", "raster", "train", "eval", "tracking", "la
 EXTERNAL_FOLDER = "external"  # subfolder of a group for other programs; glob(*) does not list it
 IN_TRIAL_PATH = ("name", "seed")  # not in the configuration's hash, but in the path of the trial's folder
 OPTIONS = ("-m", "--multirun", "--dry-run", "--config-dir", "--cfg", "--info", "--help", "--version")
+MAIN_CONFIG_OPTIONS = ("--config-name", "-cn", "--config-path", "-cp")  # of Hydra: they replace the main configuration
 # Settings that are texts, by the last part of their keys.
 TEXTS = ("name", "runs", "path", "images", "sparse", "masks", "train_list", "test_list", "weights", "uri", "version")
 MAX_POINTS = 1_000_000  # values of one list; more would fill the memory
@@ -43,6 +44,13 @@ def parse(argv: Sequence[str]) -> tuple[list[str], bool, bool]:
             dry_run = True
         elif word.split("=")[0] in ("--config-dir", "-cd"):
             folders.append(Path(word.partition("=")[2] or next(words, "")))
+        elif word.split("=")[0] in MAIN_CONFIG_OPTIONS:
+            name = word.partition("=")[2] or next(words, "NAME")
+            name = "NAME" if "-cp" in word or "path" in word else name
+            raise InputError(
+                f"{word}: gsbench's main configuration is its own: write yours to FOLDER/experiment/{name}.yaml, and "
+                f"give --config-dir FOLDER +experiment={name}"
+            )
         elif word.startswith("-"):
             group = word.lstrip("-").partition("=")[0]
             is_setting = group.partition(".")[0] in GROUPS

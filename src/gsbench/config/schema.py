@@ -168,7 +168,7 @@ def checked_values(config: DictConfig) -> dict[str, Any]:
     values = plain(config)
     for place, key, value in entries_of(values):  # also options of components, which their classes check later
         if isinstance(value, int) and abs(value) > MAX_INTEGER:
-            raise InputError(f"{'.'.join((*place, key))}={value} is too large: {MAX_INTEGER} is the most")
+            raise InputError(f"{'.'.join((*place, key))}={value} is not a whole number of 64 bits: give a nearer one")
     for group in (*GROUP_SCHEMAS, *COMPONENTS):
         if not isinstance(values.get(group), dict):
             raise InputError(f"{group} must be chosen, as {group}=NAME (see gsbench --help), got {values.get(group)!r}")
