@@ -65,7 +65,7 @@ STRANGE: dict[str, tuple[dict[str, Any], str]] = {  # settings of a file, and a 
         {"hydra": {"sweeper": {"custom_search_space": "bomb.Bomb"}}}, "custom_search_space is not a setting"
     ),
     "below a sweeper": (
-        {"defaults": [{"override /hydra/sweeper": "basic"}], "hydra": {"mode": "MULTIRUN", "sweeper": {"max_batch_size": MKDIR}}},
+        {"defaults": [{"override /hydra/sweeper": "basic"}], "hydra": {"sweeper": {"max_batch_size": MKDIR}}},
         "max_batch_size",
     ),
     "a launcher": (

@@ -120,7 +120,8 @@ def run_app(words: Sequence[str], multirun: bool, task: TrialTask) -> None:
     argv = [*words, *[f"{GRIDS}=[]"] * bool(task.grids)]
     if other:
         argv = prepare_other_sweeper(config, argv, task, other)
-    if task.look_only:  # nothing runs, so no callback is called
+    if task.look_only:  # nothing runs, so no callback is called, and Hydra writes nothing
+        argv = [word for word in argv if not key_of(word).startswith(LOGGING)] + NO_FILES
         argv += [f"~hydra.callbacks.{name}" for name in config.hydra.callbacks]
     else:
         load_callbacks(config.hydra.callbacks, task.allowed)
@@ -139,6 +140,8 @@ def run_app(words: Sequence[str], multirun: bool, task: TrialTask) -> None:
 # ---- Hydra's other sweepers, and its own files
 
 GRID_SWEEPER = "basic"  # Hydra's own, which expands lists and asks for no values
+LOGGING = ("hydra/job_logging", "hydra/hydra_logging", "hydra.job_logging", "hydra.hydra_logging")
+NO_FILES = ["hydra/job_logging=none", "hydra/hydra_logging=none", "hydra.run.dir=.", "hydra.output_subdir=null"]
 HYDRAS_FILES = ("run", "sweep", "output_subdir")
 MAX_CHOICES = 1000  # of groups, in a sweep of another sweeper
 
