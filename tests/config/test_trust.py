@@ -62,7 +62,7 @@ STRANGE: dict[str, tuple[dict[str, Any], str]] = {  # settings of a file, and a 
         "hydra.sweeper._target_=",
     ),
     "a text of a sweeper": (
-        {"hydra": {"sweeper": {"custom_search_space": "bomb.Bomb"}}}, "custom_search_space is not a setting"
+        {"hydra": {"sweeper": {"custom_search_space": "bomb.Bomb"}}}, "allow_targets=[hydra.sweeper]"
     ),
     "below a sweeper": (
         {"defaults": [{"override /hydra/sweeper": "basic"}], "hydra": {"sweeper": {"max_batch_size": MKDIR}}},
