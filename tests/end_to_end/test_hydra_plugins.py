@@ -36,7 +36,7 @@ def need(package: str) -> None:
 def test_optunas_sweeper_looks_for_the_best_mean_over_seeds(gsbench: Run, tmp_path: Path, direction: str) -> None:
     need("hydra_optuna_sweeper")
     small = [word for word in TINY if not word.startswith("init.count")]
-    words = ["-m", *small, "name=x", "seed=0,1", "init.count=interval(100,400)", "hydra/sweeper=optuna"]
+    words = ["-m", *small, "name=x", "seed=0,1", "init.count=int(interval(100,400))", "hydra/sweeper=optuna"]
     words += ["hydra.sweeper.n_trials=3", f"hydra.sweeper.direction={direction}"]
     look = gsbench(*words, "--dry-run", GSBENCH_RUNS="runs", timeout=SECONDS)
     assert "hydra/sweeper=optuna searches: it proposes 3 trials" in look.stdout, look.stderr

@@ -113,6 +113,8 @@ def run_app(words: Sequence[str], multirun: bool, task: TrialTask) -> None:
     other = other_sweeper(config) if multirun else ""
     if other and task.look_only:
         words, multirun = words_without_sweeper(config, words, other)
+        if not multirun:
+            task.handle = lambda trials: []  # trials with other values are not listed
         other = ""
     sweeper = config.hydra.sweeper
     task.grids = None if other else OmegaConf.to_container(sweeper, resolve=False).get("grids")  # type: ignore[union-attr]
@@ -159,8 +161,7 @@ def words_without_sweeper(config: DictConfig, words: Sequence[str], name: str) -
         return [*kept, f"hydra/sweeper={OWN}"], True
     points = config.hydra.sweeper.get("n_trials")
     count = "trials" if points is None else f"{points} trials (hydra.sweeper.n_trials)"
-    print(f"hydra/sweeper={name} searches: it proposes {count} one after the other, from their results")
-    print("what it will choose is not known yet: the trial is listed as it is without the searched values")
+    print(f"hydra/sweeper={name} searches: it proposes {count} from the results, so they are not known yet")
     return [*(word for word in kept if not is_sweep(word)), f"hydra/sweeper={OWN}"], False
 
 
