@@ -17,10 +17,11 @@ CORE_TESTS := @tests/core.txt
 
 # The next version of Hydra, or its newest release candidate, installed beside .venv for the tests of configurations and sweeps.
 NEXT_HYDRA := 'hydra-core>=1.4.0rc1,<1.5' 'omegaconf>=2.4.1rc1,<2.5'
+HYDRA_PLUGINS := 'hydra-optuna-sweeper==1.3.*' 'optuna<3' cliff cmaes 'hydra-ray-launcher==1.2.*' 'ray<3' 'cloudpickle<3' boto3 msgpack
 NEXT_HYDRA_TESTS := tests/app tests/config tests/end_to_end/test_hydra.py
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-slow test-all test-generic next-hydra test-next-hydra lint docs notebooks picture lock
+.PHONY: help install demo test test-slow test-all test-generic next-hydra test-next-hydra hydra-plugins test-hydra-plugins lint docs notebooks picture lock
 
 help: ## show this
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -45,6 +46,13 @@ test-generic: $(VENV)/.stamp-dev ## run core tests as on the plainest processor 
 
 next-hydra: $(VENV)/.stamp-dev
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --pre --no-deps --upgrade --target $(VENV)/next-hydra $(NEXT_HYDRA)
+
+# Plug-ins of others that need older packages than gsbench does (Optuna 2, cloudpickle 2), beside .venv.
+hydra-plugins: $(VENV)/.stamp-dev
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --upgrade --target $(VENV)/hydra-plugins $(HYDRA_PLUGINS)
+
+test-hydra-plugins: hydra-plugins ## run the tests of Hydra's sweepers and launchers of others (Optuna, Ray)
+	PYTHONPATH=$(abspath $(VENV)/hydra-plugins) $(PYTEST) tests/end_to_end/test_hydra_plugins.py
 
 test-next-hydra: next-hydra ## run the tests of configurations and sweeps on the next version of Hydra
 	PYTHONPATH=$(abspath $(VENV)/next-hydra) $(PYTEST) $(NEXT_HYDRA_TESTS)

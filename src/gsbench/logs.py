@@ -63,15 +63,47 @@ class _CurrentStderrHandler(logging.StreamHandler[TextIO]):
         super().emit(record)
 
 
-def set_up_logging() -> None:
-    """Show gsbench's log lines of level INFO and above on stderr."""
-    if not LOGGER.handlers:
-        handler = _CurrentStderrHandler()
-        handler.setLevel(logging.INFO)
-        handler.setFormatter(_Printable("%(message)s"))
-        LOGGER.addHandler(handler)
-        LOGGER.setLevel(logging.DEBUG)
-        LOGGER.propagate = False
+class _RootHandler(logging.Handler):
+    """Passes log lines on to the handlers that somebody else, such as Hydra, gave to the root logger."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        logging.getLogger().handle(record)
+
+
+def set_up_logging(verbose: bool | str | Sequence[str] = False, through_root: bool = False) -> None:
+    """Show gsbench's log lines of level INFO and above on stderr; ``through_root``: by the root logger's handlers, too.
+
+    If one of these writes to the terminal, gsbench does not. ``verbose`` shows debug lines: True, gsbench's; names of
+    loggers, theirs.
+    """
+    names = [verbose] if isinstance(verbose, str) else [] if isinstance(verbose, bool) else list(verbose)
+
+    def shown(record: logging.LogRecord) -> bool:
+        named = any(f"{record.name}.".startswith(f"{name}.") for name in names)
+        return record.levelno >= logging.INFO or verbose is True or named
+
+    others = logging.getLogger().handlers if through_root else []
+    consoles = [other for other in others if type(other) is logging.StreamHandler]
+    for console in consoles:
+        console.addFilter(_make_printable)  # the lines, not the formatter's colours
+        console.setStream(getattr(console.stream, "raw", console.stream))
+    handlers: list[logging.Handler] = [_RootHandler()] if through_root else []
+    if not consoles:
+        handlers.append(_CurrentStderrHandler())
+        handlers[-1].setFormatter(_Printable("%(message)s"))
+    for handler in handlers:
+        handler.addFilter(shown)
+    foreign = [] if through_root else [name for name in names if name.split(".")[0] != LOGGER.name]
+    for logger in (LOGGER, *map(logging.getLogger, foreign)):
+        kept = [old for old in logger.handlers if not isinstance(old, _CurrentStderrHandler | _RootHandler)]
+        logger.handlers = [*handlers, *kept]
+    LOGGER.setLevel(logging.DEBUG)
+    LOGGER.propagate = False
+
+
+def _make_printable(record: logging.LogRecord) -> bool:
+    record.msg, record.args = printable(record.getMessage()), None
+    return True
 
 
 @contextmanager

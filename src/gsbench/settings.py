@@ -24,6 +24,7 @@ from gsbench.words import did_you_mean, is_path
 
 PathName = Annotated[str, Predicate(is_path), doc("a path")]
 AnyPath = Annotated[str | Path, Predicate(lambda path: is_path(str(path))), doc("a path")]
+MAX_INTEGER = 2**63 - 1  # the largest whole number of torch and NumPy
 MAX_NAME_BYTES = 100  # of a name: a folder's name can combine two, and file systems allow 255
 
 
@@ -131,15 +132,25 @@ def _converted(value: Any, field: dataclasses.Field[Any], cls: type, key: str) -
     hint, adapter = _adapters(cls)[field.name]
     try:
         result = adapter.validate_python(value)
-        if not _has_switch_for_number(value, result):
+        too_large = _has_too_large(result)
+        if not too_large and not _has_switch_for_number(value, result):
             return result
-        reason = ""
+        reason = f": whole numbers lie between -{MAX_INTEGER} and {MAX_INTEGER}" if too_large else ""
     except ValidationError as error:
         if value is field.default or (isinstance(value, float) and value == field.default):
             return value  # a class's own default is allowed even if its annotation forbids it
         first = error.errors()[0]
         reason = f": {first['ctx']['error']}" if first["type"] in ("value_error", "assertion_error") else ""
     raise InputError(f"{key} must be {describe(hint)}, got {_shown(value)}{reason}")
+
+
+def _has_too_large(value: Any) -> bool:
+    """Return whether a value is or contains a whole number that does not fit into 64 bits, as torch and JSON need."""
+    if isinstance(value, Mapping):
+        return any(map(_has_too_large, value.values()))
+    if isinstance(value, list | tuple):
+        return any(map(_has_too_large, value))
+    return isinstance(value, int) and abs(value) > MAX_INTEGER
 
 
 def _has_switch_for_number(given: Any, result: Any) -> bool:

@@ -1,4 +1,4 @@
-"""Plug-ins by which Hydra finds gsbench's launcher and sweeper. Their work is done in ``gsbench.app.command``.
+"""Plug-ins by which Hydra finds gsbench's launcher and sweeper. Their work is done in ``gsbench.app``.
 
 Hydra imports this file whenever any Hydra app in the same environment starts, so it imports only Hydra.
 """
@@ -16,13 +16,15 @@ from omegaconf import DictConfig
 
 
 class GsbenchLauncher(Launcher):
-    """A placeholder with a name: gsbench's sweeper itself runs the trials, as the settings ``launch`` say."""
+    """Runs the jobs of another sweeper as the settings ``launch`` say. gsbench's own sweeper runs its trials itself."""
 
     def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
-        pass
+        self.context, self.task, self.config = hydra_context, task_function, config
 
     def launch(self, job_overrides: Sequence[Sequence[str]], initial_job_idx: int) -> Sequence[JobReturn]:
-        raise NotImplementedError
+        from gsbench.app.sweep import Sweep
+
+        return Sweep(self.config, self.task, self.context).run_jobs(job_overrides)
 
 
 class GsbenchSweeper(Sweeper):
@@ -36,12 +38,14 @@ class GsbenchSweeper(Sweeper):
         self.params, self.tune = params or {}, tune or {}
 
     def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
-        from gsbench.app.command import Sweep
+        from gsbench.app.sweep import Sweep
 
         self.started = Sweep.begin(hydra_context, task_function, config)
 
     def sweep(self, arguments: list[str]) -> None:
-        self.started.run(self.params, self.tune, arguments)
+        from gsbench.app.command import run_sweep
+
+        run_sweep(self.started, self.params, self.tune, arguments)
 
 
 LAUNCHER = {"_target_": "hydra_plugins.gsbench.GsbenchLauncher"}

@@ -30,26 +30,22 @@ def test_a_sweep_has_one_time() -> None:
 
 
 @pytest.mark.parametrize(
-    "word",
-    [
-        "hydra.run.dir=elsewhere",
-        "hydra.sweep.dir=elsewhere",
-        "hydra.output_subdir=x",
-        "+hydra.job.env_set.OMP_NUM_THREADS='1'",
-    ],
-)
-def test_what_hydra_alone_would_read_is_refused(word: str) -> None:
-    with pytest.raises(InputError, match=r"^hydra\."):
-        compose_trials([*SWEEP, word], multirun=True)
-
-
-@pytest.mark.parametrize(
     ("words", "text"),
     [
-        (["name=x-${hydra:job.num}"], "so they cannot read Hydra's"),
-        (["-m", "seed=0,1", "densify.name=a${hydra:job.id}"], "so they cannot read Hydra's"),
-        (["hydra.verbose=true"], "log.txt in a trial's folder holds everything"),
-        (["-m", "hydra/sweeper=basic", "seed=0,1"], "gsbench has its own"),
+        (["+hydra.job.env_set.OMP_NUM_THREADS='1'"], "hydra.job.env_set can change what runs"),
+        (["--config-name=mine"], "+experiment=mine"),
+        (["-cp", "mine"], "--config-dir"),
+        (["densify.interval=1000000000000000000000"], "whole number of 64 bits"),
+        (["-m", "densify.interval=50,-1000000000000000000000"], "whole number of 64 bits"),
+        (['densify.interval="1000000000000000000000"'], "whole numbers lie between"),
+        (["eval.at=[1000000000000000000000]"], "whole number of 64 bits"),
+        (
+            ["+densify.x=[{a: 1000000000000000000000}]"],
+            "densify.x.0.a=1000000000000000000000 is not a whole number of 64 bits",
+        ),
+        (["-m", "seed=range(0,1000000000000000000000)"], "lists more than 1,000,000 values"),
+        (["-m", "+hydra.sweeper.tune.ranges=1", "seed=0,1"], "hydra.sweeper.tune.ranges is not a setting"),
+        (["-m", "hydra/sweeper=basic", "hydra.sweeper.params=3", "seed=0,1"], "hydra.sweeper.params"),
         (["-m", "densify=glob([av]*)"], """'densify=glob("[av]*")'"""),
         (["-m", "densify=choice([av,b)"], "is not a setting like key=value"),
         (["-m", "hydra/launcher=joblib", "seed=0,1", "hydra.launcher.jobs=3"], "n_jobs"),
@@ -62,6 +58,43 @@ def test_what_cannot_be_is_refused_in_a_line(words: list[str], text: str, capsys
     assert cli.run([*words, "--dry-run"]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert text in line
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["hydra.run.dir=elsewhere", "hydra.output_subdir=x"],
+        ["-m", "hydra.sweep.dir=elsewhere", "hydra.sweep.subdir=${hydra:job.num}", "seed=0,1"],
+        ["hydra.verbose=[gsbench]", "hydra.job.chdir=true"],
+        ["hydra/job_logging=default", "hydra.job_logging.root.level=DEBUG"],
+        ["-m", "hydra/sweeper=basic", "seed=0,1"],
+        ["-m", "hydra/sweeper=basic", "hydra/launcher=basic", "seed=0,1"],
+    ],
+    ids=" ".join,
+)
+def test_what_is_hydras_is_taken_and_a_look_writes_nothing(
+    words: list[str], runs: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.run([*words, "--dry-run"]) == 0
+    assert f"{1 + ('-m' in words)} trial" in capsys.readouterr().out
+    assert list(runs.parent.iterdir()) == []
+
+
+def test_settings_read_hydras_node() -> None:
+    """Each job's own number, although trials that differ in the seed share a composition."""
+    words = ["name=x-${hydra:runtime.choices.densify}-${hydra:job.num}", "init=random", "densify=adc,none", "seed=0,1"]
+    trials = compose_trials(words, multirun=True)
+    assert [trial.values["name"] for trial in trials] == ["x-adc-0", "x-adc-1", "x-none-2", "x-none-3"]
+    (trial,) = compose_trials(["name=x-${hydra:runtime.choices.densify}"])
+    assert trial.values["name"] == "x-volumetric"
+
+
+def test_a_search_is_not_called_a_trial(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.run(["-m", "densify.volume_threshold=interval(.01,1)", "--dry-run"]) == 0
+    out = capsys.readouterr().out
+    assert "search" in out
+    assert "20 points" in out
+    assert "1 trial" not in out
 
 
 def test_a_glob_of_characters_works_as_it_is_advised(capsys: pytest.CaptureFixture[str]) -> None:

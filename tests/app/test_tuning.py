@@ -243,7 +243,7 @@ def test_a_dry_run_says_what_will_be_tuned_and_trains_nothing(
     said = capsys.readouterr().out
     assert "tunes first: 4 points each for random-adc and random-volumetric, by psnr of validation views" in said
     assert "8 trainings" in said
-    assert "the arms are listed as they are" in said
+    assert "with the values found, which are not known yet" in said
     assert not runs.exists()
 
 

@@ -56,13 +56,30 @@ STRANGE: dict[str, tuple[dict[str, Any], str]] = {  # settings of a file, and a 
         {"hydra": {"mode": "MULTIRUN", "sweeper": {"params": {"in": MKDIR}}}}, "sweeper.params.in._target_=os.mkdir"
     ),
     "beside the sweeper's settings": ({"hydra": {"sweeper": {"grids": [MKDIR]}}}, "hydra.sweeper.grids.0"),
-    "a sweeper": ({"hydra": {"sweeper": {"_target_": "hydra_plugins.bomb.Bomb"}}}, "gsbench has its own"),
-    "a launcher": ({"hydra": {"launcher": {"_target_": "hydra_plugins.gsbench.os.mkdir"}}}, "hydra.launcher: gsbench"),
+    "a sweeper": ({"hydra": {"sweeper": {"_target_": "hydra_plugins.bomb.Bomb"}}}, "allow_targets=[hydra_plugins]"),
+    "an installed sweeper in another's place": (
+        {"hydra": {"sweeper": {"_target_": "hydra_plugins.hydra_optuna_sweeper.optuna_sweeper.OptunaSweeper"}}},
+        "hydra.sweeper._target_=",
+    ),
+    "a text of a sweeper": (
+        {"hydra": {"sweeper": {"custom_search_space": "bomb.Bomb"}}}, "allow_targets=[hydra.sweeper]"
+    ),
+    "below a sweeper": (
+        {"defaults": [{"override /hydra/sweeper": "basic"}], "hydra": {"sweeper": {"max_batch_size": MKDIR}}},
+        "max_batch_size",
+    ),
+    "a launcher": (
+        {"hydra": {"launcher": {"_target_": "hydra_plugins.gsbench.os.mkdir"}}}, "allow_targets=[hydra_plugins]"
+    ),
+    "lines of a launcher's shell": (
+        {"defaults": [{"override /hydra/launcher": "joblib"}], "hydra": {"launcher": {"temp_folder": "/strange"}}},
+        "allow_targets=[hydra.launcher]",
+    ),
     "beside the launcher": ({"hydra": {"launcher": {"in": MKDIR}}}, "hydra.launcher"),
     "a copy for the launcher": ({"hydra": {"launcher": "${densify}"}}, "hydra.launcher"),
     "a launcher that hands lines to a shell": (
         {"hydra": {"launcher": {"_target_": "hydra_plugins.hydra_submitit_launcher.submitit_launcher.SlurmLauncher"}}},
-        "gsbench works with basic and joblib",
+        "allow_targets=[hydra_plugins]",
     ),
     "a name in parts": (
         {"name": "mkdir", "densify": {"_target_": "os.${name}", "path": "exploded"}}, "write the name itself"
@@ -77,14 +94,24 @@ STRANGE: dict[str, tuple[dict[str, Any], str]] = {  # settings of a file, and a 
     "a partial object": (
         {"densify": {"_partial_": True}}, "_partial_: gsbench makes no"
     ),
-    "a copy for logging": ({"hydra": {"job_logging": "${train}"}}, "hydra.job_logging: log.txt"),
+    "a copy for logging": ({"hydra": {"job_logging": "${train}"}}, "write the settings"),
     "help": ({"hydra": {"help": {"_target_": "bomb.Bomb"}}}, "_target_ is not a setting"),
     "logging": (
         {"hydra": {"job_logging": {"handlers": {"x": {"class": "bomb.Bomb"}}, "root": {"handlers": ["x"]}}}},
-        "hydra.job_logging: log.txt",
+        "job_logging.handlers.x.class=bomb.Bomb",
     ),
     "logging by a factory": (
-        {"hydra": {"hydra_logging": {"formatters": {"x": {"()": "bomb.Bomb"}}}}}, "hydra.hydra_logging: log.txt"
+        {"hydra": {"hydra_logging": {"formatters": {"x": {"()": "bomb.Bomb"}}}}}, "allow_targets=[bomb]"
+    ),
+    "logging that imports a text": (
+        {"hydra": {"job_logging": {"root": {"level": "ext://bomb.Bomb"}}}}, "allow_targets=[hydra.job_logging]"
+    ),
+    "logging to another file": (
+        {
+            "defaults": [{"override /hydra/job_logging": "default"}],
+            "hydra": {"job_logging": {"handlers": {"file": {"filename": "exploded"}}}},
+        },
+        "allow_targets=[hydra.job_logging]",
     ),
     "a densifier": ({"densify": {"_target_": "bomb.Bomb"}}, "allow_targets=[bomb]"),
     "a package": ({"densify": {"_target_": "bombs.Bomb"}}, "allow_targets=[bombs]"),
@@ -166,7 +193,36 @@ def test_a_file_sets_no_variable(
     variables: Any, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     line = ask(experiment({"hydra": {"job": {"env_set": variables}}}), capsys, monkeypatch)
-    assert "hydra.job.env_set: set variables in the shell" in line
+    assert "hydra.job.env_set can change what runs" in line
+
+
+@pytest.mark.parametrize("sweeper", ["gsbench", "basic"])
+def test_what_one_choice_of_a_sweep_brings_along_is_not_run(
+    sweeper: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Hydra configures the logging of a job before gsbench sees the job."""
+    folder = Path("conf/scene")
+    folder.mkdir(parents=True)
+    logging = "hydra:\n  job_logging:\n    handlers:\n      x:\n        class: bomb.Bomb\n"
+    (folder / "strange.yaml").write_text(f"# @package _global_\n{logging}scene:\n  name: x\n")
+    words = ["-m", "--config-dir", "conf", f"hydra/sweeper={sweeper}", "hydra/launcher=basic", "init=random"]
+    assert "class=bomb.Bomb" in ask([*words, "scene=courtyard,strange"], capsys, monkeypatch)
+    assert not Path("exploded").exists()
+
+
+def test_a_launcher_in_a_strangers_file_is_not_run(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not even in the place of an installed one."""
+    for group, target in (("launcher", "hydra_plugins.bomb.Bomb"), ("sweeper", "hydra_plugins.bomb.Bomb")):
+        folder = Path("conf/hydra", group)
+        folder.mkdir(parents=True)
+        (folder / "basic.yaml").write_text(f"_target_: {target}\n")
+        (folder / "own.yaml").write_text(f"_target_: {target}\n")
+        for name in ("basic", "own"):
+            words = ["-m", "--config-dir", "conf", f"hydra/{group}={name}", "seed=0,1"]
+            assert "allow_targets=[hydra_plugins]" in ask(words, capsys, monkeypatch)
+    assert not Path("exploded").exists()
 
 
 VARIABLES = """

@@ -78,10 +78,13 @@ def test_an_experiment_file_has_all_of_hydra(gsbench: Run, tmp_path: Path) -> No
     assert sorted(notes[1:-1]) == sorted([*(f"{i} begins with seed {i}" for i in (0, 1)), *ends])
 
 
-def test_another_launcher_runs_a_trial_a_job(gsbench: Run, tmp_path: Path) -> None:
-    if find_spec("hydra_plugins.hydra_joblib_launcher") is None:
-        pytest.skip("needs hydra-joblib-launcher (group dev)")
-    words = ["-m", *TINY, "hydra/launcher=joblib", "name=x", "seed=0,1"]
+@pytest.mark.parametrize(
+    ("package", "launcher"), [("hydra_joblib_launcher", "joblib"), ("hydra_submitit_launcher", "submitit_local")]
+)
+def test_another_launcher_runs_a_trial_a_job(gsbench: Run, tmp_path: Path, package: str, launcher: str) -> None:
+    if find_spec(f"hydra_plugins.{package}") is None:
+        pytest.skip(f"needs {package.replace('_', '-')} (group dev)")
+    words = ["-m", *TINY, f"hydra/launcher={launcher}", "name=x", "seed=0,1"]
     done = gsbench(*words, GSBENCH_RUNS="runs", timeout=SECONDS)
     assert done.returncode == 0, done.stderr
     results = sorted((tmp_path / "runs" / "x").rglob("results.json"))

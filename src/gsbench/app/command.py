@@ -6,31 +6,26 @@ as one batch, or seed by seed until their question is decided.
 """
 
 import logging
-import os
 import sys
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from itertools import product
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
-from hydra.core.hydra_config import HydraConfig
-from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
-from hydra.core.plugins import Plugins
-from hydra.core.utils import JobReturn
 from hydra.errors import HydraException
-from hydra.plugins.launcher import Launcher
-from hydra.types import HydraContext, RunMode, TaskFunction
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from gsbench.analysis.quantities import COSTS
+from gsbench.app.sweep import OWN, Objective, Sweep, TrialTask, metric_of
 from gsbench.app.tuning import tuned_jobs
 from gsbench.claims.stopping import KeyAndSeed, headline, plan_sweep, run_looks
 from gsbench.config import compose
 from gsbench.config.command_words import (
     bare_key,
-    check_removal,
     check_words,
     grid_points,
     is_interval,
@@ -41,20 +36,17 @@ from gsbench.config.command_words import (
     value_text,
 )
 from gsbench.config.compose import Trial
-from gsbench.config.trust import PERMISSIONS, check_composed, load_callbacks
+from gsbench.config.trust import PERMISSIONS, load_callbacks
 from gsbench.errors import GsbenchError, InputError
 from gsbench.eval.options import EvalConfig
 from gsbench.files import checked_runs_folder, make_runs_folder
-from gsbench.launch.batch import begin_for_another_launcher, check_parts, missing_folders, need_no_check, run_batch
-from gsbench.launch.jobs import Outcome, outcome_of_error
+from gsbench.launch.batch import check_parts, missing_folders, need_no_check, run_batch
+from gsbench.launch.jobs import Outcome
 from gsbench.launch.record import declare_questions
 from gsbench.launch.states import describe_plan
-from gsbench.logs import set_up_logging
 from gsbench.runs.layout import RESULTS
-from gsbench.system.own_modules import allow_modules
 
 GRIDS = "hydra.sweeper.grids"
-OWN_LAUNCHER = "gsbench"  # its name in Hydra
 
 log = logging.getLogger(__name__)
 
@@ -103,50 +95,6 @@ def run_trials(trials: Sequence[Trial]) -> int:
     return summarize(run_batch(trials), trials)
 
 
-@dataclass
-class TrialTask:
-    """Hydra's task function: it gets a composed configuration and hands its trial to ``handle``.
-
-    ``handle`` runs trials; with ``look_only`` it only reports what would run. ``allowed`` is what the command line
-    permits, ``folder`` holds the user's modules, ``grids`` are the grids that gsbench's sweeper joins. ``trials`` and
-    ``outcomes`` collect all batches of a sweep.
-    """
-
-    handle: Callable[[Sequence[Trial]], list[Outcome]]
-    look_only: bool = False
-    allowed: tuple[str, ...] = ()
-    folder: str = field(default_factory=os.getcwd)
-    grids: Any = None
-    trials: list[Trial] = field(default_factory=list)
-    outcomes: list[Outcome] = field(default_factory=list)
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        # Pickled for another launcher's processes, which need nothing that was collected here.
-        return TrialTask, (self.handle, self.look_only, self.allowed, self.folder)
-
-    def __call__(self, config: DictConfig) -> None:
-        """Run one trial. Called by Hydra or by another launcher, perhaps in another process; raises if it failed."""
-        allow_modules(self.allowed, self.folder)
-        set_up_logging()
-        hydra: Any = HydraConfig.instance().cfg
-        # Checked again: the files that this job chooses may set other things of Hydra than the checked ones.
-        check_composed(hydra, self.allowed)
-        hydra_words, words = compose.typed_words(hydra.hydra.overrides)
-        trial = compose.resolve_trial(compose.enforce_permissions(config, self.allowed), [*hydra_words, *words])
-        if hydra.hydra.mode == RunMode.RUN:
-            self.launch([trial])
-            return
-        # A job of a sweep: its launcher passes on what is raised.
-        (outcome,) = self.handle([trial])
-        if outcome.status == "failed":
-            raise (InputError if outcome.bad_input else GsbenchError)(outcome.message)
-
-    def launch(self, trials: Sequence[Trial]) -> None:
-        """Run a batch of trials."""
-        self.trials += trials
-        self.outcomes += self.handle(trials)
-
-
 def run_app(words: Sequence[str], multirun: bool, task: TrialTask) -> None:
     """Run ``task`` for the trials of a command line: one, or many with ``multirun`` or an experiment that is a sweep.
 
@@ -162,15 +110,128 @@ def run_app(words: Sequence[str], multirun: bool, task: TrialTask) -> None:
     with compose.explained(words):
         check_sweep_settings(config, multirun)
     task.allowed = tuple(config[PERMISSIONS])
-    task.grids = OmegaConf.to_container(config.hydra.sweeper, resolve=False).get("grids")  # type: ignore[union-attr]
+    other = other_sweeper(config) if multirun else ""
+    if other and task.look_only:
+        words, multirun = words_without_sweeper(config, words, other)
+        if not multirun:
+            task.handle = lambda trials: []  # trials with other values are not listed
+        other = ""
+    sweeper = config.hydra.sweeper
+    task.grids = None if other else OmegaConf.to_container(sweeper, resolve=False).get("grids")  # type: ignore[union-attr]
     # The grids are taken out: Hydra would resolve their ${…} when it makes the sweeper, before each trial's values.
     argv = [*words, *[f"{GRIDS}=[]"] * bool(task.grids)]
-    if task.look_only:  # nothing runs, so no callback is called
+    if other:
+        argv = prepare_other_sweeper(config, argv, task, other)
+    if task.look_only:  # nothing runs, so no callback is called, and Hydra writes nothing
+        argv = [word for word in argv if not key_of(word).startswith(LOGGING)] + NO_FILES
         argv += [f"~hydra.callbacks.{name}" for name in config.hydra.callbacks]
     else:
         load_callbacks(config.hydra.callbacks, task.allowed)
-    with compose.explained(words, (HydraException, OmegaConfBaseException, OSError)):
-        compose.run_main(task, [*argv, f"hydra.mode={'MULTIRUN' if multirun else 'RUN'}"], task.allowed)
+        argv += words_for_hydras_files(config, words, multirun)
+        if config.hydra.job.chdir:
+            log.info("hydra.job.chdir: paths still start in %s, where the command was given", task.folder)
+    # Another sweeper may raise any error for its settings.
+    errors = Exception if other else (HydraException, OmegaConfBaseException, OSError)
+    with compose.explained(words, errors):
+        compose.run_main(task, [*argv, f"hydra.mode={'MULTIRUN' if multirun else 'RUN'}"], config)
+    if other and not task.trials:
+        name = config.name
+        log.info("hydra/sweeper=%s has ended: gsbench status %s; the table: gsbench tables %s", other, name, name)
+
+
+# ---- Hydra's other sweepers, and its own files
+
+GRID_SWEEPER = "basic"  # Hydra's own, which expands lists and asks for no values
+LOGGING = ("hydra/job_logging", "hydra/hydra_logging", "hydra.job_logging", "hydra.hydra_logging")
+NO_FILES = ["hydra/job_logging=none", "hydra/hydra_logging=none", "hydra.run.dir=.", "hydra.output_subdir=null"]
+HYDRAS_FILES = ("run", "sweep", "output_subdir")
+MAX_CHOICES = 1000  # of groups, in a sweep of another sweeper
+
+
+def other_sweeper(config: DictConfig) -> str:
+    """The name of the chosen sweeper; empty if it is gsbench's."""
+    name = str(config.hydra.runtime.choices["hydra/sweeper"])
+    return "" if name == OWN else name
+
+
+def words_without_sweeper(config: DictConfig, words: Sequence[str], name: str) -> tuple[list[str], bool]:
+    """The words for a look at what another sweeper would run, and whether they are a sweep."""
+    kept = [word for word in words if not key_of(word).startswith(("hydra/sweeper", "hydra.sweeper."))]
+    if name == GRID_SWEEPER:
+        return [*kept, f"hydra/sweeper={OWN}"], True
+    points = config.hydra.sweeper.get("n_trials")
+    count = "trials" if points is None else f"{points} trials (hydra.sweeper.n_trials)"
+    print(f"hydra/sweeper={name} searches: it proposes {count} from the results, so they are not known yet")
+    return [*(word for word in kept if not is_sweep(word)), f"hydra/sweeper={OWN}"], False
+
+
+def prepare_other_sweeper(config: DictConfig, words: Sequence[str], task: TrialTask, name: str) -> list[str]:
+    """Give the ``task`` what another sweeper asks for; returns the words for Hydra.
+
+    Raises InputError for a choice among the words that would run what is not allowed: Hydra reads a job's logging
+    before the job can be checked.
+    """
+    params = config.hydra.sweeper.get("params") or {}
+    lists = {bare_key(str(key)): f"{key}={value}" for key, value in params.items()}
+    lists |= {key_of(word): word for word in words if is_sweep(word)}
+    choices = [grid_points([parse_word(word)]) for key, word in lists.items() if "." not in key and key != "seed"]
+    for number, point in enumerate(product(*choices)):
+        if number == MAX_CHOICES:
+            raise InputError(f"hydra/sweeper={name}: more than {MAX_CHOICES} combinations of choices")
+        with compose.hydra_ready():
+            compose.compose_whole([*(w for w in words if not is_sweep(w)), *(word for (word,) in point)])
+    if name == GRID_SWEEPER:
+        task.objective = Objective(-1)
+        return list(words)
+    with compose.hydra_ready():
+        metric, direction = metric_of(compose.resolve_trial(config, words).values)
+    sign = 1 if _maximizes(config.hydra.sweeper) else -1
+    # A search must not choose among seeds: each job has them all.
+    seeds = [word for (word,) in grid_points([parse_word(lists["seed"])])] if "seed" in lists else []
+    task.objective = Objective(sign, tuple(seeds))
+    log.info(
+        "hydra/sweeper=%s gets %s%s of test views, %s; gsbench's own sweeper would tune on validation views and "
+        "can stop by looks",
+        name, "-" if sign != direction else "", metric, "maximized" if sign > 0 else "minimized",
+    )  # fmt: skip
+    kept = [word for word in words if key_of(word) != "seed" or not is_sweep(word)]
+    return kept + ["~hydra.sweeper.params.seed"] * ("seed" in params)
+
+
+def _maximizes(sweeper: DictConfig) -> bool:
+    """Return whether a sweeper was told (as Optuna's, Nevergrad's or Ax's is) to look for the largest value."""
+    direction = sweeper.get("direction")
+    name = str(getattr(direction, "name", direction)).lower()
+    nevergrad, ax = (OmegaConf.select(sweeper, key) for key in ("optim.maximize", "ax_config.experiment.minimize"))
+    return name == "maximize" or nevergrad is True or ax is False
+
+
+def words_for_hydras_files(config: DictConfig, words: Sequence[str], multirun: bool) -> list[str]:
+    """The words by which Hydra writes its own files as in any app, if one of its folders or logs was asked for.
+
+    Otherwise Hydra writes nothing, since each trial's folder has its configuration and log.
+    """
+    node, own = (OmegaConf.to_container(config.hydra, resolve=False), compose.installed_nodes(()))
+    assert isinstance(node, dict)
+    logs = node["job_logging"].get("root")
+    if not logs and all(node[key] == own[key] for key in HYDRAS_FILES):
+        return []
+    typed = {key_of(word) for word in words}
+    added = {}
+    if node["output_subdir"] is None and "hydra.output_subdir" not in typed:
+        added["hydra.output_subdir"] = ".hydra"
+    if not logs and "hydra/job_logging" not in typed:
+        added |= {"hydra/job_logging": "default", "hydra.job_logging.root.handlers": "[file]"}
+    if node["run"] == own["run"]:
+        added["hydra.run.dir"] = "${runs}/.hydra"
+    if multirun and node["sweep"]["subdir"] == own["sweep"]["subdir"]:
+        added["hydra.sweep.subdir"] = "${hydra.job.num}"
+    if multirun and config.hydra.runtime.choices["hydra/launcher"] == OWN:
+        if config.launch.name == "serial":
+            added["hydra/launcher"] = "basic"  # runs one job after the other, with Hydra's files for each
+        else:
+            log.info("launch=%s writes no files of Hydra's: each trial's folder has them", config.launch.name)
+    return [f"{key}={value}" for key, value in added.items()]
 
 
 def list_trials(trials: Sequence[Trial]) -> list[Outcome]:
@@ -193,9 +254,9 @@ def check_sweep_settings(config: DictConfig, multirun: bool) -> None:
     if config.launch.stop_when_decided and not multirun:
         raise InputError("launch.stop_when_decided adds seeds to a sweep: add -m, two densifiers and seed=0,1,2,3")
     launcher = config.hydra.runtime.choices["hydra/launcher"]
-    if launcher != OWN_LAUNCHER and not multirun:
+    if launcher != OWN and not multirun:
         raise InputError(f"hydra/launcher={launcher} launches sweeps: add -m, or leave it out")
-    if launcher != OWN_LAUNCHER and config.launch.name != "serial":
+    if launcher != OWN and config.launch.name != "serial":
         raise InputError(f"hydra/launcher={launcher} and launch={config.launch.name} are two launchers: choose one")
 
 
@@ -226,104 +287,51 @@ def summarize(outcomes: Sequence[Outcome], trials: Sequence[Trial]) -> int:
 # ---- sweeps
 
 
-@dataclass(frozen=True)
-class Sweep:
-    """A sweep that Hydra has started: its configuration, its task, Hydra's context and the launcher."""
+def run_sweep(sweep: Sweep, params: Mapping[str, Any], tune: Mapping[str, Any], words: Sequence[str]) -> None:
+    """Run all points that the ``words`` and ``params`` (``hydra.sweeper.params``) of the sweep span.
 
-    config: DictConfig
-    task: TrialTask
-    context: HydraContext
-    launcher: Launcher
-
-    @classmethod
-    def begin(cls, context: HydraContext, task: TaskFunction, config: DictConfig) -> Self:
-        """Make a sweep from what Hydra gives a sweeper."""
-        assert isinstance(task, TrialTask)
-        config.allow_targets = list(task.allowed)
-        compose.resolve_times(config)
-        launcher = Plugins.instance().instantiate_launcher(hydra_context=context, task_function=task, config=config)
-        return cls(config, task, context, launcher)
-
-    def run(self, params: Mapping[str, Any], tune: Mapping[str, Any], words: Sequence[str]) -> None:
-        """Run all points that the ``words`` and ``params`` (``hydra.sweeper.params``) of the sweep span.
-
-        ``tune`` (``hydra.sweeper.tune``) says how intervals among them are searched first (`gsbench.app.tuning`).
-        """
-        grids = checked_grids(self.task.grids or [])
-        jobs: list[list[str]] = []
-        intervals: list[dict[str, Override]] = []  # for each job, the settings that are searched for its arm
-        for grid_words in words_of_grids(params, grids, words):
-            by_key = {bare_key(override.get_key_element()): override for override in self.parse(grid_words)}
-            points = grid_points([override for override in by_key.values() if not is_interval(override)])
-            jobs += points
-            searched = {override.get_key_element(): override for override in by_key.values() if is_interval(override)}
-            intervals += [searched] * len(points)
-        trials = self.trials(tuned_jobs(self, tune, jobs, intervals))
-        if any(trial.values["launch"]["stop_when_decided"] for trial in trials):
-            self._run_until_decided(trials)
-        else:
-            self.launch(trials)
-
-    def parse(self, words: Sequence[str]) -> list[Override]:
-        """The words as Hydra reads them, with the choices of ``glob(*)``."""
-        for word in words:  # those from a file were not checked before
-            if (override := parse_word(word)).is_delete():
-                check_removal(override)
-        with compose.explained(words):
-            return OverridesParser.create(self.context.config_loader).parse_overrides(list(words))
-
-    def trials(self, jobs: Sequence[Sequence[str]]) -> list[Trial]:
-        """The trials of ``jobs``, each the list of its words."""
-        return compose.compose_jobs(self.context.config_loader, self.config, jobs)
-
-    def launch(self, trials: Sequence[Trial]) -> None:
-        """Run trials by the launcher. For another launcher than gsbench's, all trials are checked before the first."""
-        name = self.config.hydra.runtime.choices["hydra/launcher"]
-        if name == OWN_LAUNCHER or self.task.look_only:
-            self.task.launch(trials)
-            return
-        begin_for_another_launcher(trials)
-        jobs = [[word for word in trial.overrides if not parse_word(word).is_hydra_override()] for trial in trials]
-        try:
-            returned = self.launcher.launch(jobs, initial_job_idx=len(self.task.trials))
-        except GsbenchError:
-            raise
-        except Exception as error:
-            message = " ".join(str(error).split()) or type(error).__name__
-            raise GsbenchError(f"hydra/launcher={name}: {message} (gsbench status tells how far it came)") from error
-        self.task.trials += trials
-        self.task.outcomes += [_outcome(trial, ended) for trial, ended in zip(trials, returned, strict=True)]
-
-    def _run_until_decided(self, trials: Sequence[Trial]) -> None:
-        """Run the trials in the looks that the sequential test plans. Decided pairs of arms get no further trials.
-
-        Raises InputError for a sweep that cannot be tested so.
-        """
-        stopping = plan_sweep(trials)
-        if self.task.look_only:
-            print(stopping.describe())
-            self.launch(trials)
-            return
-        make_runs_folder(checked_runs_folder(trials[0].values["runs"]))
-        stopping = replace(stopping, declaration=declare_questions(stopping.home, stopping.declaration))
-        launched: set[Path] = set()
-
-        def run(planned: Sequence[KeyAndSeed]) -> None:
-            batch = [trial for key in planned if (trial := stopping.trials[key]).folder not in launched]
-            launched.update(trial.folder for trial in batch)
-            if batch:
-                self.launch(batch)
-
-        for verdict in run_looks(stopping.declaration, stopping.judged, run):
-            log.info("%s", headline(verdict))
-        spared = [trial for trial in trials if trial.folder not in launched and not (trial.folder / RESULTS).exists()]
-        log.info("%d of %d trials were not needed", len(spared), len(trials))
+    ``tune`` (``hydra.sweeper.tune``) says how intervals among them are searched first (`gsbench.app.tuning`).
+    """
+    grids = checked_grids(sweep.task.grids or [])
+    jobs: list[list[str]] = []
+    intervals: list[dict[str, Override]] = []  # for each job, the settings that are searched for its arm
+    for grid_words in words_of_grids(params, grids, words):
+        by_key = {bare_key(override.get_key_element()): override for override in sweep.parse(grid_words)}
+        points = grid_points([override for override in by_key.values() if not is_interval(override)])
+        jobs += points
+        searched = {override.get_key_element(): override for override in by_key.values() if is_interval(override)}
+        intervals += [searched] * len(points)
+    trials = sweep.trials(tuned_jobs(sweep, tune, jobs, intervals))
+    if any(trial.values["launch"]["stop_when_decided"] for trial in trials):
+        _run_until_decided(sweep, trials)
+    else:
+        sweep.launch(trials)
 
 
-def _outcome(trial: Trial, returned: JobReturn) -> Outcome:
-    """The outcome of a trial that another launcher ran."""
-    value: Any = returned._return_value  # the public property `return_value` would write a line to stderr
-    return outcome_of_error(trial.folder, value) if isinstance(value, Exception) else Outcome(trial.folder, "done")
+def _run_until_decided(sweep: Sweep, trials: Sequence[Trial]) -> None:
+    """Run the trials in the looks that the sequential test plans. Decided pairs of arms get no further trials.
+
+    Raises InputError for a sweep that cannot be tested so.
+    """
+    stopping = plan_sweep(trials)
+    if sweep.task.look_only:
+        print(stopping.describe())
+        sweep.launch(trials)
+        return
+    make_runs_folder(checked_runs_folder(trials[0].values["runs"]))
+    stopping = replace(stopping, declaration=declare_questions(stopping.home, stopping.declaration))
+    launched: set[Path] = set()
+
+    def run(planned: Sequence[KeyAndSeed]) -> None:
+        batch = [trial for key in planned if (trial := stopping.trials[key]).folder not in launched]
+        launched.update(trial.folder for trial in batch)
+        if batch:
+            sweep.launch(batch)
+
+    for verdict in run_looks(stopping.declaration, stopping.judged, run):
+        log.info("%s", headline(verdict))
+    spared = [trial for trial in trials if trial.folder not in launched and not (trial.folder / RESULTS).exists()]
+    log.info("%d of %d trials were not needed", len(spared), len(trials))
 
 
 # ---- grids

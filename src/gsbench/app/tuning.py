@@ -25,6 +25,7 @@ from hydra.core.override_parser.types import Override
 from omegaconf import OmegaConf
 from pydantic import NonNegativeInt, PositiveInt
 
+from gsbench.app.sweep import DEFAULT_METRIC, Sweep
 from gsbench.claims.stopping import facts_for
 from gsbench.config.command_words import bare_key, check_makes_trials, grid_points, key_of, parse_word
 from gsbench.config.compose import Trial
@@ -34,7 +35,7 @@ from gsbench.files import checked_runs_folder, make_runs_folder, write_json
 from gsbench.runs.experiments import SearchPoint, TuningRecord, make_home, metric_and_question
 from gsbench.runs.keys import flatten
 from gsbench.runs.layout import TUNING
-from gsbench.settings import check_settings
+from gsbench.settings import check_settings, check_values
 from gsbench.system.install import install_command
 from gsbench.words import counted, did_you_mean, listed
 
@@ -43,12 +44,9 @@ if TYPE_CHECKING:
     from optuna.distributions import BaseDistribution
     from optuna.trial import Trial as Proposal
 
-    from gsbench.app.command import Sweep
-
 log = logging.getLogger(__name__)
 
 PLACE = "hydra.sweeper.tune"
-DEFAULT_METRIC = "psnr"
 DEFAULT_POINTS = 20
 SEED = "seed"
 NOT_TUNED = ("scene", "eval", "launch", "tracking", "hydra")  # groups that say how all arms are run and judged
@@ -135,7 +133,8 @@ def tuned_jobs(
     Raises InputError for wrong ``settings`` (``hydra.sweeper.tune``) or intervals, and GsbenchError if no point of an
     arm could be judged.
     """
-    tune = TuneSettings(**OmegaConf.to_container(OmegaConf.create(settings)))  # type: ignore[arg-type]
+    given: Any = OmegaConf.to_container(OmegaConf.create(settings))
+    tune = TuneSettings(**check_values(TuneSettings, given, PLACE))
     untuned = [list(job) for job in jobs]
     if not tune.points or not any(intervals):
         return untuned
@@ -147,7 +146,8 @@ def tuned_jobs(
     if sweep.task.look_only:
         print(_describe(searches))
     if not _search(sweep, list(tuned.values())):
-        print("what it will choose is not known yet: the arms are listed as they are")
+        print(f"then the trials of the sweep ({len(jobs)}) with the values found, which are not known yet")
+        sweep.task.handle = lambda trials: []  # trials with other values are not listed
         return untuned
     best_words = {arm: _best_words(search) for arm, search in tuned.items()}
     return [[*job, *best_words.get(trial.folder.parent.name, ())] for job, trial in zip(jobs, trials, strict=True)]
@@ -211,7 +211,7 @@ def _describe(searches: Sequence[ArmSearch]) -> str:
     trials = {search.record.arm: len(search.jobs) * len(first.seeds) for search in searches if search.ranges}
     untuned = [search.record.arm for search in searches if not search.ranges]
     return (
-        f"tunes first: {counted(first.wanted, 'point')} each for {listed(list(trials))}, by {first.metric} "
+        f"a search tunes first: {counted(first.wanted, 'point')} each for {listed(list(trials))}, by {first.metric} "
         f"of validation views on {listed(first.scenes)} with {counted(len(first.seeds), 'seed')}, "
         f"{sum(trials.values()) * first.wanted} trainings" + (f"; not tuned: {listed(untuned)}" if untuned else "")
     )

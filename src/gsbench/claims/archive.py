@@ -170,6 +170,8 @@ def _check_configuration(folder: str, values: Mapping[str, Any], results: Mappin
 
 def _read(file: Path) -> tuple[dict[str, Any], dict[str, bytes]]:
     """The manifest, and the content of the files that it lists, whose checksums were compared."""
+    if file.exists() and not (file.is_file() or file.is_dir()):  # reading a pipe or a device may never end
+        raise InputError("it is not a regular file: give an archive")
     try:
         with zipfile.ZipFile(file) as archive:
             manifest = json.loads(_member(archive, MANIFEST))

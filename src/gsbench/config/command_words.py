@@ -4,7 +4,7 @@ import re
 import shlex
 from collections.abc import Sequence
 from functools import cache
-from itertools import accumulate, product
+from itertools import accumulate, islice, product
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +23,10 @@ GROUPS = ("scene", "init", "densify", "raster", "train", "eval", "tracking", "la
 EXTERNAL_FOLDER = "external"  # subfolder of a group for other programs; glob(*) does not list it
 IN_TRIAL_PATH = ("name", "seed")  # not in the configuration's hash, but in the path of the trial's folder
 OPTIONS = ("-m", "--multirun", "--dry-run", "--config-dir", "--cfg", "--info", "--help", "--version")
+MAIN_CONFIG_OPTIONS = ("--config-name", "-cn", "--config-path", "-cp")  # of Hydra: they replace the main configuration
 # Settings that are texts, by the last part of their keys.
 TEXTS = ("name", "runs", "path", "images", "sparse", "masks", "train_list", "test_list", "weights", "uri", "version")
+MAX_POINTS = 1_000_000  # values of one list; more would fill the memory
 MAX_BRACKETS = 40  # open at once in a word, since Hydra's parser recurses into them
 KEY = re.compile(r"[+~]*\w+([./]\w+)*")
 
@@ -42,6 +44,13 @@ def parse(argv: Sequence[str]) -> tuple[list[str], bool, bool]:
             dry_run = True
         elif word.split("=")[0] in ("--config-dir", "-cd"):
             folders.append(Path(word.partition("=")[2] or next(words, "")))
+        elif word.split("=")[0] in MAIN_CONFIG_OPTIONS:
+            name = word.partition("=")[2] or next(words, "NAME")
+            name = "NAME" if "-cp" in word or "path" in word else name
+            raise InputError(
+                f"{word}: gsbench's main configuration is its own: write yours to FOLDER/experiment/{name}.yaml, and "
+                f"give --config-dir FOLDER +experiment={name}"
+            )
         elif word.startswith("-"):
             group = word.lstrip("-").partition("=")[0]
             is_setting = group.partition(".")[0] in GROUPS
@@ -246,11 +255,14 @@ def grid_points(overrides: Sequence[Override]) -> list[list[str]]:
         if override.is_sweep_override():
             check_sweep(override)
             try:
-                choices[key] = [f"{key}={value}" for value in override.sweep_string_iterator()]
+                values = islice(override.sweep_string_iterator(), MAX_POINTS + 1)
+                choices[key] = [f"{key}={value}" for value in values]
             except ValueError as error:  # such as a range with a step of 0
                 raise InputError(f"{override.input_line}: {error}") from error
             if not choices[key]:
                 raise InputError(f"{override.input_line} lists no value")
+            if len(choices[key]) > MAX_POINTS:
+                raise InputError(f"{override.input_line} lists more than {MAX_POINTS:,} values")
         else:
             choices[key] = [key if override.is_delete() else f"{key}={override.get_value_element_as_str()}"]
     return [list(point) for point in product(*choices.values())]

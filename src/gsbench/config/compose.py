@@ -22,15 +22,17 @@ import yaml
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 from omegaconf.errors import OmegaConfBaseException
 
 from gsbench.config import command_words
 from gsbench.config.command_words import GROUPS, options, parse_word
 from gsbench.config.schema import Config, checked_values, register_schemas
-from gsbench.config.trust import HYDRAS_CALLBACKS, PERMISSIONS, check_composed, check_permissions
+from gsbench.config.trust import HYDRAS_CALLBACKS, MADE_NODES, PERMISSIONS, check_composed, check_permissions
 from gsbench.errors import GsbenchError, InputError
 from gsbench.parsing import MAX_VALUES
+from gsbench.runs.keys import targets_in
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.settings import check_values
 from gsbench.system.install import conf_dir
@@ -44,6 +46,7 @@ VERSION_BASE: dict[str, Any] = {"version_base": "1.3"} if hydra.__version__.star
 WHITELIST: Callable[[Sequence[str]], AbstractContextManager[Any]] = getattr(
     hydra.utils, "execution_whitelist", lambda names: nullcontext()
 )
+MADE_GROUPS = tuple(f"hydra/{name}" for name in MADE_NODES)
 HYDRAS_LINE = "Error executing job with overrides"
 
 
@@ -126,10 +129,34 @@ def enforce_permissions(config: DictConfig, allowed: Sequence[str]) -> DictConfi
 
     Setting it discards what a file says of ``allow_targets``.
     """
-    check_composed(config, allowed)
+    check_permitted(config, allowed)
     with read_write(config), open_dict(config):
         config[PERMISSIONS] = list(allowed)
     return config
+
+
+def check_permitted(config: DictConfig, allowed: Sequence[str]) -> None:
+    """`check_composed`, with Hydra's nodes as the installed packages write them."""
+    choices = config.hydra.runtime.choices if "hydra" in config else {}
+    words = [f"{group}={choice}" for group, choice in sorted(choices.items()) if str(group).startswith(MADE_GROUPS)]
+    check_composed(config, allowed, installed_nodes(tuple(words)))
+
+
+@cache
+def installed_nodes(words: tuple[str, ...]) -> Mapping[str, Any]:
+    """Hydra's node for the choices ``words``, from installed packages only; choices from a user's folder are left out.
+
+    It also has what gsbench's own ``conf/config.yaml`` sets.
+    """
+    with hydra_ready():
+        try:
+            config = hydra.compose(CONFIG_NAME, list(words), return_hydra_config=True)
+        except (HydraException, OmegaConfBaseException):
+            if len(words) < 2:
+                return installed_nodes(())
+            # One by one: a choice that no package has must not take the others along.
+            return {name: node for word in words for name, node in installed_nodes((word,)).items() if name in word}
+        return OmegaConf.to_container(config.hydra, resolve=False)  # type: ignore[return-value]
 
 
 def compose_one(overrides: Sequence[str], modules: str | None = None) -> Trial:
@@ -144,6 +171,8 @@ def compose_one(overrides: Sequence[str], modules: str | None = None) -> Trial:
 
 def resolve_trial(config: DictConfig, overrides: Sequence[str]) -> Trial:
     """The trial of a composed configuration, with interpolations resolved in a copy."""
+    if "hydra" in config:  # for ${hydra:…} among the settings
+        HydraConfig.instance().set_config(config)
     with explained(overrides):
         return Trial(checked_values(config), tuple(overrides))
 
@@ -174,15 +203,20 @@ SEED = re.compile(r"seed=(\d+)")
 PLAIN_KEY = re.compile(r"seed|(?!hydra\b)[a-zA-Z]\w*(\.[a-zA-Z]\w*)+")
 # An interpolation that may read the seed: it names the seed, or its own name is an interpolation.
 MAY_READ_SEED = re.compile(r"\$\{[^}]*(seed|\$\{)")
+# An interpolation that may read Hydra's node, which has the number and the words of a job.
+READS_HYDRA = re.compile(r"\$\{\s*hydra\b")
 
 
-def compose_jobs(loader: ConfigLoader, sweep: DictConfig, jobs: Sequence[Sequence[str]]) -> list[Trial]:
-    """The trials of ``jobs``, each the list of its words; ``sweep`` is the configuration of the whole sweep."""
+def compose_jobs(loader: ConfigLoader, sweep: DictConfig, jobs: Sequence[Sequence[str]], first: int = 0) -> list[Trial]:
+    """The trials of ``jobs``, each the list of its words; ``sweep`` is the configuration of the whole sweep.
+
+    ``first`` is the number of the first job, for ``${hydra:job.num}``.
+    """
     by_files: dict[tuple[str, ...], DictConfig] = {}
     by_settings: dict[tuple[str, ...], Trial] = {}
     trials = []
     hydra_words, allowed = typed_words(sweep.hydra.overrides)[0], tuple(sweep.allow_targets)
-    for words in jobs:
+    for number, words in enumerate(jobs, first):
         overrides = (*hydra_words, *words)
         seeds = [int(match.group(1)) for word in words if (match := SEED.fullmatch(word))]
         without_seed = tuple(word for word in words if not SEED.fullmatch(word))
@@ -198,12 +232,17 @@ def compose_jobs(loader: ConfigLoader, sweep: DictConfig, jobs: Sequence[Sequenc
                     OmegaConf.update(composed, key, value)
             else:
                 command_words.check_search_path(words, allowed)
-                composed = by_files[files] = enforce_permissions(loader.load_sweep_config(sweep, list(words)), allowed)
+                composed = enforce_permissions(loader.load_sweep_config(sweep, list(words)), allowed)
                 with read_write(composed), open_dict(composed):
-                    composed.pop("hydra")  # large, and no trial reads it
-            reads_seed = MAY_READ_SEED.search(repr(OmegaConf.to_container(composed, resolve=False)))
+                    composed.hydra.job.num, composed.hydra.job.id = number, f"job_id_for_{number}"
+                    HydraConfig.instance().set_config(composed)
+                    composed.pop("hydra")  # large, and no trial reads it but by ${hydra:…}
+            settings = repr(OmegaConf.to_container(composed, resolve=False))
             trials.append(resolve_trial(composed, overrides))
-        if not reads_seed:
+        reads_hydra = READS_HYDRA.search(settings)
+        if not reads_hydra:
+            by_files.setdefault(files, composed)
+        if not reads_hydra and not MAY_READ_SEED.search(settings):
             by_settings[without_seed] = trials[-1]
     return trials
 
@@ -264,12 +303,13 @@ def hydra_ready() -> Iterator[None]:
         HydraConfig.instance().cfg = None
 
 
-def run_main(task: Callable[[Any], Any], argv: Sequence[str], allowed: Sequence[str] = ()) -> None:
+def run_main(task: Callable[[Any], Any], argv: Sequence[str], config: DictConfig | None = None) -> None:
     """Run ``task`` as an app of ``hydra.main`` with the words ``argv``; raises what ``task`` raises.
 
-    Hydra may instantiate the callback classes that ``allowed`` names, and its own.
+    Hydra may instantiate its own callbacks, and of the checked ``config`` the allowed ones and the chosen plug-ins.
     """
-    names = [name for name in allowed if all(part.isidentifier() for part in name.split("."))]
+    names = [] if config is None else [*config[PERMISSIONS], *(target for _, target in targets_in(plugins_of(config)))]
+    names = [name for name in names if all(part.isidentifier() for part in name.split("."))]
     register_schemas()
     saved_argv, sys.argv = sys.argv, ["gsbench", *argv]
     saved_full_error = os.environ.get("HYDRA_FULL_ERROR")
@@ -284,6 +324,11 @@ def run_main(task: Callable[[Any], Any], argv: Sequence[str], allowed: Sequence[
         if saved_full_error is not None:
             os.environ["HYDRA_FULL_ERROR"] = saved_full_error
         HydraConfig.instance().cfg = None
+
+
+def plugins_of(config: DictConfig) -> dict[str, Any]:
+    """The nodes of a configuration of which Hydra makes the launcher and the sweeper."""
+    return {key: OmegaConf.to_container(config.hydra[key], resolve=False) for key in ("launcher", "sweeper")}
 
 
 class _WithoutHydrasLine:

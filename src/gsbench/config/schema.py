@@ -20,9 +20,11 @@ from gsbench.config.trust import is_external
 from gsbench.errors import InputError
 from gsbench.eval.options import EvalConfig
 from gsbench.raster.executors import RasterConfig
+from gsbench.runs.keys import entries_of
 from gsbench.runs.layout import IN_RUNS
 from gsbench.scene.options import SceneConfig
 from gsbench.settings import (
+    MAX_INTEGER,
     MISSING,
     Address,
     FolderName,
@@ -37,7 +39,6 @@ from gsbench.system.resources import trials_at_once
 from gsbench.train.options import TrainConfig
 
 NO_DENSIFIER = "gsbench.densify.NoDensifier"
-MAX_SEED = 2**63 - 1  # torch's generators take no larger one
 
 
 ExperimentName = Annotated[
@@ -112,7 +113,7 @@ class Config:
     """The root. ``init`` and ``densify`` take any keys, because a user's own class has its own options."""
 
     name: ExperimentName = "default"
-    seed: Annotated[int, Interval(ge=0, le=MAX_SEED)] = 0
+    seed: Annotated[int, Interval(ge=0, le=MAX_INTEGER)] = 0
     device: DeviceName = "auto"
     threads: Threads | Literal["auto"] = "auto"
     runs: PathName = MISSING
@@ -165,6 +166,9 @@ def checked_values(config: DictConfig) -> dict[str, Any]:
     naming the key.
     """
     values = plain(config)
+    for place, key, value in entries_of(values):  # also options of components, which their classes check later
+        if isinstance(value, int) and abs(value) > MAX_INTEGER:
+            raise InputError(f"{'.'.join((*place, key))}={value} is not a whole number of 64 bits: give a nearer one")
     for group in (*GROUP_SCHEMAS, *COMPONENTS):
         if not isinstance(values.get(group), dict):
             raise InputError(f"{group} must be chosen, as {group}=NAME (see gsbench --help), got {values.get(group)!r}")

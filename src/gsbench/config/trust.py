@@ -58,27 +58,18 @@ UNQUOTED = re.compile(r"[\w./+-]+")  # a name that needs no quotes in a list on 
 SPECIAL_KEYS = (  # keys by which Hydra instantiates objects, beside _target_
     "_recursive_", "_convert_", "_args_", "_partial_", "_isolate_", "_execution_whitelist_"
 )  # fmt: skip
-OWN_SWEEPER = "hydra_plugins.gsbench.GsbenchSweeper"
-# The launchers that may be used, if installed. Others can run shell lines, as submitit's can.
-LAUNCHERS = ("GsbenchLauncher", "BasicLauncher", "JoblibLauncher")
 HYDRAS_CALLBACKS = tuple(
     f"hydra.experimental.callbacks.{name}" for name in ("LogJobReturnCallback", "PickleJobInfoCallback")
 )
-# Hydra's settings that must stay as in conf/config.yaml, and the error's advice. Some would start code: logging names
-# classes, and a variable can name a file that Python, a library or a program loads.
-RUNS_TRIALS = "gsbench runs the trials itself, as launch=serial, local or slurm says: leave it out"
-IN_LOG = "log.txt in a trial's folder holds everything: leave it out"
-NO_LOGGING = {"version": 1, "root": None, "disable_existing_loggers": False}
-FIXED_SETTINGS: dict[str, tuple[Any, str]] = {
-    "output_subdir": (None, RUNS_TRIALS),
-    "run": ({"dir": "."}, RUNS_TRIALS),
-    "sweep": ({"dir": "${runs}/.hydra", "subdir": "."}, RUNS_TRIALS),
-    "job.chdir": (False, "trials run in the folder where the command was given, and paths start there: leave it out"),
-    "job.env_set": ({}, "set variables in the shell, before the command"),
-    "verbose": (False, IN_LOG),
-    "job_logging": (NO_LOGGING, IN_LOG),
-    "hydra_logging": (NO_LOGGING, IN_LOG),
-}
+# Hydra's nodes of which plug-ins and loggers are made. What an installed package writes there is trusted.
+MADE_NODES = ("launcher", "sweeper", "job_logging", "hydra_logging")
+CLASS_KEYS = (TARGET, "class", "()")  # Hydra's and logging's keys of import paths
+# Keys whose texts start nothing: resources, names and directions, and how a log line looks. In a plug-in any other text
+# may be a line for a shell, a module or a server whose answers are unpickled; in a logger, a file to append to.
+PLUGIN_TEXTS = SBATCH_RESOURCES | {"name", "direction", "study_name", "timeout", "pre_dispatch", "backend"}
+LOGGING_TEXTS = ("level", "format", "datefmt", "style", "handlers", "formatter")
+FREE_TEXTS = ("ext://sys.stdout", "ext://sys.stderr", "auto", "local")  # streams; a Ray cluster of this machine
+SWEPT_TEXTS = ("params", "grids", "search_space")  # parts of a sweeper that are words of its jobs, checked as such
 # Resolvers that make only texts and numbers. Resolvers that turn texts into mappings (oc.create, oc.decode, oc.dict)
 # could create a `_target_` after the check; resolvers of plug-ins could do anything.
 RESOLVERS = ("hydra", "now", "oc.env", "oc.select", "python_version")
@@ -175,15 +166,17 @@ def packages_allowed_at(place: Sequence[str]) -> tuple[str, ...]:
     return ()
 
 
-def check_composed(config: DictConfig, allowed: Sequence[str]) -> None:
+def check_composed(config: DictConfig, allowed: Sequence[str], installed: Mapping[str, Any]) -> None:
     """Refuse a composed configuration, with Hydra's node, that would run what is not ``allowed``.
 
-    The values are checked before ``${…}`` is resolved. An interpolation that could change what runs is refused. Raises
-    InputError.
+    ``installed`` has Hydra's nodes as the installed packages alone write them for the same choices. The values are
+    checked before ``${…}`` is resolved. An interpolation that could change what runs is refused. Raises InputError.
     """
     raw: Any = OmegaConf.to_container(config, resolve=False)
     if "hydra" in raw:  # Hydra removes its node when it runs a job
-        _check_hydra(raw["hydra"])
+        foreign = {name: _differing(raw["hydra"][name], installed.get(name)) for name in MADE_NODES}
+        raw["hydra"] = raw["hydra"] | foreign
+        _check_hydra(raw["hydra"], allowed)
     for place, key, value in entries_of(raw):
         if isinstance(value, str) and "${" in value:
             _check_interpolation(place, key, value)
@@ -191,6 +184,14 @@ def check_composed(config: DictConfig, allowed: Sequence[str]) -> None:
             raise InputError(f"{'.'.join((*place, key))}: gsbench makes no objects this way: leave it out")
     for place, target in targets_in(raw):
         _check_place(place, target, allowed)
+
+
+def _differing(given: Any, installed: Any) -> Any:
+    """What differs in ``given`` from ``installed``: of mappings the differing entries, else ``given`` itself."""
+    if not isinstance(given, dict) or not isinstance(installed, dict):
+        return given
+    differing = {key: value for key, value in given.items() if key not in installed or value != installed[key]}
+    return {key: _differing(value, installed.get(key)) for key, value in differing.items()}
 
 
 def _check_interpolation(place: tuple[str, ...], key: str, value: str) -> None:
@@ -204,8 +205,6 @@ def _check_interpolation(place: tuple[str, ...], key: str, value: str) -> None:
     except GrammarParseError:  # OmegaConf cannot resolve it either, and says so when the value is read
         return
     for name in resolvers:
-        if name == "hydra" and place[:1] != ("hydra",):
-            raise InputError(f"{where}={value}: a trial gets its settings from gsbench, so they cannot read Hydra's")
         if name not in RESOLVERS:
             raise InputError(f"{where}={value}: ${{{name}:…}} is not resolved here, only {', '.join(RESOLVERS)}")
 
@@ -220,8 +219,8 @@ def _resolvers(tree: Any) -> Iterator[str]:
 
 def _check_place(place: tuple[str, ...], target: Any, allowed: Sequence[str]) -> None:
     """Refuse a ``target`` that its ``place`` may not name: Hydra would import and call it."""
-    if not isinstance(target, str) or target == "???" or place in (("hydra", "launcher"), ("hydra", "sweeper")):
-        return  # the schema, Hydra or `_check_hydra` reports these
+    if not isinstance(target, str) or target == "???":
+        return  # the schema or Hydra reports these
     group = ".".join(place)
     # gsbench's classes are allowed in their own group only: `densify._target_=gsbench.init.…` is refused.
     own = HYDRAS_CALLBACKS if place[:2] == ("hydra", "callbacks") and len(place) == 3 else packages_allowed_at(place)
@@ -230,43 +229,42 @@ def _check_place(place: tuple[str, ...], target: Any, allowed: Sequence[str]) ->
         load_class(target, group, allowed)  # refuses names such as gsbench.densify.adc.torch.load
 
 
-def _check_hydra(hydra: dict[str, Any]) -> None:
-    """Refuse Hydra's own settings that have no effect here or would start code."""
-    for name, (fixed, advice) in FIXED_SETTINGS.items():
-        group, _, key = name.partition(".")
-        value = hydra.get(group) if not key else hydra[group].get(key)
-        if isinstance(fixed, dict) and (isinstance(value, dict) or value is None):
-            value = {**fixed, **(value or {})}
-        if value != fixed:
-            raise InputError(f"hydra.{name}: {advice}")
-    launcher, sweeper = hydra["launcher"], hydra["sweeper"]
-    if sweeper.get(TARGET) != OWN_SWEEPER:
-        raise InputError("hydra.sweeper: gsbench has its own, which searches intervals, too: leave hydra/sweeper out")
-    # Hydra instantiates these, and ${…} may stand for a mapping that names a class.
-    own_sweeper = sweeper | {"params": None, "grids": None}
-    plugins = {"callbacks": hydra["callbacks"], "launcher": launcher, "sweeper": own_sweeper}
-    for place, key, value in entries_of(plugins, ("hydra",)):
-        if isinstance(value, str) and "${" in value:
-            raise InputError(f"{'.'.join((*place, key))}: write the settings themselves here, without ${{…}}")
-    if not isinstance(launcher, dict) or launcher.get(TARGET) not in known_launchers():
-        raise InputError("hydra.launcher: gsbench works with basic and joblib, beside launch=serial, local and slurm")
-    # A job is composed after this check, and its words could name packages to import configurations from.
-    for place, key, value in entries_of(sweeper, ("hydra", "sweeper")):
-        for text in (key, value) if key != TARGET else ():
-            if isinstance(text, str) and NOT_SWEPT.match(text):
-                raise InputError(
-                    f"{'.'.join(place)}: {text} cannot differ from job to job, and no file can allow it: "
-                    "type it on the command line"
-                )
+def _check_hydra(hydra: Mapping[str, Any], allowed: Sequence[str]) -> None:
+    """Refuse Hydra's own settings that would start code. Of `MADE_NODES`, ``hydra`` has what no package wrote."""
+    # A variable can name a file that Python, a library or a program loads, and no list of harmless ones is complete.
+    if hydra["job"].get("env_set"):
+        raise InputError("hydra.job.env_set can change what runs: set variables in the shell, before the command")
+    for place, key, value in entries_of({name: hydra[name] for name in ("callbacks", *MADE_NODES)}, ("hydra",)):
+        where = ".".join((*place, key))
+        name = key if len(place) == 1 else place[1]
+        if (*place, key)[1:3] in [("sweeper", part) for part in SWEPT_TEXTS]:
+            # A job is composed after this check, and its words could name packages to import configurations from.
+            for text in (key, value):
+                if isinstance(text, str) and NOT_SWEPT.match(text):
+                    raise InputError(
+                        f"{'.'.join(place)}: {text} cannot differ from job to job, and no file can allow it: "
+                        "type it on the command line"
+                    )
+        elif isinstance(value, str) and "${" in value:
+            raise InputError(f"{where}: write the settings themselves here, without ${{…}}")  # may become a class
+        elif name in MADE_NODES and isinstance(value, str):
+            _check_text(where, name, key if not key.isdigit() else place[-1], value, allowed)
 
 
-def known_launchers() -> set[str]:
-    """The import paths of those `LAUNCHERS` that are installed."""
-    from hydra.core.plugins import Plugins
-    from hydra.plugins.launcher import Launcher
-
-    installed = Plugins.instance().discover(Launcher)
-    return {f"{cls.__module__}.{cls.__name__}" for cls in installed if cls.__name__ in LAUNCHERS}
+def _check_text(where: str, node: str, key: str, text: str, allowed: Sequence[str]) -> None:
+    """Refuse a ``text`` that no package wrote, if a plug-in or a logger could take it for code or a file."""
+    is_logging = node.endswith("_logging")
+    if key in CLASS_KEYS:
+        if not is_allowed(text, allowed):
+            advice = permission_advice([text.split(".")[0]], allowed)
+            raise InputError(f"{where}={text} is not what a package set; if you trust that code, {advice}")
+        return
+    if is_allowed(f"hydra.{node}", allowed) or where.startswith("hydra.sweeper.tune.") or text in FREE_TEXTS:
+        return
+    # logging imports what stands behind ext://, in any text.
+    if "://" in text or not text.isprintable() or key not in (LOGGING_TEXTS if is_logging else PLUGIN_TEXTS):
+        advice = permission_advice([f"hydra.{node}"], allowed)
+        raise InputError(f"{where}={text!r} could start code or write a file; if you trust it, {advice}")
 
 
 def load_callbacks(callbacks: Any, allowed: Sequence[str]) -> None:

@@ -1,0 +1,170 @@
+"""Plug-ins of others for Hydra, through the real program: sweepers that search, and Ray; and Hydra's own files.
+
+Two of them need older packages than gsbench's own search and tracker, so ``make test-hydra-plugins`` installs them
+into a folder of their own. Without it these tests are skipped.
+"""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections import defaultdict
+from collections.abc import Iterator
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+import yaml
+
+from tests.end_to_end.conftest import Run, start
+from tests.end_to_end.test_hydra import SECONDS, TINY, results_below
+
+pytestmark = pytest.mark.slow
+
+
+def need(package: str) -> None:
+    if find_spec(f"hydra_plugins.{package}") is None:
+        pytest.skip(f"needs {package.replace('_', '-')}: make test-hydra-plugins (or group dev)")
+
+
+# ---- sweepers
+
+
+@pytest.mark.parametrize("direction", ["minimize", "maximize"])
+def test_optunas_sweeper_looks_for_the_best_mean_over_seeds(gsbench: Run, tmp_path: Path, direction: str) -> None:
+    need("hydra_optuna_sweeper")
+    small = [word for word in TINY if not word.startswith("init.count")]
+    words = ["-m", *small, "name=x", "seed=0,1", "init.count=int(interval(100,400))", "hydra/sweeper=optuna"]
+    words += ["hydra.sweeper.n_trials=3", f"hydra.sweeper.direction={direction}"]
+    look = gsbench(*words, "--dry-run", GSBENCH_RUNS="runs", timeout=SECONDS)
+    assert "hydra/sweeper=optuna searches: it proposes 3 trials" in look.stdout, look.stderr
+    assert not (tmp_path / "runs").exists()
+
+    done = gsbench(*words, GSBENCH_RUNS="runs", timeout=SECONDS)
+    assert done.returncode == 0, done.stderr
+    assert f"psnr of test views, {direction}d" in done.stderr
+    psnr = defaultdict(list)
+    for result in results_below(tmp_path / "runs" / "x"):
+        psnr[result["num_init_points"]].append(result["metrics"]["psnr"])  # type: ignore[index]
+    assert all(len(values) == 2 for values in psnr.values())
+    best = max(psnr, key=lambda count: statistics.fmean(psnr[count]))
+    found = yaml.safe_load((tmp_path / "runs" / ".hydra" / "optimization_results.yaml").read_text())
+    assert found["best_params"] == {"init.count": best}
+    sign = 1 if direction == "maximize" else -1
+    assert found["best_value"] == pytest.approx(sign * statistics.fmean(psnr[best]))
+
+
+def test_what_a_sweeper_does_not_understand_is_one_line(gsbench: Run, tmp_path: Path) -> None:
+    need("hydra_optuna_sweeper")
+    for words in (["hydra.sweeper.params=3"], ["hydra.sweeper.direction=up", "seed=0,1"]):
+        done = gsbench("-m", *TINY, "hydra/sweeper=optuna", *words, GSBENCH_RUNS="runs", timeout=SECONDS)
+        assert done.returncode == 2
+        assert "Traceback" not in done.stderr
+        assert done.stderr.splitlines()[-1].startswith("gsbench: ")
+
+
+def test_a_strangers_texts_for_a_sweeper_are_refused(gsbench: Run, tmp_path: Path) -> None:
+    need("hydra_optuna_sweeper")
+    (tmp_path / "bomb.py").write_text("open('exploded', 'w')\ndef bomb(*rest): ...\n")
+    for word in ("hydra.sweeper.custom_search_space=bomb.bomb", "hydra.sweeper.storage=sqlite:///exploded"):
+        done = gsbench("-m", *TINY, "hydra/sweeper=optuna", "seed=0,1", word, GSBENCH_RUNS="runs", timeout=SECONDS)
+        assert done.returncode == 2
+        assert "allow_targets=[hydra.sweeper]" in done.stderr
+    assert not (tmp_path / "exploded").exists()
+
+
+# ---- Ray
+
+
+@pytest.fixture
+def cluster() -> Iterator[Any]:
+    """A Ray cluster of two nodes on this machine, each with one worker."""
+    need("hydra_ray_launcher")
+    from ray.cluster_utils import Cluster
+
+    node = {"num_cpus": 1, "object_store_memory": 10**8}
+    cluster = Cluster(initialize_head=True, head_node_args=node | {"include_dashboard": False})
+    cluster.add_node(**node)
+    yield cluster
+    cluster.shutdown()
+
+
+def ray_workers() -> list[psutil.Process]:
+    """The processes of the cluster that run a job now."""
+    found = []
+    for process in psutil.Process().children(recursive=True):
+        try:
+            found += [process] * any("ray::_run_job" in word for word in process.cmdline())
+        except psutil.Error:
+            continue
+    return found
+
+
+def test_ray_runs_a_sweep_on_two_nodes_and_a_killed_worker_costs_nothing(
+    cluster: Any, environment: dict[str, str], tmp_path: Path, gsbench: Run
+) -> None:
+    words = ["-m", *TINY, "name=x", "seed=0,1,2,3,4,5,6,7", "hydra/launcher=ray"]
+    words += ["hydra.launcher.ray.init.address=auto", "+hydra.launcher.ray.init.object_store_memory=null"]
+    program = start(environment | {"RAY_ADDRESS": cluster.address}, tmp_path, tmp_path / "runs", *words)
+    at_once, killed = 0, 0
+    until = time.monotonic() + SECONDS
+    while program.poll() is None and time.monotonic() < until:
+        workers = ray_workers()
+        at_once = max(at_once, len(workers))
+        if not killed and at_once == 2 and list((tmp_path / "runs").glob("x/*/*/*/log.txt")):
+            workers[-1].kill()
+            killed = workers[-1].pid
+        time.sleep(0.2)
+    out, _ = program.communicate(timeout=SECONDS)
+    assert (program.returncode, at_once, bool(killed)) == (0, 2, True), out
+    assert "8 of 8 trials done" in out
+    assert sorted(result["seed"] for result in results_below(tmp_path / "runs" / "x")) == list(range(8))
+
+
+# ---- Hydra's own files and logs
+
+
+def test_hydra_writes_its_files_where_it_is_told(gsbench: Run, tmp_path: Path) -> None:
+    words = [*TINY, "name=x", "hydra.run.dir=own", "hydra.verbose=true", "hydra.job.chdir=true"]
+    done = gsbench(*words, GSBENCH_RUNS="runs", timeout=SECONDS)
+    assert done.returncode == 0, done.stderr
+    (result,) = (tmp_path / "runs" / "x").rglob("results.json")  # and not below own/
+    assert f"paths still start in {tmp_path}" in done.stderr
+    assert yaml.safe_load((tmp_path / "own" / ".hydra" / "config.yaml").read_text())["name"] == "x"
+    assert f"the trial's folder is {result.parent}" in (tmp_path / "own" / "gsbench.log").read_text()
+
+    sweep = ["-m", *TINY, "name=x", "seed=0,1", "hydra.sweep.dir=many", "hydra.output_subdir=h"]
+    done = gsbench(*sweep, GSBENCH_RUNS="runs", timeout=SECONDS)
+    assert done.returncode == 0, done.stderr
+    for job in ("0", "1"):
+        assert yaml.safe_load((tmp_path / "many" / job / "h" / "config.yaml").read_text())["seed"] == int(job)
+    assert len(list((tmp_path / "runs" / "x").rglob("results.json"))) == 2
+
+
+def test_colours_of_a_log_reach_the_terminal(gsbench: Run, tmp_path: Path) -> None:
+    need("hydra_colorlog")
+    words = [*TINY, "name=x", "hydra/job_logging=colorlog", "hydra/hydra_logging=colorlog"]
+    done = gsbench(*words, GSBENCH_RUNS="runs", timeout=SECONDS)
+    assert done.returncode == 0, done.stderr
+    assert "\x1b[32mINFO" in done.stdout
+
+
+def test_debug_lines_are_shown_if_they_are_asked_for(gsbench: Run, tmp_path: Path) -> None:
+    (tmp_path / "own.py").write_text(
+        "import logging\nfrom gsbench.densify import NoDensifier\n"
+        "class Own(NoDensifier):\n"
+        "    def observe(self, *rest, **named):\n"
+        "        logging.getLogger('gsbench.own').debug('a detail')\n"
+        "        logging.getLogger('other.own').debug('another detail')\n"
+    )
+    words = [*TINY, "densify._target_=own.Own", "allow_targets=[own]"]
+    for name, word, shown in (
+        ("quiet", "hydra.verbose=false", (False, False)),
+        ("all", "hydra.verbose=true", (True, False)),
+        ("one", "hydra.verbose=[other]", (False, True)),
+    ):
+        done = gsbench(*words, f"name={name}", word, "train.iterations=2", GSBENCH_RUNS=f"runs-{name}", timeout=SECONDS)
+        assert done.returncode == 0, done.stderr
+        assert ("a detail" in done.stderr, "another detail" in done.stderr) == shown, name
