@@ -92,7 +92,7 @@ def _section(experiment: Experiment, key: str) -> dict[str, Any]:
 
 def _claims(experiment: Experiment) -> list[Verdict]:
     """The verdicts on declared claims, as `gsbench check --from` gives them, without those of gates."""
-    declared = [one for one in read_declarations(experiment.folder) if one.of_claims]
+    declared = [one for one in read_declarations(experiment.folder) if one.kind == "claims"]
     if not declared:
         return []
     judged = judge(experiment.trials, latest_declaration(declared))

@@ -1,0 +1,372 @@
+"""People's votes on which of two renders is nearer to the photograph, and what a round of them shows.
+
+`gsbench.claims.vote_page` makes a round: pairs of renders (each with the photograph), some of them a second time with
+the sides swapped, and traps, which show the photograph beside a blurred one. Everybody sees the same showings.
+
+A vote is independent neither of the other votes of its person nor of those of its scene. So a person's mean preference
+is one unit, and so is a scene's. `gsbench.analysis.statistics.judge_like_these`, an exact sign test, judges both:
+people like these on the shown views, and scenes like these for the people who voted. Each needs six units.
+"""
+
+import hashlib
+import hmac
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from annotated_types import MinLen
+from numpy.typing import NDArray
+from pydantic import Field
+
+from gsbench.analysis.results import TrialResult, read_views
+from gsbench.analysis.statistics import ALPHA, Interval, LikeThese, judge_like_these
+from gsbench.errors import InputError
+from gsbench.parsing import Amount, Count, Record, Text, read_typed
+from gsbench.runs.experiments import Arm, unix_time
+from gsbench.runs.layout import VOTE_KEY, VOTES
+
+METRIC = "votes"  # of the declared question
+# Preferences from -1 to 1 within ± this are too small to matter: between 45 and 55 % of the votes.
+LEAST_PREFERENCE = 0.1
+PHOTOGRAPH, BLURRED = "photograph", "blurred"  # the sides of a trap
+SAME = "same"
+DRAWS = 2000  # of people and scenes, for the intervals of a ranking
+STEPS = 200  # of the iteration that ranks arms; it converges in some dozens
+
+Side = Literal["left", "right"]
+Kind = Literal["pair", "again", "trap"]
+Chosen = Literal["most different", "random", ""]
+RoundId = Annotated[str, Field(pattern=r"^[0-9a-f]{12}$")]
+PersonId = Annotated[str, Field(pattern=r"^[0-9a-f]{16}$")]
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Showing(Record):
+    """One decision of a round: ``left`` and ``right`` name arms, or the sides of a trap.
+
+    ``chosen`` says how the view was chosen. ``of`` is the first showing of one that is shown again.
+    """
+
+    id: Text
+    kind: Kind
+    scene: str
+    view: str
+    seed: Count
+    left: Text
+    right: Text
+    chosen: Chosen = ""
+    of: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RoundKey(Record):
+    """The key of a round, which stays in the runs folder until the votes are there.
+
+    ``arms`` begin with the baseline. ``people`` is the number of people at which the round is judged. A person with
+    more than ``traps_allowed`` wrong traps is left out.
+    """
+
+    salt: Text
+    time: Text
+    arms: tuple[Arm, ...]
+    people: Count
+    traps_allowed: Count
+    showings: Annotated[tuple[Showing, ...], MinLen(1)]
+
+    def commitment(self, showing: Showing) -> str:
+        """The salted hash of a showing's sides, which the page has: without the salt it tells nothing."""
+        sides = f"{showing.id} {showing.left} {showing.right}"
+        return hmac.new(self.salt.encode(), sides.encode(), hashlib.sha256).hexdigest()
+
+    @cached_property
+    def round(self) -> str:
+        """The name of the round: a hash of all commitments, so a key that was changed later has another name."""
+        return hashlib.sha256("".join(map(self.commitment, self.showings)).encode()).hexdigest()[:12]
+
+    @property
+    def pairs(self) -> list[Showing]:
+        """The showings that count: pairs of arms, seen for the first time."""
+        return [one for one in self.showings if one.kind == "pair"]
+
+    @property
+    def votes(self) -> int:
+        """The number of votes at which the round is judged."""
+        return self.people * len(self.pairs)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Vote(Record):
+    """The answer to a showing, and the seconds that it took."""
+
+    showing: Text
+    answer: Literal["left", "right", "same"]
+    seconds: Amount
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ballot(Record):
+    """The file that a person saves at the end of a round; ``finished`` is the time of the last answer."""
+
+    round: RoundId
+    person: PersonId
+    name: Annotated[str, Field(max_length=60)] = ""
+    finished: Text
+    votes: tuple[Vote, ...]
+
+    def __post_init__(self) -> None:
+        if unix_time(self.finished) is None:
+            raise ValueError("finished is not a time")
+
+    @property
+    def label(self) -> str:
+        return f"{self.name} ({self.person[:6]})" if self.name else self.person[:6]
+
+    @cached_property
+    def answers(self) -> dict[str, str]:
+        return {vote.showing: vote.answer for vote in self.votes}
+
+
+def round_folder(home: Path, name: str) -> Path:
+    """The folder of a round in an experiment's folder: its key, and the ballots that were handed in."""
+    return home / VOTES / name
+
+
+def read_key(folder: Path) -> RoundKey:
+    """The key of the round in ``folder``; raises InputError if it is missing, damaged or was changed."""
+    try:
+        key = read_typed(folder / VOTE_KEY, RoundKey)
+    except FileNotFoundError:
+        raise InputError(
+            f"no round {folder.name} of this experiment: `gsbench vote make` made the page of it"
+        ) from None
+    if key.round != folder.name:
+        raise InputError(f"{folder / VOTE_KEY} was changed after the page was made: nothing can be judged by it")
+    return key
+
+
+def read_ballot(path: Path) -> Ballot:
+    """A person's file of votes; raises InputError if it is missing or damaged."""
+    try:
+        return read_typed(path, Ballot)
+    except FileNotFoundError:
+        raise InputError(f"{path} is not there: give the files of votes that people saved") from None
+
+
+def check_ballot(ballot: Ballot, key: RoundKey, path: Path) -> None:
+    """Raise InputError unless the ballot answers every showing of the round once."""
+    showings = {one.id for one in key.showings}
+    if ballot.answers.keys() != showings or len(ballot.votes) != len(showings):
+        known = len(ballot.answers.keys() & showings)
+        raise InputError(f"{path} answers {known} of the {len(showings)} showings of its round: only whole files count")
+
+
+# ---- the verdict
+
+
+@dataclass(frozen=True)
+class ViewVotes:
+    """The votes on one pair of renders: from -1 (all for the baseline) to 1 (all for the arm)."""
+
+    showing: Showing
+    preference: float
+
+
+@dataclass(frozen=True)
+class PairVotes:
+    """The votes on ``arm`` against ``baseline``, with the two statements; each is None below six units."""
+
+    baseline: Arm
+    arm: Arm
+    wins: int
+    losses: int
+    ties: int
+    people: LikeThese | None
+    scenes: LikeThese | None
+    views: tuple[ViewVotes, ...]
+
+    @property
+    def share(self) -> float:
+        """The share of votes for the arm; "no difference" counts half for each."""
+        return (self.wins + self.ties / 2) / (self.wins + self.losses + self.ties)
+
+    def share_of(self, chosen: Chosen) -> float | None:
+        """The share among the views chosen in this way; None without such views."""
+        own = [view.preference for view in self.views if view.showing.chosen == chosen]
+        return (1 + float(np.mean(own))) / 2 if own else None
+
+
+@dataclass(frozen=True)
+class RankedArm:
+    """An arm with its chance to win against the average arm (Bradley and Terry 1952), and the chance's interval."""
+
+    arm: Arm
+    chance: float
+    interval: Interval
+
+
+@dataclass(frozen=True)
+class RoundVerdict:
+    """What a round shows. ``left_out`` says by person why the votes do not count.
+
+    ``final`` is False below the declared number of votes: then nothing is decided yet. ``consistent`` is the share of
+    the pairs shown again that had the same answer, ``left`` the share of votes for the left side; None without any.
+    """
+
+    key: RoundKey
+    counted: tuple[Ballot, ...]
+    left_out: Mapping[str, str]
+    pairs: tuple[PairVotes, ...]
+    ranking: tuple[RankedArm, ...]
+    consistent: float | None
+    left: float | None
+
+    @property
+    def votes(self) -> int:
+        return len(self.counted) * len(self.key.pairs)
+
+    @property
+    def final(self) -> bool:
+        return self.votes >= self.key.votes
+
+
+def judge_round(key: RoundKey, ballots: Sequence[Ballot]) -> RoundVerdict:
+    """The verdict of a round: first traps, then at most the declared number of people in the order of finishing."""
+    left_out: dict[str, str] = {}
+    counted = list[Ballot]()
+    traps = [one for one in key.showings if one.kind == "trap"]
+    for ballot in sorted(ballots, key=lambda one: (unix_time(one.finished) or 0, one.person)):
+        wrong = sum(_preference(trap, ballot, PHOTOGRAPH) != 1 for trap in traps)
+        if wrong > key.traps_allowed:
+            left_out[ballot.label] = f"failed {wrong} of {len(traps)} traps, and {key.traps_allowed} may fail"
+        elif len(counted) == key.people:
+            # Adding people until the result pleases would find effects that do not exist.
+            left_out[ballot.label] = f"came after the {key.people} people whose votes were declared to count"
+        else:
+            counted.append(ballot)
+    level = ALPHA / (len(key.arms) - 1)
+    pairs = [_judge_pair(key, counted, arm, level) for arm in key.arms[1:]] if counted else []
+    first = {one.id: one for one in key.showings}
+    again = [
+        _preference(one, ballot, one.left) == _preference(first[one.of], ballot, one.left)
+        for one in key.showings
+        for ballot in counted
+        if one.kind == "again"
+    ]
+    sides = [ballot.answers[one.id] for one in key.showings if one.kind != "trap" for ballot in counted]
+    decided = [side == "left" for side in sides if side != SAME]
+    return RoundVerdict(
+        key,
+        tuple(counted),
+        left_out,
+        tuple(one for one in pairs if one is not None),
+        rank_arms(key, counted) if counted and len(key.arms) > 2 else (),
+        float(np.mean(again)) if again else None,
+        float(np.mean(decided)) if decided else None,
+    )
+
+
+def _preference(showing: Showing, ballot: Ballot, side: str) -> int:
+    """1 if the ballot prefers ``side`` (an arm, or of a trap the photograph), -1 the other, 0 for no difference."""
+    answer = ballot.answers[showing.id]
+    if answer == SAME:
+        return 0
+    return 1 if getattr(showing, answer) == side else -1
+
+
+def _judge_pair(key: RoundKey, counted: Sequence[Ballot], arm: Arm, level: float) -> PairVotes | None:
+    """The verdict on ``arm`` against the baseline; None if the round shows no view of the two."""
+    sides = {str(arm), str(key.arms[0])}
+    showings = [one for one in key.pairs if {one.left, one.right} == sides]
+    if not showings:
+        return None
+    votes = np.array([[_preference(one, ballot, str(arm)) for one in showings] for ballot in counted])  # [K, V]
+    scenes = list(dict.fromkeys(one.scene for one in showings))
+    of_scene = [[place for place, one in enumerate(showings) if one.scene == scene] for scene in scenes]
+    cells = np.stack([votes[:, places].mean(axis=1) for places in of_scene])  # [S, K]: each scene has the same weight
+    return PairVotes(
+        key.arms[0],
+        arm,
+        int((votes > 0).sum()),
+        int((votes < 0).sum()),
+        int((votes == 0).sum()),
+        judge_like_these(cells.mean(axis=0), 1, LEAST_PREFERENCE, level),
+        judge_like_these(cells.mean(axis=1), 1, LEAST_PREFERENCE, level),
+        tuple(ViewVotes(one, float(own.mean())) for one, own in zip(showings, votes.T, strict=True)),
+    )
+
+
+def rank_arms(key: RoundKey, counted: Sequence[Ballot]) -> tuple[RankedArm, ...]:
+    """The arms by `bradley_terry`, the best first, with intervals of 95 %.
+
+    The intervals come from drawing people and scenes anew, both with replacement (Owen 2007, Ann. Appl. Stat. 1, 386).
+    """
+    names = [str(arm) for arm in key.arms]
+    scenes = list(dict.fromkeys(one.scene for one in key.pairs))
+    wins = np.zeros((len(counted), len(scenes), len(names), len(names)))  # [K, S, A, A], of row against column
+    for person, ballot in enumerate(counted):
+        for one in key.pairs:
+            left, right = names.index(one.left), names.index(one.right)
+            for_left = (1 + _preference(one, ballot, one.left)) / 2
+            wins[person, scenes.index(one.scene), left, right] += for_left
+            wins[person, scenes.index(one.scene), right, left] += 1 - for_left
+    rng = np.random.default_rng(0)
+    people_drawn, scenes_drawn = (
+        rng.multinomial(count, np.full(count, 1 / count), DRAWS).astype(float) for count in wins.shape[:2]
+    )
+    drawn = np.einsum("dk,ds,ksij->dij", people_drawn, scenes_drawn, wins)
+    chances = bradley_terry(wins.sum(axis=(0, 1))[None])[0]
+    low, high = np.quantile(bradley_terry(drawn), [ALPHA / 2, 1 - ALPHA / 2], axis=0)
+    ranked = [
+        RankedArm(arm, float(chances[k]), Interval(float(low[k]), float(high[k]))) for k, arm in enumerate(key.arms)
+    ]
+    return tuple(sorted(ranked, key=lambda one: -one.chance))
+
+
+def bradley_terry(wins: Array) -> Array:
+    """The chance [D, A] of each arm to win against the average arm, from the ``wins`` [D, A, A] of row against column.
+
+    The model is that of Bradley and Terry (1952), fitted by the iteration of Hunter (2004, Ann. Stat. 32, 384). Half a
+    vote more for each arm against each other keeps an arm that never lost at a finite strength.
+    """
+    arms = wins.shape[-1]
+    wins = wins + 0.5 * (1 - np.eye(arms))
+    games = wins + wins.swapaxes(1, 2)
+    strengths = np.ones(wins.shape[:2])
+    for _ in range(STEPS):
+        sums = strengths[:, :, None] + strengths[:, None, :]  # [D, A, A]
+        strengths = wins.sum(axis=2) / (games / sums).sum(axis=2)
+        strengths /= np.exp(np.log(strengths).mean(axis=1, keepdims=True))
+    return np.asarray(strengths / (1 + strengths))
+
+
+# ---- beside the metrics
+
+
+def view_gains(trials: Sequence[TrialResult], pair: PairVotes) -> list[dict[str, float]]:
+    """For each view of ``pair.views``, the difference of every metric that both trials have, arm minus baseline.
+
+    It is empty if a trial or its file of views is gone or damaged.
+    """
+    files: dict[tuple[Arm, str, int], dict[str, dict[str, float]]] = {}
+    for trial in trials:
+        if trial.arm in (pair.arm, pair.baseline):
+            with suppress(InputError):
+                files[trial.arm, trial.scene, trial.seed] = read_views(trial)
+    gains = []
+    for one in (view.showing for view in pair.views):
+        arm, baseline = (
+            files.get((side, one.scene, one.seed), {}).get(one.view, {}) for side in (pair.arm, pair.baseline)
+        )
+        gains.append({key: arm[key] - baseline[key] for key in arm.keys() & baseline.keys()})
+    return gains
+
+
+def agreement(preferences: Sequence[float], gains: Sequence[float]) -> tuple[int, int]:
+    """In how many views people and a metric prefer the same arm, of how many in which both prefer one."""
+    products = [preference * gain for preference, gain in zip(preferences, gains, strict=True)]
+    return sum(one > 0 for one in products), sum(one != 0 for one in products)
