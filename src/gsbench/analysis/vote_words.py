@@ -9,7 +9,8 @@ from gsbench.analysis.images import ViewComparison, compare_view
 from gsbench.analysis.quantities import Quantity, choose_quantities
 from gsbench.analysis.results import TrialResult
 from gsbench.analysis.statistics import UNDECIDED, LikeThese
-from gsbench.analysis.verdicts import p_text
+from gsbench.analysis.table_formats import Column, Row, Table, TableEntry
+from gsbench.analysis.verdicts import WORDS, PairVerdicts, p_text
 from gsbench.analysis.votes import (
     PairVotes,
     RoundVerdict,
@@ -37,6 +38,8 @@ class Disagreement:
     """A view where people and LPIPS prefer different arms: the sentence about it, and pictures of the first few."""
 
     words: str
+    first: str  # the arms of the pictures
+    second: str
     pictures: ViewComparison | None
 
 
@@ -112,18 +115,51 @@ def _statement(like: LikeThese | None, units: str, final: bool) -> str:
     return f"{word}; {like.helped} of {like.scenes} {units} {prefer} (sign test p {p_text(like.p)}{median})"
 
 
-def agreement_words(pair: PairVotes, trials: Sequence[TrialResult]) -> str:
-    """In how many views each metric prefers the arm that people prefer."""
-    gains, parts = view_gains(trials, pair), list[str]()
+def agreements(pair: PairVotes, trials: Sequence[TrialResult]) -> list[tuple[Quantity, int, int]]:
+    """Each metric with the views in which it prefers the arm that people prefer, of those in which both prefer one."""
+    gains = view_gains(trials, pair)
+    found = []
     for metric in _metrics(pair, trials):
         both = [
-            (view.preference, own[metric.key]) for view, own in zip(pair.views, gains, strict=True) if metric.key in own
+            (one.preference, own[metric.key]) for one, own in zip(pair.views, gains, strict=True) if metric.key in own
         ]
         same, views = agreement([one for one, _ in both], [metric.direction * gain for _, gain in both])
-        parts += [f"{metric.name} in {same} of {views}"] if views else []
+        found += [(metric, same, views)] if views else []
+    return found
+
+
+def agreement_words(pair: PairVotes, trials: Sequence[TrialResult]) -> str:
+    """In how many views each metric prefers the arm that people prefer."""
+    parts = [f"{metric.name} in {same} of {views}" for metric, same, views in agreements(pair, trials)]
     if not parts:
         return "No metric prefers an arm on these views."
     return f"Views in which a metric prefers the arm that people prefer: {', '.join(parts)}."
+
+
+def vote_table(pair: PairVotes, final: bool, trials: Sequence[TrialResult], judged: Sequence[PairVerdicts]) -> Table:
+    """People's verdict beside that of each metric on the same arms; LPIPS comes first."""
+    rows = [
+        Row((f"{units} like these",), (TableEntry(_word(like, final)), TableEntry(_share(pair)), TableEntry("")))
+        for units, like in (("people", pair.people), ("scenes", pair.scenes))
+    ]
+    arms = (pair.baseline, pair.arm)
+    verdicts = {one.question.metric: one for own in judged if (own.first, own.second) == arms for one in own.verdicts}
+    by_metric = agreements(pair, trials)
+    for metric, same, views in sorted(by_metric, key=lambda one: not one[0].key.startswith(LPIPS)):
+        one = verdicts.get(metric.key)
+        word, difference = ("not compared", "") if one is None else (WORDS[one.outcome], one.shown(one.mean or 0.0))
+        rows.append(Row((metric.heading,), tuple(map(TableEntry, (word, difference, f"{same} of {views} views")))))
+    heads = ("verdict", "share of votes, or difference", "prefers what people prefer")
+    title = f"People and metrics: {pair.arm} against {pair.baseline}"
+    return Table(title, ("judged by",), tuple(Column("", head, ("votes", head)) for head in heads), tuple(rows))
+
+
+def _word(like: LikeThese | None, final: bool) -> str:
+    return WORDS["undecided" if like is None or not final else like.outcome]
+
+
+def _share(pair: PairVotes) -> str:
+    return f"{100 * pair.share:.0f} % of {pair.wins + pair.losses + pair.ties} votes"
 
 
 def disagreements(pair: PairVotes, trials: Sequence[TrialResult]) -> list[Disagreement]:
@@ -143,6 +179,8 @@ def disagreements(pair: PairVotes, trials: Sequence[TrialResult]) -> list[Disagr
             f"{view.showing.scene}, view {view.showing.view}, seed {view.showing.seed} ({view.showing.chosen}): people "
             f"prefer {_preferred(pair, view.preference)} (mean vote {signed(view.preference, '.2f')}), {lpips[0].name} "
             f"prefers {_preferred(pair, gain)} (by {abs(gain):.4f})",
+            str(pair.baseline),
+            str(pair.arm),
             pictures_of(pair, view, trials) if place < MAX_SHOWN else None,
         )
         for place, (view, gain) in enumerate(found)

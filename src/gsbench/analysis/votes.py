@@ -28,6 +28,7 @@ from gsbench.errors import InputError
 from gsbench.parsing import Amount, Count, Record, Text, read_typed
 from gsbench.runs.experiments import Arm, unix_time
 from gsbench.runs.layout import VOTE_KEY, VOTES
+from gsbench.scene.images import png_name
 
 METRIC = "votes"  # of the declared question
 # Preferences from -1 to 1 within ± this are too small to matter: between 45 and 55 % of the votes.
@@ -356,11 +357,12 @@ def view_gains(trials: Sequence[TrialResult], pair: PairVotes) -> list[dict[str,
     for trial in trials:
         if trial.arm in (pair.arm, pair.baseline):
             with suppress(InputError):
-                files[trial.arm, trial.scene, trial.seed] = read_views(trial)
+                views = {png_name(name): values for name, values in read_views(trial).items()}
+                files[trial.arm, trial.scene, trial.seed] = views
     gains = []
     for one in (view.showing for view in pair.views):
         arm, baseline = (
-            files.get((side, one.scene, one.seed), {}).get(one.view, {}) for side in (pair.arm, pair.baseline)
+            files.get((side, one.scene, one.seed), {}).get(f"{one.view}.png", {}) for side in (pair.arm, pair.baseline)
         )
         gains.append({key: arm[key] - baseline[key] for key in arm.keys() & baseline.keys()})
     return gains

@@ -26,6 +26,8 @@ from gsbench.analysis.results import Arm, Experiment, TrialResult, group_by
 from gsbench.analysis.table_formats import Column, Row, Table, TableEntry, fill
 from gsbench.analysis.tables import build_table, compared_pairs
 from gsbench.analysis.verdicts import PairVerdicts
+from gsbench.analysis.vote_words import describe_round, disagreements, load_rounds, vote_table
+from gsbench.analysis.votes import RoundVerdict
 from gsbench.errors import InputError
 from gsbench.eval.facts import find_metric
 from gsbench.events import RefineEvent
@@ -68,6 +70,7 @@ def build_report(experiment: Experiment, baseline: str = BASELINE) -> str:
         seeds=experiment.seeds,
         trials=trials,
         versus=[compare_arms(trials, own) for own in judged],
+        votes=[show_votes(one, trials, judged) for one in load_rounds(experiment.folder)],
         declared=declared.sentences(quantity.name) if declared and quantity else [],
         families=verdicts.families(judged),
         # The top of the page has the notes on verdicts.
@@ -118,6 +121,15 @@ def compare_arms(trials: Sequence[TrialResult], judged: PairVerdicts) -> dict[st
         "forests": [_forest(verdict) for verdict in judged.verdicts],
         "views": views,
         "notes": dict.fromkeys([*judged.notes, *faults]),
+    }
+
+
+def show_votes(verdict: RoundVerdict, trials: Sequence[TrialResult], judged: Sequence[PairVerdicts]) -> dict[str, Any]:
+    """Everything that the page shows of a round of people's votes."""
+    return {
+        "lines": describe_round(verdict, trials),
+        "tables": [vote_table(pair, verdict.final, trials, judged) for pair in verdict.pairs],
+        "disagreements": [one for pair in verdict.pairs for one in disagreements(pair, trials)],
     }
 
 
