@@ -35,6 +35,7 @@ from gsbench.errors import InputError
 from gsbench.runs.experiments import Arm, read_declarations
 from gsbench.verbs.vote import choose_arms
 from tests.analysis.synthetic import Plan, write_runs
+from tests.conftest import script
 from tests.view.browser import Browser
 
 ADC, VOLUMETRIC = "sfm-adc", "sfm-volumetric"
@@ -360,6 +361,20 @@ def test_the_ranking_is_the_maximum_of_its_likelihood() -> None:
 def test_agreement_counts_views_with_two_preferences() -> None:
     assert agreement([1, -0.5, 0, 0.2], [0.1, 0.1, 0.1, 0]) == (1, 2)
     assert agreement([], []) == (0, 0)
+
+
+@pytest.mark.parametrize("name", ["everybody guesses", "people differ", "scenes differ", "people and scenes differ"])
+def test_without_an_effect_few_rounds_state_one(name: str) -> None:
+    untruths = script("vote_untruths")
+    people, scenes, both, votes = untruths.rates(untruths.KINDS[name], 0.0, 300)[1::2]
+    # The error rate is 5 %; of 300 rounds, 8.8 % lie three standard errors above it.
+    assert max(people, scenes, both) < 0.088
+    if name != "everybody guesses":
+        assert votes > 0.3  # of a test that takes all votes as independent
+
+
+def test_intervals_of_a_ranking_hold_the_truth() -> None:
+    assert script("vote_untruths").ranking_misses(9, 9, 30) < 0.1
 
 
 # ---- in a browser

@@ -13,6 +13,7 @@ from gsbench.analysis.table_formats import Column, Row, Table, TableEntry
 from gsbench.analysis.verdicts import WORDS, PairVerdicts, p_text
 from gsbench.analysis.votes import (
     PairVotes,
+    RoundKey,
     RoundVerdict,
     ViewVotes,
     agreement,
@@ -85,6 +86,19 @@ def describe_round(verdict: RoundVerdict, trials: Sequence[TrialResult]) -> list
     return lines + [f"Left out: {person} {reason}." for person, reason in verdict.left_out.items()]
 
 
+def _when(key: RoundKey) -> str:
+    return f"{key.time[:16].replace('T', ' ')} UTC"
+
+
+def summary(verdict: RoundVerdict) -> list[str]:
+    """A sentence on each arm, for the top of the report."""
+    return [
+        f"{pair.arm} against {pair.baseline}: {_share(pair)} of {people_words(len(verdict.counted))} are for it; "
+        f"people like these {_word(pair.people, verdict.final)}, scenes like these {_word(pair.scenes, verdict.final)}"
+        for pair in verdict.pairs
+    ]
+
+
 def people_words(count: int) -> str:
     """``1 person``, ``9 people``"""
     return f"{count} {'person' if count == 1 else 'people'}"
@@ -129,7 +143,7 @@ def agreements(pair: PairVotes, trials: Sequence[TrialResult]) -> list[tuple[Qua
 
 
 def agreement_words(pair: PairVotes, trials: Sequence[TrialResult]) -> str:
-    """In how many views each metric prefers the arm that people prefer."""
+    """The number of views in which each metric prefers the arm that people prefer, as a sentence."""
     parts = [f"{metric.name} in {same} of {views}" for metric, same, views in agreements(pair, trials)]
     if not parts:
         return "No metric prefers an arm on these views."

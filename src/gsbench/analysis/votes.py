@@ -21,6 +21,7 @@ import numpy as np
 from annotated_types import MinLen
 from numpy.typing import NDArray
 from pydantic import Field
+from scipy import special
 
 from gsbench.analysis.results import TrialResult, read_views
 from gsbench.analysis.statistics import ALPHA, Interval, LikeThese, judge_like_these
@@ -212,7 +213,7 @@ class RankedArm:
 
 @dataclass(frozen=True)
 class RoundVerdict:
-    """What a round shows. ``left_out`` says by person why the votes do not count.
+    """The result of a round. ``left_out`` says by person why the votes do not count.
 
     ``final`` is False below the declared number of votes: then nothing is decided yet. ``consistent`` is the share of
     the pairs shown again that had the same answer, ``left`` the share of votes for the left side; None without any.
@@ -285,27 +286,35 @@ def _judge_pair(key: RoundKey, counted: Sequence[Ballot], arm: Arm, level: float
     showings = [one for one in key.pairs if {one.left, one.right} == sides]
     if not showings:
         return None
-    votes = np.array([[_preference(one, ballot, str(arm)) for one in showings] for ballot in counted])  # [K, V]
-    scenes = list(dict.fromkeys(one.scene for one in showings))
-    of_scene = [[place for place, one in enumerate(showings) if one.scene == scene] for scene in scenes]
-    cells = np.stack([votes[:, places].mean(axis=1) for places in of_scene])  # [S, K]: each scene has the same weight
+    votes = np.array([[_preference(one, ballot, str(arm)) for one in showings] for ballot in counted])
+    people, scenes = judge_votes(votes, [one.scene for one in showings], level)
     return PairVotes(
         key.arms[0],
         arm,
         int((votes > 0).sum()),
         int((votes < 0).sum()),
         int((votes == 0).sum()),
-        judge_like_these(cells.mean(axis=0), 1, LEAST_PREFERENCE, level),
-        judge_like_these(cells.mean(axis=1), 1, LEAST_PREFERENCE, level),
+        people,
+        scenes,
         tuple(ViewVotes(one, float(own.mean())) for one, own in zip(showings, votes.T, strict=True)),
     )
 
 
-def rank_arms(key: RoundKey, counted: Sequence[Ballot]) -> tuple[RankedArm, ...]:
-    """The arms by `bradley_terry`, the best first, with intervals of 95 %.
+def judge_votes(
+    votes: NDArray[np.int_], scenes: Sequence[str], level: float
+) -> tuple[LikeThese | None, LikeThese | None]:
+    """The statements about people like these and scenes like these, each None below six units.
 
-    The intervals come from drawing people and scenes anew, both with replacement (Owen 2007, Ann. Appl. Stat. 1, 386).
+    ``votes`` [K, V] of K people on V views are 1, 0 or -1; ``scenes`` has the scene of each view.
     """
+    of_scene = [[place for place, one in enumerate(scenes) if one == scene] for scene in dict.fromkeys(scenes)]
+    cells = np.stack([votes[:, places].mean(axis=1) for places in of_scene])  # [S, K]: scenes have the same weight
+    people, views = cells.mean(axis=0), cells.mean(axis=1)
+    return judge_like_these(people, 1, LEAST_PREFERENCE, level), judge_like_these(views, 1, LEAST_PREFERENCE, level)
+
+
+def rank_arms(key: RoundKey, counted: Sequence[Ballot]) -> tuple[RankedArm, ...]:
+    """The arms by their chance to win against the average arm, the best first."""
     names = [str(arm) for arm in key.arms]
     scenes = list(dict.fromkeys(one.scene for one in key.pairs))
     wins = np.zeros((len(counted), len(scenes), len(names), len(names)))  # [K, S, A, A], of row against column
@@ -315,17 +324,31 @@ def rank_arms(key: RoundKey, counted: Sequence[Ballot]) -> tuple[RankedArm, ...]
             for_left = (1 + _preference(one, ballot, one.left)) / 2
             wins[person, scenes.index(one.scene), left, right] += for_left
             wins[person, scenes.index(one.scene), right, left] += 1 - for_left
-    rng = np.random.default_rng(0)
-    people_drawn, scenes_drawn = (
-        rng.multinomial(count, np.full(count, 1 / count), DRAWS).astype(float) for count in wins.shape[:2]
-    )
-    drawn = np.einsum("dk,ds,ksij->dij", people_drawn, scenes_drawn, wins)
-    chances = bradley_terry(wins.sum(axis=(0, 1))[None])[0]
-    low, high = np.quantile(bradley_terry(drawn), [ALPHA / 2, 1 - ALPHA / 2], axis=0)
+    chances, low, high = rank_wins(wins)
     ranked = [
         RankedArm(arm, float(chances[k]), Interval(float(low[k]), float(high[k]))) for k, arm in enumerate(key.arms)
     ]
     return tuple(sorted(ranked, key=lambda one: -one.chance))
+
+
+def rank_wins(wins: Array) -> tuple[Array, Array, Array]:
+    """The `bradley_terry` chances [A] and both ends [A] of their intervals of 95 %, from ``wins`` [K, S, A, A].
+
+    The standard errors of the log-odds come from drawing people and scenes anew, both with replacement (Owen 2007, Ann.
+    Appl. Stat. 1, 386). Percentiles of so few units would be too narrow, so Student's t widens them, with one degree
+    of freedom less than there are people or scenes, whichever are fewer. One person and one scene have no interval.
+    """
+    rng = np.random.default_rng(0)
+    units = [count for count in wins.shape[:2] if count > 1]
+    people, scenes = (
+        rng.multinomial(count, np.full(count, 1 / count), DRAWS).astype(float) for count in wins.shape[:2]
+    )
+    drawn = bradley_terry(np.einsum("dk,ds,ksij->dij", people, scenes, wins, optimize=True))
+    error = special.logit(drawn).std(axis=0, ddof=1)
+    half = special.stdtrit(min(units) - 1, 1 - ALPHA / 2) * error if units else np.full(wins.shape[-1], np.inf)
+    chances = bradley_terry(wins.sum(axis=(0, 1))[None])[0]
+    middle = special.logit(chances)
+    return chances, special.expit(middle - half), special.expit(middle + half)
 
 
 def bradley_terry(wins: Array) -> Array:
@@ -349,9 +372,9 @@ def bradley_terry(wins: Array) -> Array:
 
 
 def view_gains(trials: Sequence[TrialResult], pair: PairVotes) -> list[dict[str, float]]:
-    """For each view of ``pair.views``, the difference of every metric that both trials have, arm minus baseline.
+    """The difference of every metric, arm minus baseline, for each view of ``pair.views``.
 
-    It is empty if a trial or its file of views is gone or damaged.
+    A view has none if a trial or its file of views is gone or damaged.
     """
     files: dict[tuple[Arm, str, int], dict[str, dict[str, float]]] = {}
     for trial in trials:
@@ -369,6 +392,6 @@ def view_gains(trials: Sequence[TrialResult], pair: PairVotes) -> list[dict[str,
 
 
 def agreement(preferences: Sequence[float], gains: Sequence[float]) -> tuple[int, int]:
-    """In how many views people and a metric prefer the same arm, of how many in which both prefer one."""
+    """The views in which people and a metric prefer the same arm, and all in which both prefer one."""
     products = [preference * gain for preference, gain in zip(preferences, gains, strict=True)]
     return sum(one > 0 for one in products), sum(one != 0 for one in products)

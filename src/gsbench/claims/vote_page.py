@@ -64,7 +64,7 @@ def find_candidates(trials: Sequence[TrialResult], one: Arm, other: Arm) -> dict
 def choose_views(
     by_scene: Mapping[str, Sequence[Candidate]], count: int, rng: random.Random
 ) -> list[tuple[Candidate, Chosen]]:
-    """At most ``count`` views, spread equally over scenes.
+    """Choose at most ``count`` views, spread equally over scenes.
 
     Half of a scene's views are those with the most different renders, the others are chosen at random.
     """

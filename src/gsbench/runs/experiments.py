@@ -217,7 +217,7 @@ class Declaration(Record):
 
     @property
     def kind(self) -> Literal["sweep", "claims", "votes"]:
-        """What it is about: a sweep's metric, a file of claims (or a gate), whose questions have names, or votes."""
+        """The subject: a sweep's metric; a file of claims (or a gate), whose questions have names; or people's votes."""
         if self.vote_round:
             return "votes"
         return "claims" if any(question.name for question in self.questions) else "sweep"
