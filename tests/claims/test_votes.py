@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import random
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -23,11 +24,9 @@ from gsbench.analysis.votes import (
     RoundKey,
     Showing,
     Vote,
-    agreement,
     bradley_terry,
     judge_round,
     read_key,
-    round_folder,
 )
 from gsbench.claims.vote_page import make_round
 from gsbench.cli import run
@@ -256,7 +255,7 @@ def test_files_that_do_not_fit_are_refused(runs: Path, tmp_path: Path, capsys: p
 
 def test_a_changed_key_judges_nothing(runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     key = made(runs, tmp_path / "page", "--pairs", "12")
-    file = round_folder(runs / "exp", key.round) / "key.json"
+    file = runs / "exp" / "votes" / key.round / "key.json"
     text = file.read_text()
     first = key.showings[0]
     swapped = [replace(first, left=first.right, right=first.left), *key.showings[1:]]
@@ -273,6 +272,17 @@ def test_names_of_strangers_stay_words(runs: Path, tmp_path: Path) -> None:
     page = build_report(load_experiment(runs, "exp"))
     assert "&lt;img src=x" in page
     assert "<img src=x" not in page
+
+
+def test_the_report_shows_where_people_and_lpips_disagree(runs: Path, tmp_path: Path) -> None:
+    key = made(runs, tmp_path / "page", "--pairs", "12", "--people", "1")
+    assert run(["vote", "judge", "exp", saved(tmp_path, ballot(key, 1, prefers(VOLUMETRIC)))]) == 0
+    page = build_report(load_experiment(runs, "exp"))
+    part = page.partition(f"Round {key.round}")[2].partition("</section>")[0].partition("Round ")[0]
+    # LPIPS is worse by 0.1 for the arm that this person prefers, on every view.
+    assert re.search(r"LPIPS VGG raw ↓</th><td>undecided</td><td>\+0.1\d+</td><td>0 of 12 views", part)
+    assert part.count("people prefer sfm-volumetric (mean vote +1.00), LPIPS VGG raw prefers sfm-adc") == 3
+    assert part.count("<img") == 12
 
 
 # ---- the verdict
@@ -341,8 +351,8 @@ def test_more_arms_share_the_error_rate() -> None:
     verdict = judge_round(key, [ballot(key, n, choose) for n in range(9)])
     assert [str(pair.arm) for pair in verdict.pairs] == ["sfm-b", "sfm-c"]
     assert all(pair.people is not None and pair.people.level == pytest.approx(0.025) for pair in verdict.pairs)
-    assert [str(one.arm) for one in verdict.ranking] == ["sfm-b", "sfm-c", "sfm-a"]
-    assert all(one.interval.low <= one.chance <= one.interval.high for one in verdict.ranking)
+    assert [str(arm) for arm, _, _ in verdict.ranking] == ["sfm-b", "sfm-c", "sfm-a"]
+    assert all(interval.low <= chance <= interval.high for _, chance, interval in verdict.ranking)
 
 
 def test_the_ranking_is_the_maximum_of_its_likelihood() -> None:
@@ -356,11 +366,6 @@ def test_the_ranking_is_the_maximum_of_its_likelihood() -> None:
 
         theta = minimize(loss, np.zeros(5), tol=1e-12).x
         np.testing.assert_allclose(chances, 1 / (1 + np.exp(theta.mean() - theta)), atol=1e-5)
-
-
-def test_agreement_counts_views_with_two_preferences() -> None:
-    assert agreement([1, -0.5, 0, 0.2], [0.1, 0.1, 0.1, 0]) == (1, 2)
-    assert agreement([], []) == (0, 0)
 
 
 @pytest.mark.parametrize("name", ["everybody guesses", "people differ", "scenes differ", "people and scenes differ"])
@@ -444,7 +449,7 @@ def test_two_people_vote_by_keyboard_and_are_judged(
     assert run(["vote", "judge", "exp", *files]) == 0
     out = capsys.readouterr().out
     assert "24 votes of 2 people; 24 were declared" in out
-    assert "50 % of the votes (12 for it, 12 against it, 0 without a difference" in out
+    assert "50 % of 24 votes (12 for it, 12 against it, 0 without a difference" in out
     assert "100 % of the pairs shown again" in out
     stored = [json.loads(Path(file).read_text()) for file in files]
     assert [one["name"] for one in stored] == ["person 1200", "person 400"]

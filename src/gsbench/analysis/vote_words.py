@@ -2,7 +2,6 @@
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 from gsbench.analysis.images import ViewComparison, compare_view
@@ -11,92 +10,30 @@ from gsbench.analysis.results import TrialResult
 from gsbench.analysis.statistics import UNDECIDED, LikeThese
 from gsbench.analysis.table_formats import Column, Row, Table, TableEntry
 from gsbench.analysis.verdicts import WORDS, PairVerdicts, p_text
-from gsbench.analysis.votes import (
-    PairVotes,
-    RoundKey,
-    RoundVerdict,
-    ViewVotes,
-    agreement,
-    judge_round,
-    read_ballot,
-    read_key,
-    view_gains,
-)
+from gsbench.analysis.votes import Ballot, PairVotes, RoundVerdict, judge_round, read_key, view_gains
 from gsbench.errors import InputError
 from gsbench.eval.facts import LPIPS
 from gsbench.files import require_no_links
-from gsbench.runs.experiments import Arm
+from gsbench.parsing import read_typed
 from gsbench.runs.layout import VOTE_KEY, VOTES
 from gsbench.words import counted, signed
 
-MAX_SHOWN = 3  # views where people and LPIPS disagree that the report shows with pictures
+MAX_SHOWN = 3  # views where people and LPIPS disagree that the report shows
 
 log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class Disagreement:
-    """A view where people and LPIPS prefer different arms: the sentence about it, and pictures of the first few."""
-
-    words: str
-    first: str  # the arms of the pictures
-    second: str
-    pictures: ViewComparison | None
 
 
 def load_rounds(home: Path) -> list[RoundVerdict]:
     """The verdicts of all rounds of the experiment in ``home``, the oldest first; a damaged round gives a warning."""
     verdicts = []
-    for folder in sorted((home / VOTES).glob("*/")):
+    for folder in (home / VOTES).glob("*/"):
         try:
             require_no_links(home.parent, folder, below=True)
-            key = read_key(folder)
-            ballots = [read_ballot(file) for file in sorted(folder.glob("*.json")) if file.name != VOTE_KEY]
-            verdicts.append(judge_round(key, ballots))
+            files = [file for file in sorted(folder.glob("*.json")) if file.name != VOTE_KEY]
+            verdicts.append(judge_round(read_key(folder), [read_typed(file, Ballot) for file in files]))
         except InputError as error:
             log.warning("left out: %s", error)
     return sorted(verdicts, key=lambda one: one.key.time)
-
-
-def describe_round(verdict: RoundVerdict, trials: Sequence[TrialResult]) -> list[str]:
-    """The lines of a round: how many voted, the verdict on each arm, its agreement with metrics, and the ranking."""
-    key = verdict.key
-    people = people_words(len(verdict.counted))
-    lines = [
-        f"Round {key.round}: {counted(verdict.votes, 'vote')} of {people}; {key.votes} were declared ({key.time})."
-    ]
-    if not verdict.final:
-        lines.append(f"This is an early look: nothing is decided before {key.votes} votes.")
-    for pair in verdict.pairs:
-        lines += describe_pair(pair, verdict.final)
-        lines += [agreement_words(pair, trials)]
-    if verdict.ranking:
-        ranks = [
-            f"{one.arm} {100 * one.chance:.0f} % ({100 * one.interval.low:.0f} to {100 * one.interval.high:.0f})"
-            for one in verdict.ranking
-        ]
-        lines.append(
-            f"Chance to win against the average arm (Bradley and Terry), with 95 % intervals: {'; '.join(ranks)}."
-        )
-    if verdict.consistent is not None and verdict.left is not None:
-        lines.append(
-            f"{100 * verdict.consistent:.0f} % of the pairs shown again, swapped, had the same answer; "
-            f"{100 * verdict.left:.0f} % of the votes were for the left side."
-        )
-    return lines + [f"Left out: {person} {reason}." for person, reason in verdict.left_out.items()]
-
-
-def _when(key: RoundKey) -> str:
-    return f"{key.time[:16].replace('T', ' ')} UTC"
-
-
-def summary(verdict: RoundVerdict) -> list[str]:
-    """A sentence on each arm, for the top of the report."""
-    return [
-        f"{pair.arm} against {pair.baseline}: {_share(pair)} of {people_words(len(verdict.counted))} are for it; "
-        f"people like these {_word(pair.people, verdict.final)}, scenes like these {_word(pair.scenes, verdict.final)}"
-        for pair in verdict.pairs
-    ]
 
 
 def people_words(count: int) -> str:
@@ -104,118 +41,107 @@ def people_words(count: int) -> str:
     return f"{count} {'person' if count == 1 else 'people'}"
 
 
-def describe_pair(pair: PairVotes, final: bool) -> list[str]:
+def describe_round(verdict: RoundVerdict) -> list[str]:
+    """The lines of a round: how many voted, the verdict on each arm, the ranking, and who was left out."""
+    key = verdict.key
+    when = f"{key.time[:16].replace('T', ' ')} UTC"
+    voted = f"{counted(verdict.votes, 'vote')} of {people_words(len(verdict.counted))}"
+    lines = [f"Round {key.round}: {voted}; {key.votes} were declared ({when})."]
+    if not verdict.final:
+        lines.append(f"This is an early look: nothing is decided before {key.votes} votes.")
+    for pair in verdict.pairs:
+        lines += _describe_pair(pair, verdict.final)
+    if verdict.ranking:
+        ranks = [
+            f"{arm} {100 * chance:.0f} % ({100 * interval.low:.0f} to {100 * interval.high:.0f})"
+            for arm, chance, interval in verdict.ranking
+        ]
+        lines.append(f"Chance to win against the average arm, with 95 % intervals: {'; '.join(ranks)}.")
+    if verdict.counted:
+        lines.append(
+            f"{100 * verdict.consistent:.0f} % of the pairs shown again, swapped, had the same answer; "
+            f"{100 * verdict.left:.0f} % of the votes were for the left side."
+        )
+    return lines + [f"Left out: {person} {reason}." for person, reason in verdict.left_out.items()]
+
+
+def _describe_pair(pair: PairVotes, final: bool) -> list[str]:
     """The votes on an arm against the baseline, and the statements about people and about scenes."""
-    by_choice = {how: share for how in ("most different", "random") if (share := pair.share_of(how)) is not None}
-    parts = ", ".join(f"{100 * share:.0f} % of the {how} views" for how, share in by_choice.items())
+    parts = ""
+    for how in ("most different", "random"):
+        means = [mean for showing, mean in pair.views if showing.chosen == how]
+        parts += f", {50 + 50 * sum(means) / len(means):.0f} % of the {how} views" if means else ""
     return [
-        f"{pair.arm} against {pair.baseline}: {100 * pair.share:.0f} % of the votes ({pair.wins} for it, {pair.losses} "
-        f"against it, {pair.ties} without a difference; {parts}).",
+        f"{pair.arm} against {pair.baseline}: {_share(pair)} ({pair.wins} for it, {pair.losses} against it, "
+        f"{pair.ties} without a difference{parts}).",
         f"People like these, on these views: {_statement(pair.people, 'people', final)}.",
         f"Scenes like these, for these people: {_statement(pair.scenes, 'scenes', final)}.",
     ]
 
 
 def _statement(like: LikeThese | None, units: str, final: bool) -> str:
-    """``supported; 8 of 9 people prefer it (sign test p 0.039; their median share 55 to 83 %)``"""
+    """``better; for it are 8 of 9 people (sign test p 0.039; their median share 55 to 83 %)``"""
     if like is None:
         return f"{UNDECIDED}, since the sign test needs six {units}"
-    word = like.outcome if final else UNDECIDED
     median = ""
     if like.median is not None:
-        low, high = (50 * (1 + end) for end in (like.median.low, like.median.high))
-        median = f"; their median share {low:.0f} to {high:.0f} %"
-    prefer = "prefer it" if units == "people" else "are better by it"
-    return f"{word}; {like.helped} of {like.scenes} {units} {prefer} (sign test p {p_text(like.p)}{median})"
-
-
-def agreements(pair: PairVotes, trials: Sequence[TrialResult]) -> list[tuple[Quantity, int, int]]:
-    """Each metric with the views in which it prefers the arm that people prefer, of those in which both prefer one."""
-    gains = view_gains(trials, pair)
-    found = []
-    for metric in _metrics(pair, trials):
-        both = [
-            (one.preference, own[metric.key]) for one, own in zip(pair.views, gains, strict=True) if metric.key in own
-        ]
-        same, views = agreement([one for one, _ in both], [metric.direction * gain for _, gain in both])
-        found += [(metric, same, views)] if views else []
-    return found
-
-
-def agreement_words(pair: PairVotes, trials: Sequence[TrialResult]) -> str:
-    """The number of views in which each metric prefers the arm that people prefer, as a sentence."""
-    parts = [f"{metric.name} in {same} of {views}" for metric, same, views in agreements(pair, trials)]
-    if not parts:
-        return "No metric prefers an arm on these views."
-    return f"Views in which a metric prefers the arm that people prefer: {', '.join(parts)}."
-
-
-def vote_table(pair: PairVotes, final: bool, trials: Sequence[TrialResult], judged: Sequence[PairVerdicts]) -> Table:
-    """People's verdict beside that of each metric on the same arms; LPIPS comes first."""
-    rows = [
-        Row((f"{units} like these",), (TableEntry(_word(like, final)), TableEntry(_share(pair)), TableEntry("")))
-        for units, like in (("people", pair.people), ("scenes", pair.scenes))
-    ]
-    arms = (pair.baseline, pair.arm)
-    verdicts = {one.question.metric: one for own in judged if (own.first, own.second) == arms for one in own.verdicts}
-    by_metric = agreements(pair, trials)
-    for metric, same, views in sorted(by_metric, key=lambda one: not one[0].key.startswith(LPIPS)):
-        one = verdicts.get(metric.key)
-        word, difference = ("not compared", "") if one is None else (WORDS[one.outcome], one.shown(one.mean or 0.0))
-        rows.append(Row((metric.heading,), tuple(map(TableEntry, (word, difference, f"{same} of {views} views")))))
-    heads = ("verdict", "share of votes, or difference", "prefers what people prefer")
-    title = f"People and metrics: {pair.arm} against {pair.baseline}"
-    return Table(title, ("judged by",), tuple(Column("", head, ("votes", head)) for head in heads), tuple(rows))
+        median = f"; median share {50 + 50 * like.median.low:.0f} to {50 + 50 * like.median.high:.0f} %"
+    votes = f"for it are {like.helped} of {like.scenes} {units}"
+    return f"{_word(like, final)}; {votes} (sign test p {p_text(like.p)}{median})"
 
 
 def _word(like: LikeThese | None, final: bool) -> str:
-    return WORDS["undecided" if like is None or not final else like.outcome]
+    return UNDECIDED if like is None or not final else WORDS[like.outcome]
 
 
 def _share(pair: PairVotes) -> str:
     return f"{100 * pair.share:.0f} % of {pair.wins + pair.losses + pair.ties} votes"
 
 
-def disagreements(pair: PairVotes, trials: Sequence[TrialResult]) -> list[Disagreement]:
-    """The views where people and LPIPS prefer different arms, those with the clearest votes first."""
+def vote_table(pair: PairVotes, final: bool, trials: Sequence[TrialResult], judged: Sequence[PairVerdicts]) -> Table:
+    """People's verdict beside those of metrics on the same arms, and how often a metric prefers what people prefer."""
+    rows = [
+        Row((f"{units} like these",), (TableEntry(_word(like, final)), TableEntry(_share(pair)), TableEntry("")))
+        for units, like in (("people", pair.people), ("scenes", pair.scenes))
+    ]
+    own = [one for one in judged if (one.first, one.second) == (pair.baseline, pair.arm)]
+    verdicts = {verdict.question.metric: verdict for one in own for verdict in one.verdicts}
     gains = view_gains(trials, pair)
-    lpips = [
-        one for one in _metrics(pair, trials) if one.key.startswith(LPIPS) and any(one.key in own for own in gains)
-    ]
-    found: list[tuple[ViewVotes, float]] = []
-    for view, own in zip(pair.views, gains, strict=True):
-        gain = -own.get(lpips[0].key, 0.0) if lpips else 0.0
-        if view.preference * gain < 0:
-            found.append((view, gain))
-    found.sort(key=lambda both: -abs(both[0].preference))
-    return [
-        Disagreement(
-            f"{view.showing.scene}, view {view.showing.view}, seed {view.showing.seed} ({view.showing.chosen}): people "
-            f"prefer {_preferred(pair, view.preference)} (mean vote {signed(view.preference, '.2f')}), {lpips[0].name} "
-            f"prefers {_preferred(pair, gain)} (by {abs(gain):.4f})",
-            str(pair.baseline),
-            str(pair.arm),
-            pictures_of(pair, view, trials) if place < MAX_SHOWN else None,
-        )
-        for place, (view, gain) in enumerate(found)
-    ]
-
-
-def pictures_of(pair: PairVotes, view: ViewVotes, trials: Sequence[TrialResult]) -> ViewComparison | None:
-    """The pictures of a view; None if they cannot be read any more."""
-    one = view.showing
-    by_arm = {trial.arm: trial for trial in trials if (trial.scene, trial.seed) == (one.scene, one.seed)}
-    try:
-        return compare_view("", (by_arm[pair.baseline], by_arm[pair.arm]), one.view)
-    except (KeyError, InputError):
-        return None
-
-
-def _preferred(pair: PairVotes, gain: float) -> Arm:
-    return pair.arm if gain > 0 else pair.baseline
+    for metric in _metrics(pair, trials):
+        both = zip(pair.views, gains, strict=True)
+        signs = [mean * metric.direction * gain[metric.key] for (_, mean), gain in both if gain.get(metric.key)]
+        one = verdicts.get(metric.key)
+        word, difference = ("not compared", "") if one is None else (WORDS[one.outcome], one.shown(one.mean or 0.0))
+        agreed = f"{sum(sign > 0 for sign in signs)} of {sum(sign != 0 for sign in signs)} views"
+        rows.append(Row((metric.heading,), tuple(map(TableEntry, (word, difference, agreed)))))
+    heads = ("verdict", "share of votes, or difference", "prefers what people prefer")
+    title = f"People and metrics: {pair.arm} against {pair.baseline}"
+    return Table(title, ("judged by",), tuple(Column("", head, ("votes", head)) for head in heads), tuple(rows))
 
 
 def _metrics(pair: PairVotes, trials: Sequence[TrialResult]) -> list[Quantity]:
-    """The metrics with a known direction; the LPIPS of the protocol comes before other variants."""
+    """The metrics of the two arms that have a direction, LPIPS first."""
     own = [trial for trial in trials if trial.arm in (pair.arm, pair.baseline)]
-    return [metric for metric in choose_quantities(own) if metric.direction and not metric.cost]
+    metrics = [one for one in choose_quantities(own) if one.direction and not one.cost]
+    return sorted(metrics, key=lambda one: not one.key.startswith(LPIPS))
+
+
+def disagreements(pair: PairVotes, trials: Sequence[TrialResult]) -> list[ViewComparison]:
+    """Pictures of at most `MAX_SHOWN` views where people and LPIPS prefer different arms, the clearest votes first.
+
+    LPIPS is the first variant that both trials of the view have.
+    """
+    lpips = [metric for metric in _metrics(pair, trials) if metric.key.startswith(LPIPS)]
+    by_trial = {(trial.arm, trial.scene, trial.seed): trial for trial in trials}
+    shown = list[ViewComparison]()
+    for (one, mean), gains in sorted(
+        zip(pair.views, view_gains(trials, pair), strict=True), key=lambda both: -abs(both[0][1])
+    ):
+        metric = next((metric for metric in lpips if metric.key in gains), None)
+        if metric is None or mean * metric.direction * gains[metric.key] >= 0 or len(shown) == MAX_SHOWN:
+            continue
+        people, other = (pair.arm, pair.baseline) if mean > 0 else (pair.baseline, pair.arm)
+        words = f"people prefer {people} (mean vote {signed(mean, '.2f')}), {metric.name} prefers {other}"
+        trials_shown = (by_trial[pair.baseline, one.scene, one.seed], by_trial[pair.arm, one.scene, one.seed])
+        shown.append(compare_view(words, trials_shown, one.view))
+    return shown

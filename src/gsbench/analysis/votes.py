@@ -10,6 +10,7 @@ people like these on the shown views, and scenes like these for the people who v
 
 import hashlib
 import hmac
+import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -28,7 +29,7 @@ from gsbench.analysis.statistics import ALPHA, Interval, LikeThese, judge_like_t
 from gsbench.errors import InputError
 from gsbench.parsing import Amount, Count, Record, Text, read_typed
 from gsbench.runs.experiments import Arm, unix_time
-from gsbench.runs.layout import VOTE_KEY, VOTES
+from gsbench.runs.layout import VOTE_KEY
 from gsbench.scene.images import png_name
 
 METRIC = "votes"  # of the declared question
@@ -133,30 +134,14 @@ class Ballot(Record):
         return {vote.showing: vote.answer for vote in self.votes}
 
 
-def round_folder(home: Path, name: str) -> Path:
-    """The folder of a round in an experiment's folder: its key, and the ballots that were handed in."""
-    return home / VOTES / name
-
-
 def read_key(folder: Path) -> RoundKey:
     """The key of the round in ``folder``; raises InputError if it is missing, damaged or was changed."""
-    try:
-        key = read_typed(folder / VOTE_KEY, RoundKey)
-    except FileNotFoundError:
-        raise InputError(
-            f"no round {folder.name} of this experiment: `gsbench vote make` made the page of it"
-        ) from None
+    if not (folder / VOTE_KEY).is_file():
+        raise InputError(f"this experiment has no round {folder.name}: `gsbench vote make` makes rounds")
+    key = read_typed(folder / VOTE_KEY, RoundKey)
     if key.round != folder.name:
         raise InputError(f"{folder / VOTE_KEY} was changed after the page was made: nothing can be judged by it")
     return key
-
-
-def read_ballot(path: Path) -> Ballot:
-    """A person's file of votes; raises InputError if it is missing or damaged."""
-    try:
-        return read_typed(path, Ballot)
-    except FileNotFoundError:
-        raise InputError(f"{path} is not there: give the files of votes that people saved") from None
 
 
 def check_ballot(ballot: Ballot, key: RoundKey, path: Path) -> None:
@@ -171,16 +156,11 @@ def check_ballot(ballot: Ballot, key: RoundKey, path: Path) -> None:
 
 
 @dataclass(frozen=True)
-class ViewVotes:
-    """The votes on one pair of renders: from -1 (all for the baseline) to 1 (all for the arm)."""
-
-    showing: Showing
-    preference: float
-
-
-@dataclass(frozen=True)
 class PairVotes:
-    """The votes on ``arm`` against ``baseline``, with the two statements; each is None below six units."""
+    """The votes on ``arm`` against ``baseline``, with the two statements; each is None below six units.
+
+    ``views`` have the mean vote on each view, from -1 (all for the baseline) to 1.
+    """
 
     baseline: Arm
     arm: Arm
@@ -189,26 +169,12 @@ class PairVotes:
     ties: int
     people: LikeThese | None
     scenes: LikeThese | None
-    views: tuple[ViewVotes, ...]
+    views: tuple[tuple[Showing, float], ...]
 
     @property
     def share(self) -> float:
         """The share of votes for the arm; "no difference" counts half for each."""
         return (self.wins + self.ties / 2) / (self.wins + self.losses + self.ties)
-
-    def share_of(self, chosen: Chosen) -> float | None:
-        """The share among the views chosen in this way; None without such views."""
-        own = [view.preference for view in self.views if view.showing.chosen == chosen]
-        return (1 + float(np.mean(own))) / 2 if own else None
-
-
-@dataclass(frozen=True)
-class RankedArm:
-    """An arm with its chance to win against the average arm (Bradley and Terry 1952), and the chance's interval."""
-
-    arm: Arm
-    chance: float
-    interval: Interval
 
 
 @dataclass(frozen=True)
@@ -216,16 +182,17 @@ class RoundVerdict:
     """The result of a round. ``left_out`` says by person why the votes do not count.
 
     ``final`` is False below the declared number of votes: then nothing is decided yet. ``consistent`` is the share of
-    the pairs shown again that had the same answer, ``left`` the share of votes for the left side; None without any.
+    the pairs shown again that had the same answer, ``left`` that of votes for the left side; NaN without any.
+    ``ranking`` has the arms of a round of several, with their chance to win against the average arm, the best first.
     """
 
     key: RoundKey
     counted: tuple[Ballot, ...]
     left_out: Mapping[str, str]
     pairs: tuple[PairVotes, ...]
-    ranking: tuple[RankedArm, ...]
-    consistent: float | None
-    left: float | None
+    ranking: tuple[tuple[Arm, float, Interval], ...]
+    consistent: float
+    left: float
 
     @property
     def votes(self) -> int:
@@ -250,25 +217,23 @@ def judge_round(key: RoundKey, ballots: Sequence[Ballot]) -> RoundVerdict:
             left_out[ballot.label] = f"came after the {key.people} people whose votes were declared to count"
         else:
             counted.append(ballot)
-    level = ALPHA / (len(key.arms) - 1)
-    pairs = [_judge_pair(key, counted, arm, level) for arm in key.arms[1:]] if counted else []
+    pairs = [_judge_pair(key, counted, arm) for arm in key.arms[1:] if counted]
     first = {one.id: one for one in key.showings}
+    seen = [(one, ballot) for one in key.showings for ballot in counted if one.kind != "trap"]
     again = [
         _preference(one, ballot, one.left) == _preference(first[one.of], ballot, one.left)
-        for one in key.showings
-        for ballot in counted
+        for one, ballot in seen
         if one.kind == "again"
     ]
-    sides = [ballot.answers[one.id] for one in key.showings if one.kind != "trap" for ballot in counted]
-    decided = [side == "left" for side in sides if side != SAME]
+    sides = [ballot.answers[one.id] == "left" for one, ballot in seen if ballot.answers[one.id] != SAME]
     return RoundVerdict(
         key,
         tuple(counted),
         left_out,
-        tuple(one for one in pairs if one is not None),
+        tuple(pair for pair in pairs if pair is not None),
         rank_arms(key, counted) if counted and len(key.arms) > 2 else (),
-        float(np.mean(again)) if again else None,
-        float(np.mean(decided)) if decided else None,
+        sum(again) / len(again) if again else math.nan,
+        sum(sides) / len(sides) if sides else math.nan,
     )
 
 
@@ -280,24 +245,17 @@ def _preference(showing: Showing, ballot: Ballot, side: str) -> int:
     return 1 if getattr(showing, answer) == side else -1
 
 
-def _judge_pair(key: RoundKey, counted: Sequence[Ballot], arm: Arm, level: float) -> PairVotes | None:
+def _judge_pair(key: RoundKey, counted: Sequence[Ballot], arm: Arm) -> PairVotes | None:
     """The verdict on ``arm`` against the baseline; None if the round shows no view of the two."""
     sides = {str(arm), str(key.arms[0])}
     showings = [one for one in key.pairs if {one.left, one.right} == sides]
     if not showings:
         return None
     votes = np.array([[_preference(one, ballot, str(arm)) for one in showings] for ballot in counted])
-    people, scenes = judge_votes(votes, [one.scene for one in showings], level)
-    return PairVotes(
-        key.arms[0],
-        arm,
-        int((votes > 0).sum()),
-        int((votes < 0).sum()),
-        int((votes == 0).sum()),
-        people,
-        scenes,
-        tuple(ViewVotes(one, float(own.mean())) for one, own in zip(showings, votes.T, strict=True)),
-    )
+    statements = judge_votes(votes, [one.scene for one in showings], ALPHA / (len(key.arms) - 1))
+    wins, losses, ties = (int((votes == side).sum()) for side in (1, -1, 0))
+    means = zip(showings, map(float, votes.mean(axis=0)), strict=True)
+    return PairVotes(key.arms[0], arm, wins, losses, ties, *statements, tuple(means))
 
 
 def judge_votes(
@@ -313,7 +271,7 @@ def judge_votes(
     return judge_like_these(people, 1, LEAST_PREFERENCE, level), judge_like_these(views, 1, LEAST_PREFERENCE, level)
 
 
-def rank_arms(key: RoundKey, counted: Sequence[Ballot]) -> tuple[RankedArm, ...]:
+def rank_arms(key: RoundKey, counted: Sequence[Ballot]) -> tuple[tuple[Arm, float, Interval], ...]:
     """The arms by their chance to win against the average arm, the best first."""
     names = [str(arm) for arm in key.arms]
     scenes = list(dict.fromkeys(one.scene for one in key.pairs))
@@ -324,11 +282,11 @@ def rank_arms(key: RoundKey, counted: Sequence[Ballot]) -> tuple[RankedArm, ...]
             for_left = (1 + _preference(one, ballot, one.left)) / 2
             wins[person, scenes.index(one.scene), left, right] += for_left
             wins[person, scenes.index(one.scene), right, left] += 1 - for_left
-    chances, low, high = rank_wins(wins)
     ranked = [
-        RankedArm(arm, float(chances[k]), Interval(float(low[k]), float(high[k]))) for k, arm in enumerate(key.arms)
+        (arm, float(chance), Interval(float(low), float(high)))
+        for arm, chance, low, high in zip(key.arms, *rank_wins(wins), strict=True)
     ]
-    return tuple(sorted(ranked, key=lambda one: -one.chance))
+    return tuple(sorted(ranked, key=lambda one: -one[1]))
 
 
 def rank_wins(wins: Array) -> tuple[Array, Array, Array]:
@@ -383,15 +341,9 @@ def view_gains(trials: Sequence[TrialResult], pair: PairVotes) -> list[dict[str,
                 views = {png_name(name): values for name, values in read_views(trial).items()}
                 files[trial.arm, trial.scene, trial.seed] = views
     gains = []
-    for one in (view.showing for view in pair.views):
+    for one, _ in pair.views:
         arm, baseline = (
             files.get((side, one.scene, one.seed), {}).get(f"{one.view}.png", {}) for side in (pair.arm, pair.baseline)
         )
         gains.append({key: arm[key] - baseline[key] for key in arm.keys() & baseline.keys()})
     return gains
-
-
-def agreement(preferences: Sequence[float], gains: Sequence[float]) -> tuple[int, int]:
-    """The views in which people and a metric prefer the same arm, and all in which both prefer one."""
-    products = [preference * gain for preference, gain in zip(preferences, gains, strict=True)]
-    return sum(one > 0 for one in products), sum(one != 0 for one in products)

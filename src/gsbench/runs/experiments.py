@@ -217,7 +217,7 @@ class Declaration(Record):
 
     @property
     def kind(self) -> Literal["sweep", "claims", "votes"]:
-        """The subject: a sweep's metric; a file of claims (or a gate), whose questions have names; or people's votes."""
+        """The subject: a sweep's metric, people's votes, or claims (of a file or a gate): their questions are named."""
         if self.vote_round:
             return "votes"
         return "claims" if any(question.name for question in self.questions) else "sweep"

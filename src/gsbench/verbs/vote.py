@@ -7,17 +7,21 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from gsbench.analysis.cells import with_variants
+from gsbench.analysis.declaration import active_declaration
 from gsbench.analysis.pairing import BASELINE
 from gsbench.analysis.results import Arm, Experiment, load_experiment
 from gsbench.analysis.statistics import ALPHA, sign_test_needs
-from gsbench.analysis.vote_words import describe_round, load_rounds, people_words
-from gsbench.analysis.votes import LEAST_PREFERENCE, METRIC, check_ballot, read_ballot, read_key, round_folder
+from gsbench.analysis.table_formats import to_markdown
+from gsbench.analysis.tables import compared_pairs
+from gsbench.analysis.verdicts import judge_pairs
+from gsbench.analysis.vote_words import describe_round, load_rounds, people_words, vote_table
+from gsbench.analysis.votes import LEAST_PREFERENCE, METRIC, Ballot, check_ballot, read_key
 from gsbench.errors import InputError
 from gsbench.files import make_runs_folder, require_no_links, writable_output, write_json
 from gsbench.launch.record import declare_questions
-from gsbench.parsing import resolved
+from gsbench.parsing import read_typed, resolved
 from gsbench.runs.experiments import Declaration, Question
-from gsbench.runs.layout import VOTE_KEY
+from gsbench.runs.layout import VOTE_KEY, VOTES
 from gsbench.verbs.arguments import ArgumentParser, names, path
 from gsbench.words import counted, some_of
 
@@ -75,7 +79,7 @@ def make(experiment: Experiment, options: argparse.Namespace) -> None:
     rng = random.Random(secrets.randbits(256))
     with writable_output(out / PAGE):
         key = make_round(trials, arms, options.pairs, options.people, out, rng)
-    folder = round_folder(experiment.folder, key.round)
+    folder = experiment.folder / VOTES / key.round
     require_no_links(experiment.folder.parent, folder)
     folder.mkdir(parents=True)
     write_json(folder / VOTE_KEY, key.to_json())
@@ -102,29 +106,32 @@ def make(experiment: Experiment, options: argparse.Namespace) -> None:
 
 def judge(experiment: Experiment, files: Sequence[Path]) -> None:
     """Take people's files into their rounds, and print the verdicts of these rounds; without files, of all rounds."""
-    rounds: dict[str, None] = {}
-    handed_in: set[str] = set()
+    ballots: dict[str, Ballot] = {}
     for file in files:
-        ballot = read_ballot(resolved(file))
-        folder = round_folder(experiment.folder, ballot.round)
+        if not file.is_file():
+            raise InputError(f"{file} is not there: give the files of votes that people saved")
+        ballot = read_typed(resolved(file), Ballot)
+        folder = experiment.folder / VOTES / ballot.round
         require_no_links(experiment.folder.parent, folder, below=True)
         check_ballot(ballot, read_key(folder), file)
-        if ballot.person in handed_in:
+        if ballot.person in ballots:
             raise InputError(f"{file} is of the same person as another file: give one file for each person")
-        handed_in.add(ballot.person)
+        ballots[ballot.person] = ballot
         place = folder / f"{ballot.person}.json"
         # A person who goes back and saves again would otherwise change votes after seeing a verdict.
-        if place.exists() and read_ballot(place) != ballot:
+        if place.exists() and read_typed(place, Ballot) != ballot:
             raise InputError(f"{file}: this person handed in other votes before, which stay ({place})")
         write_json(place, ballot.to_json())
-        rounds[ballot.round] = None
     verdicts = load_rounds(experiment.folder)
     if not verdicts:
         raise InputError(f"{experiment.name} has no round of votes: gsbench vote make {experiment.name} --out DIR")
-    trials = with_variants(experiment.trials)
+    trials, pairs = compared_pairs(experiment)
+    judged = judge_pairs(trials, pairs, active_declaration(experiment.folder, trials))
+    rounds = {ballot.round for ballot in ballots.values()} or {verdict.key.round for verdict in verdicts}
     for verdict in verdicts:
-        if not rounds or verdict.key.round in rounds:
-            print("\n".join(describe_round(verdict, trials)))
+        if verdict.key.round in rounds:
+            tables = [to_markdown(vote_table(pair, verdict.final, trials, judged)) for pair in verdict.pairs]
+            print("\n".join([*describe_round(verdict), *tables]))
 
 
 def choose_arms(arms: Sequence[Arm], wanted: Sequence[str]) -> list[Arm]:

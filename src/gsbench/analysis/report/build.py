@@ -26,7 +26,7 @@ from gsbench.analysis.results import Arm, Experiment, TrialResult, group_by
 from gsbench.analysis.table_formats import Column, Row, Table, TableEntry, fill
 from gsbench.analysis.tables import build_table, compared_pairs
 from gsbench.analysis.verdicts import PairVerdicts
-from gsbench.analysis.vote_words import describe_round, disagreements, load_rounds, summary, vote_table
+from gsbench.analysis.vote_words import describe_round, disagreements, load_rounds, vote_table
 from gsbench.analysis.votes import RoundVerdict
 from gsbench.errors import InputError
 from gsbench.eval.facts import find_metric
@@ -126,11 +126,16 @@ def compare_arms(trials: Sequence[TrialResult], judged: PairVerdicts) -> dict[st
 
 def show_votes(verdict: RoundVerdict, trials: Sequence[TrialResult], judged: Sequence[PairVerdicts]) -> dict[str, Any]:
     """Everything that the page shows of a round of people's votes."""
+    views, faults = [], list[str]()
+    for pair in verdict.pairs:
+        try:
+            views += [(pair, view) for view in disagreements(pair, trials)]
+        except InputError as error:
+            faults.append(str(error))
     return {
-        "summary": summary(verdict),
-        "lines": describe_round(verdict, trials),
+        "lines": [*describe_round(verdict), *faults],
         "tables": [vote_table(pair, verdict.final, trials, judged) for pair in verdict.pairs],
-        "disagreements": [one for pair in verdict.pairs for one in disagreements(pair, trials)],
+        "views": views,
     }
 
 
