@@ -20,8 +20,9 @@ from gsbench.analysis.images import choose_views, png_uri
 from gsbench.analysis.judgement import Verdict
 from gsbench.analysis.pairing import BASELINE, pair_trials
 from gsbench.analysis.paper import layout_of, load_paper, paper_tables
-from gsbench.analysis.quantities import COSTS, relative_change
-from gsbench.analysis.report.charts import ForestRow, forest_plot, line_chart
+from gsbench.analysis.quantities import COSTS, choose_quantities, relative_change
+from gsbench.analysis.ranks import rank_all
+from gsbench.analysis.report.charts import ForestRow, forest_plot, line_chart, rank_plot
 from gsbench.analysis.results import Arm, Experiment, TrialResult, group_by
 from gsbench.analysis.table_formats import Column, Row, Table, TableEntry, fill
 from gsbench.analysis.tables import build_table, compared_pairs
@@ -78,6 +79,7 @@ def build_report(experiment: Experiment, baseline: str = BASELINE) -> str:
             replace(one, notes=tuple(note for note in one.notes if not note.startswith(verdicts.VERDICT)))
             for one in tables
         ],
+        ranks=[rank_plot(one) for one in rank_all(trials, choose_quantities(trials)) if pairs],
         contradictions=[] if paper_table is None else load_paper().contradictions,
         search=search_summary(experiment.folder),
         say=verdicts,
