@@ -25,7 +25,7 @@ from gsbench.analysis.ranks import rank_all
 from gsbench.analysis.report.charts import ForestRow, forest_plot, line_chart, rank_plot
 from gsbench.analysis.results import Arm, Experiment, TrialResult, group_by
 from gsbench.analysis.table_formats import Column, Row, Table, TableEntry, fill
-from gsbench.analysis.tables import build_table, compared_pairs
+from gsbench.analysis.tables import build_table, compared_pairs, with_agreement
 from gsbench.analysis.verdicts import PairVerdicts
 from gsbench.analysis.vote_words import describe_round, disagreements, load_rounds, vote_table
 from gsbench.analysis.votes import RoundVerdict
@@ -77,7 +77,7 @@ def build_report(experiment: Experiment, baseline: str = BASELINE) -> str:
         # The top of the page has the notes on verdicts.
         tables=[
             replace(one, notes=tuple(note for note in one.notes if not note.startswith(verdicts.VERDICT)))
-            for one in tables
+            for one in with_agreement(tables)
         ],
         ranks=[rank_plot(one) for one in rank_all(trials, choose_quantities(trials)) if pairs],
         contradictions=[] if paper_table is None else load_paper().contradictions,
