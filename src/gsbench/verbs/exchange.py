@@ -37,14 +37,15 @@ def evaluate(argv: Sequence[str], runs: Path) -> int:
 
 def _evaluate_parser() -> ArgumentParser:
     parser = ArgumentParser("evaluate", "Names are matched, never guessed. Sizes must be equal.")
-    parser.add_argument("renders", metavar="RENDERS", help="folder of pictures")
+    parser.add_argument(
+        "renders", metavar="RENDERS", help="folder of pictures, or predictions of nerfbaselines (.zip, .tar.gz)"
+    )
     parser.add_argument("settings", nargs="*", metavar="KEY=VALUE", help="settings of the scene, and eval.…")
     parser.add_argument(
         "--truth",
         metavar="PLACE",
-        required=True,
         help="the photographs: a folder, a trial (folder or EXPERIMENT:SCENE:"
-        "DENSIFY), or a scene's name, whose test views are taken as a trial sees them",
+        "DENSIFY), or a scene's name, whose test views are taken as a trial sees them; not needed for predictions",
     )
     parser.add_argument("--protocol", choices=list(PROTOCOLS), help="default: that of the trial, or paper")
     parser.add_argument("--by-order", action="store_true", help="match sorted pictures with sorted photographs")
