@@ -145,6 +145,7 @@ def test_views_sides_repeats_and_traps_follow_the_rules(runs: Path, tmp_path: Pa
     kinds = [one.kind for one in key.showings]
     assert [kinds.count(kind) for kind in ("pair", "again", "trap")] == [12, 1, 4]  # type: ignore[arg-type]
     assert [one.left for one in key.pairs].count(ADC) == 6
+    assert sorted(one.left for one in key.showings if one.kind == "trap") == 2 * ["blurred"] + 2 * ["photograph"]
     for scene in ("courtyard", "garden"):
         own = [one for one in key.pairs if one.scene == scene]
         assert len({one.view for one in own}) == len(own) == 6

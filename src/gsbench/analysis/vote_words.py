@@ -80,14 +80,15 @@ def _describe_pair(pair: PairVotes, final: bool) -> list[str]:
 
 
 def _statement(like: LikeThese | None, units: str, final: bool) -> str:
-    """``better; for it are 8 of 9 people (sign test p 0.039; their median share 55 to 83 %)``"""
+    """``better; for it are 8 of 9 people (sign test at 5 %, p 0.039; median share 55 to 83 %)``"""
     if like is None:
         return f"{UNDECIDED}, since the sign test needs six {units}"
     median = ""
     if like.median is not None:
         median = f"; median share {50 + 50 * like.median.low:.0f} to {50 + 50 * like.median.high:.0f} %"
     votes = f"for it are {like.helped} of {like.scenes} {units}"
-    return f"{_word(like, final)}; {votes} (sign test p {p_text(like.p)}{median})"
+    test = f"sign test at {100 * like.level:.3g} %, p {p_text(like.p)}"
+    return f"{_word(like, final)}; {votes} ({test}{median})"
 
 
 def _word(like: LikeThese | None, final: bool) -> str:

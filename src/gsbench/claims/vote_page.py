@@ -104,8 +104,10 @@ def make_round(
             shown.append((_showing("pair", candidate, str(sides[0]), str(sides[1]), how), candidate))
     traps = max(MIN_TRAPS, len(shown) // PAIRS_PER_TRAP)
     again = rng.sample(shown, max(1, len(shown) // SHOWN_AGAIN))
-    for _, candidate in [rng.choice(shown) for _ in range(traps)]:
-        left, right = rng.sample([PHOTOGRAPH, BLURRED], 2)
+    views = [rng.choice(shown)[1] for _ in range(traps)]
+    for place, candidate in enumerate(views):
+        # By turns, so that whoever always presses the same key fails.
+        left, right = (PHOTOGRAPH, BLURRED) if place % 2 else (BLURRED, PHOTOGRAPH)
         shown.append((_showing("trap", candidate, left, right), candidate))
     rng.shuffle(shown)
     for first, candidate in again:
