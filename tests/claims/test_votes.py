@@ -19,19 +19,12 @@ from scipy.stats import binomtest
 
 from gsbench.analysis.report.build import build_report
 from gsbench.analysis.results import load_experiment
-from gsbench.analysis.votes import (
-    Ballot,
-    RoundKey,
-    Showing,
-    Vote,
-    bradley_terry,
-    judge_round,
-    read_key,
-)
+from gsbench.analysis.votes import bradley_terry, judge_round
 from gsbench.claims.vote_page import make_round
 from gsbench.cli import run
 from gsbench.errors import InputError
 from gsbench.runs.experiments import Arm, read_declarations
+from gsbench.runs.votes import Ballot, RoundKey, Showing, Vote, read_key
 from gsbench.verbs.vote import choose_arms
 from tests.analysis.synthetic import Plan, write_runs
 from tests.conftest import script

@@ -10,12 +10,13 @@ from gsbench.analysis.results import TrialResult
 from gsbench.analysis.statistics import UNDECIDED, LikeThese
 from gsbench.analysis.table_formats import Column, Row, Table, TableEntry
 from gsbench.analysis.verdicts import WORDS, PairVerdicts, p_text
-from gsbench.analysis.votes import Ballot, PairVotes, RoundVerdict, judge_round, read_key, view_gains
+from gsbench.analysis.votes import PairVotes, RoundVerdict, judge_round, view_gains
 from gsbench.errors import InputError
 from gsbench.eval.facts import LPIPS
 from gsbench.files import require_no_links
 from gsbench.parsing import read_typed
 from gsbench.runs.layout import VOTE_KEY, VOTES
+from gsbench.runs.votes import Ballot, read_key
 from gsbench.words import counted, signed
 
 MAX_SHOWN = 3  # views where people and LPIPS disagree that the report shows

@@ -21,9 +21,9 @@ from gsbench.analysis.images import Pixels, absolute_error, read_compared, view_
 from gsbench.analysis.pairing import pair_trials
 from gsbench.analysis.results import TrialPair, TrialResult
 from gsbench.analysis.table_formats import fill
-from gsbench.analysis.votes import BLURRED, PHOTOGRAPH, Chosen, Kind, RoundKey, Showing
 from gsbench.errors import InputError
 from gsbench.runs.experiments import STAMP, Arm
+from gsbench.runs.votes import BLURRED, PHOTOGRAPH, Chosen, Kind, RoundKey, Showing
 
 PAGE, PICTURES = "index.html", "pictures"
 SHOWN_AGAIN = 10  # every tenth pair is shown a second time, with its sides swapped

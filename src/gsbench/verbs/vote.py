@@ -15,13 +15,14 @@ from gsbench.analysis.table_formats import to_markdown
 from gsbench.analysis.tables import compared_pairs
 from gsbench.analysis.verdicts import judge_pairs
 from gsbench.analysis.vote_words import describe_round, load_rounds, people_words, vote_table
-from gsbench.analysis.votes import LEAST_PREFERENCE, METRIC, Ballot, check_ballot, read_key
+from gsbench.analysis.votes import LEAST_PREFERENCE, METRIC
 from gsbench.errors import InputError
 from gsbench.files import make_runs_folder, require_no_links, writable_output, write_json
 from gsbench.launch.record import declare_questions
 from gsbench.parsing import read_typed, resolved
 from gsbench.runs.experiments import Declaration, Question
 from gsbench.runs.layout import VOTE_KEY, VOTES
+from gsbench.runs.votes import Ballot, check_ballot, read_key
 from gsbench.verbs.arguments import ArgumentParser, names, path
 from gsbench.words import counted, some_of
 
