@@ -351,7 +351,7 @@ def test_every_declaration_is_a_line_of_one_kind_and_reads_back(tmp_path: Path) 
     (tmp_path / "declared.jsonl").write_text(record_text([two, one]))
     assert read_declarations(tmp_path) == [one, two]
     assert one.planned == dict.fromkeys(keys, (0, 1, 2))
-    assert not one.of_claims
+    assert one.kind == "sweep"
     assert str(arms[1]) == "sfm-volumetric max_gaussians=30000"
 
 

@@ -19,7 +19,7 @@ import pytest
 from gsbench.analysis.quantities import Change, asked_quantity, choose_quantities, quantity, relative_change
 from gsbench.analysis.results import Experiment, load_experiment
 from gsbench.analysis.table_formats import Table, escape_latex, to_csv, to_html_page, to_latex, to_markdown
-from gsbench.analysis.tables import build_table
+from gsbench.analysis.tables import build_table, with_agreement
 from gsbench.errors import InputError
 from tests.analysis.synthetic import Plan, trial_data, write_runs, write_trial
 
@@ -368,3 +368,23 @@ def test_counts_from_a_million_and_times_from_ten_minutes_have_the_larger_unit(
     fixed = [quantity(name, trials[:1]) for name in ("gaussians_millions", "train_minutes", "peak_memory_mb")]
     assert [one.format(1.26) for one in fixed] == ["1.26", "1.3", "1"]
     assert [one.read(trials[0]) for one in fixed] == pytest.approx([gaussians / 1e6, seconds / 60, 900])
+
+
+@pytest.mark.parametrize(
+    ("metrics", "said"),
+    [
+        (("psnr", "lpips_vgg_raw"), "was 0.52 for PSNR in one study"),
+        (("ssim", "psnr"), "was 0.52 for PSNR, 0.37 for SSIM in one study"),
+        (("flip",), ""),
+    ],
+)
+def test_the_first_table_says_how_weakly_its_metrics_agree_with_people(
+    make_experiment: Callable[..., Experiment], metrics: tuple[str, ...], said: str
+) -> None:
+    """Values of arXiv 2511.06830, table 3, SROCC of the main set."""
+    table = build_table(make_experiment(), metrics=metrics)
+    first, second = with_agreement([table, table])
+    notes = [note for note in first.notes if "agree with people" in note]
+    assert len(notes) == bool(said)
+    assert said in "".join(notes)
+    assert second == table

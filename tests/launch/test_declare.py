@@ -92,8 +92,8 @@ def test_claims_are_kept_beside_declared_metrics(tmp_path: Path, caplog: pytest.
         declare_questions(home, claims("ssim", "2022-01-01T00:00:00Z"))
     assert "other questions were declared before" in caplog.text
     every = read_declarations(home)
-    assert [one.primary for one in every if one.of_claims] == ["psnr", "ssim"]
-    assert [one.primary for one in every if not one.of_claims] == ["psnr"]
+    assert [one.primary for one in every if one.kind == "claims"] == ["psnr", "ssim"]
+    assert [one.primary for one in every if one.kind == "sweep"] == ["psnr"]
 
 
 @pytest.mark.slow

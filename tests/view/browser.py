@@ -51,7 +51,7 @@ class Browser:
         )
         self._ids = itertools.count()
         try:
-            address = self._wait_for(lambda: self._page(profile), "a page")
+            address = self.wait_for(lambda: self._page(profile), "a page")
             self._socket = sockets.connect(address, max_size=None)
         except BaseException:
             self._process.kill()
@@ -67,7 +67,7 @@ class Browser:
 
     def wait_until(self, condition: Callable[[np.ndarray], bool], what: str) -> np.ndarray:
         """The first picture of the page, [H, W, 3] in [0, 255], that fulfils ``condition``."""
-        return self._wait_for(lambda: picture if condition(picture := self.picture()) else None, what)
+        return self.wait_for(lambda: picture if condition(picture := self.picture()) else None, what)
 
     def picture(self) -> np.ndarray:
         """What the window shows now, [H, W, 3] in [0, 255]."""
@@ -94,7 +94,8 @@ class Browser:
             return None
         return str(pages[0]["webSocketDebuggerUrl"]) if pages else None
 
-    def _wait_for(self, look: Callable[[], Any], what: str) -> Any:
+    def wait_for(self, look: Callable[[], Any], what: str) -> Any:
+        """The first result of ``look`` that is not None."""
         deadline = time.monotonic() + SECONDS
         while time.monotonic() < deadline:
             found = look()

@@ -83,7 +83,7 @@ def active_declaration(folder: Path, trials: Sequence[TrialResult]) -> ActiveDec
     soon as it is measured.
     """
     recorded = read_declarations(folder, (trial.record.declared for trial in trials))
-    declared = [one for one in recorded if not one.of_claims]
+    declared = [one for one in recorded if one.kind == "sweep"]
     if not declared:
         return None
     others = [one for one in declared if one.primary != declared[-1].primary]

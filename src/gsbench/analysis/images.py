@@ -115,13 +115,13 @@ def choose_views(pairs: Sequence[TrialPair]) -> tuple[list[ViewComparison], list
             continue
         try:
             for view in view_names(one):
-                first, second, truth = _read(one, other, view)
+                first, second, truth = read_compared(one, other, view)
                 gain = absolute_error(first, truth=truth).mean() - absolute_error(second, truth=truth).mean()
                 views.append((float(gain), (one, other), view))
             scenes_read.add(one.scene)
         except InputError as error:
             faults.setdefault(one.scene, str(error))
-    return [_compare_view(which, pair, view) for which, pair, view in _worst_median_best(views)], list(faults.values())
+    return [compare_view(which, pair, view) for which, pair, view in _worst_median_best(views)], list(faults.values())
 
 
 def _worst_median_best(views: Sequence[tuple[float, TrialPair, str]]) -> list[tuple[str, TrialPair, str]]:
@@ -135,8 +135,9 @@ def _worst_median_best(views: Sequence[tuple[float, TrialPair, str]]) -> list[tu
     return [(f"the view with the {word} gain", *ordered[place][1:]) for word, place in places.items()]
 
 
-def _compare_view(which: str, pair: TrialPair, view: str) -> ViewComparison:
-    first, second, truth = _read(*pair, view)
+def compare_view(which: str, pair: TrialPair, view: str) -> ViewComparison:
+    """A test view of a pair of trials as the report shows it; raises InputError if its pictures differ in size."""
+    first, second, truth = read_compared(*pair, view)
     errors = [absolute_error(image, truth=truth) for image in (first, second)]  # [H, W] each
     gain = np.clip((errors[0] - errors[1]) / FULL_COLOUR, -1, 1)[..., None]  # [H, W, 1], 1 where the second is nearer
     white, blue, red = (np.array(colour) for colour in ((255, 255, 255), (33, 102, 172), (178, 24, 43)))
@@ -173,7 +174,7 @@ def _data_uri(picture: Image.Image, kind: str, **options: Any) -> str:
     return f"data:image/{kind};base64,{base64.b64encode(buffer.getvalue()).decode('ascii')}"
 
 
-def _read(one: TrialResult, other: TrialResult, view: str) -> list[Pixels]:
+def read_compared(one: TrialResult, other: TrialResult, view: str) -> list[Pixels]:
     """Both renders and the photograph, with stripes over ignored pixels: equal stripes show no error."""
     first = read_image(one.path / RENDERS / f"{view}.png")
     second = read_image(other.path / RENDERS / f"{view}.png")

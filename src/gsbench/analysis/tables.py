@@ -6,6 +6,7 @@ The notes below a table say who trained, what was declared, and how else the com
 import itertools
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from types import MappingProxyType
 
 from gsbench.analysis.cells import (
@@ -25,6 +26,7 @@ from gsbench.analysis.pairing import BASELINE, are_equal, choose_pairs, controls
 from gsbench.analysis.quantities import Quantity, choose_quantities
 from gsbench.analysis.results import Arm, Experiment, TrialResult, group_by, seeds_words
 from gsbench.analysis.table_formats import Column, Row, Table, TableEntry
+from gsbench.eval.facts import find_metric
 from gsbench.runs.keys import SHOWN
 from gsbench.runs.layout import TUNING
 from gsbench.runs.trial_record import FROM_MODEL, FROM_RENDERS, TwinViews
@@ -335,6 +337,34 @@ def compared_pairs(experiment: Experiment, baseline: str = BASELINE) -> tuple[li
     if (experiment.folder / TUNING).exists():
         return trials, []
     return trials, choose_pairs(sorted({trial.arm for trial in trials}), baseline, controls_of(trials))
+
+
+# Spearman's rank correlation with viewers' scores of trained 3DGS models: Chen et al. 2025, MUGSQA (arXiv 2511.06830),
+# table 3, main set.
+AGREEMENT = {
+    "psnr": 0.52,
+    "ssim": 0.37,
+    "lpips_vgg": 0.41,
+    "lpips_alex": 0.44,
+    "ms_ssim": 0.64,
+    "fsim": 0.68,
+    "gmsd": 0.55,
+}
+
+
+def with_agreement(tables: Sequence[Table]) -> list[Table]:
+    """The tables, of which the first says how weakly its metrics agree with people, if a study measured any of them."""
+    shown = {column.key[0] for table in tables for column in table.columns}
+    found = [
+        f"{value} for {facts.label}" for key, value in AGREEMENT.items() if key in shown and (facts := find_metric(key))
+    ]
+    if not found:
+        return list(tables)
+    note = (
+        "Metrics agree with people only in part. Their rank correlation with viewers' scores of 3DGS models was "
+        f"{', '.join(found)} in one study (arXiv 2511.06830, table 3). gsbench vote asks people."
+    )
+    return [replace(tables[0], notes=(*tables[0].notes, note)), *tables[1:]]
 
 
 def machine_notes(trials: Sequence[TrialResult]) -> list[str]:

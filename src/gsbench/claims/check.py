@@ -186,7 +186,7 @@ def recheck(file: ClaimsFile, archive: Path, folder: Path) -> tuple[list[ClaimVe
     experiment = unpack_archive(archive, folder)
     if experiment.name != file.name:
         raise InputError(f"{archive} is of the experiment {experiment.name}, not of {file.name}")
-    declarations = [one for one in read_declarations(experiment.folder) if one.of_claims]
+    declarations = [one for one in read_declarations(experiment.folder) if one.kind == "claims"]
     if not declarations:
         raise InputError(f"{archive}: it declares no claims, so it is not an archive of a gsbench check")
     declaration = latest_declaration(declarations)
@@ -348,7 +348,7 @@ def _fairness(one: ClaimVerdict) -> tuple[tuple[Table, ...], str]:
 
 def _declared_line(declared: Declaration, declarations: Sequence[Declaration]) -> str:
     line = f"The claims were declared {declared.when}. A claim says so if trials had been measured before."
-    earlier = {one.hash for one in declarations if one.of_claims and one.moment < declared.moment}
+    earlier = {one.hash for one in declarations if one.kind == "claims" and one.moment < declared.moment}
     if earlier:
         line += f" Earlier declarations under this name: {len(earlier)}."
     return line

@@ -15,7 +15,10 @@ from typing import Any
 from gsbench.analysis.cells import swept_settings
 from gsbench.analysis.declaration import active_declaration
 from gsbench.analysis.judgement import Verdict, judge
+from gsbench.analysis.quantities import choose_quantities
+from gsbench.analysis.ranks import rank_all
 from gsbench.analysis.report.build import build_report
+from gsbench.analysis.report.charts import rank_plot
 from gsbench.analysis.results import Experiment
 from gsbench.analysis.table_formats import Table, fill
 from gsbench.analysis.tables import build_table, compared_pairs
@@ -86,13 +89,14 @@ def _section(experiment: Experiment, key: str) -> dict[str, Any]:
         "gsbench": ", ".join(sorted({trial.record.versions.get("gsbench", "unknown") for trial in trials})),
     }
     lines = [headline(one) for one in judged]
+    ranks = [rank_plot(one) for one in rank_all(arms, choose_quantities(arms))] if pairs else []
     shown = {"facts": list(facts.items()), "claims": claims, "lines": lines, "tables": tables, "notes": notes}
-    return {"name": experiment.name, "key": key} | shown
+    return {"name": experiment.name, "key": key, "ranks": ranks} | shown
 
 
 def _claims(experiment: Experiment) -> list[Verdict]:
     """The verdicts on declared claims, as `gsbench check --from` gives them, without those of gates."""
-    declared = [one for one in read_declarations(experiment.folder) if one.of_claims]
+    declared = [one for one in read_declarations(experiment.folder) if one.kind == "claims"]
     if not declared:
         return []
     judged = judge(experiment.trials, latest_declaration(declared))

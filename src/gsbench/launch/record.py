@@ -152,7 +152,7 @@ def declare(trials: Sequence[Trial]) -> None:
         make_home(home)
         with hold(home / f".{DECLARED}.lock", "the declarations"):
             declarations = read_declarations(home)
-            latest = next((one for one in reversed(declarations) if not one.of_claims), None)
+            latest = next((one for one in reversed(declarations) if one.kind == "sweep"), None)
             metric = given or (None if latest is None else latest.primary)
             if metric is None:
                 continue
@@ -182,7 +182,7 @@ def declare(trials: Sequence[Trial]) -> None:
 
 
 def declare_questions(home: Path, asked: Declaration) -> Declaration:
-    """Add questions that name their trials (of a file of claims, or of a sweep in looks) to the experiment's record.
+    """Add questions to the experiment's record: of a file of claims, of a sweep in looks, or of people's votes.
 
     Returns the recorded declaration: if the latest one of its kind is equal, that one with its earlier time.
     """
@@ -191,11 +191,11 @@ def declare_questions(home: Path, asked: Declaration) -> Declaration:
     make_home(home)
     with hold(home / f".{DECLARED}.lock", "the declarations"):
         declarations = read_declarations(home)
-        same_kind = [one for one in declarations if one.of_claims == asked.of_claims]
+        same_kind = [one for one in declarations if one.kind == asked.kind]
         if same_kind and same_kind[-1].hash == asked.hash:
             return same_kind[-1]
         write_text(home / DECLARED, record_text([*declarations, asked]))
-    if same_kind:
+    if same_kind and asked.kind != "votes":  # votes are judged by their own round alone
         log.warning(
             "%s: other questions were declared before: trials that were measured under them count as looked at",
             home.name,

@@ -264,7 +264,7 @@ def results_of(
     evaluation = read_typed(evaluated.path / layout.METRICS, Evaluation)
     manifest = read_manifest(evaluated.path)
     primary, declarations = values["eval"].get("primary"), read_declarations(TrialFolder.of(values).home)
-    declared = [one for one in declarations if not one.of_claims and one.primary == primary]
+    declared = [one for one in declarations if one.kind == "sweep" and one.primary == primary]
     sizes = sorted({(view.camera.width, view.camera.height) for view in [*scene.train, *scene.test]}, reverse=True)
     seconds = {"init": init.seconds, "train": training.seconds, "evaluate": evaluated.seconds}
     evaluated_from, unknown = training.evaluated_from, dict[str, str]()

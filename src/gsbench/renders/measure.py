@@ -8,7 +8,7 @@ as missing, and say which arms were evaluated from renders.
 import argparse
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +31,7 @@ from gsbench.logs import progress
 from gsbench.pipeline.parts import Parts, build_metrics, make_evaluator
 from gsbench.pipeline.steps.evaluate import summary_of, write_per_view
 from gsbench.pipeline.trial import TrialSteps, versions
+from gsbench.renders.predictions import opened_renders
 from gsbench.runs import keys
 from gsbench.runs.keys import EVALUATE, ROOMS, sha256_of, states_of
 from gsbench.runs.layout import CONFIG, GROUND_TRUTH, IN_RUNS, MASKS, PER_VIEW, RENDERS, RESULTS, SEED, STORE
@@ -82,14 +83,22 @@ class Destination:
 
 def measure_renders(options: argparse.Namespace, runs: Path) -> None:
     """Measure the renders that the ``options`` of the verb name, and print the values."""
-    truth = _reference_images(options, runs)
+    with opened_renders(Path(options.renders).expanduser()) as (renders, photographs):
+        _measure(options, renders, photographs, runs)
+
+
+def _measure(options: argparse.Namespace, renders: Path, photographs: Path | None, runs: Path) -> None:
+    """Measure the pictures in the folder ``renders``; ``photographs`` is used if the command names none."""
+    if options.truth is not None:
+        truth = _reference_images(options, runs)
+    elif photographs is not None:
+        truth = replace(_folder(photographs, options.settings), what=f"the photographs in {options.renders}")
+    else:
+        raise InputError("--truth PLACE is needed: only predictions of nerfbaselines bring their photographs")
     destination = None
     if options.place is not None:
         destination = find_destination(options.place, options.scene, options.seed, truth, runs)
         check_destination(destination, truth, runs)
-    renders = Path(options.renders).expanduser()
-    if not renders.is_dir():
-        raise InputError(f"{renders} is not a folder of renders")
     match = match_by_order if options.by_order else match_pictures
     matching = match(list(truth.photographs), list_images(renders))
     pairs = [
@@ -102,7 +111,10 @@ def measure_renders(options: argparse.Namespace, runs: Path) -> None:
         per_view = measure(pairs, evaluator, report)
     folder = None
     if destination is not None:
-        source = {"folder": str(renders.resolve()), "names matched": matching.rule or "as they are"}
+        source = {
+            "folder": str(Path(options.renders).expanduser().resolve()),
+            "names matched": matching.rule or "as they are",
+        }
         with storage_errors(runs):
             folder = import_trial(destination, truth, pairs, per_view, evaluator, source, runs)
     if options.json:

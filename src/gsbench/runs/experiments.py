@@ -188,7 +188,8 @@ class Declaration(Record):
 
     ``looks`` are the rising numbers of seeds at which a question may be decided; without looks, all seeds are judged
     at once. ``trials`` are the planned trials if the questions name none; None if they are not recorded. ``missing``
-    says by question what could not be tested, and why.
+    says by question what could not be tested, and why. ``votes`` is the number of people's votes at which the questions
+    of the round ``vote_round`` are judged.
     """
 
     time: str
@@ -197,6 +198,8 @@ class Declaration(Record):
     looks: tuple[Count, ...] = ()
     trials: dict[TrialKey, tuple[Count, ...]] | None = None
     missing: dict[str, list[str]] = field(default_factory=dict)
+    votes: Count = 0
+    vote_round: str = ""
 
     def __post_init__(self) -> None:
         if unix_time(self.time) is None:
@@ -213,9 +216,11 @@ class Declaration(Record):
         return time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(self.moment))
 
     @property
-    def of_claims(self) -> bool:
-        """Return whether it comes from a file of claims (or a gate): only their questions have names."""
-        return any(question.name for question in self.questions)
+    def kind(self) -> Literal["sweep", "claims", "votes"]:
+        """The subject: a sweep's metric, people's votes, or claims (of a file or a gate): their questions are named."""
+        if self.vote_round:
+            return "votes"
+        return "claims" if any(question.name for question in self.questions) else "sweep"
 
     @property
     def primary(self) -> str:

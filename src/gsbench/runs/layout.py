@@ -22,6 +22,8 @@ METRICS = "metrics.json"  # of an evaluation
 PLAN = "plan.json"  # all trials of the commands so far
 DECLARED = "declared.jsonl"  # declared questions, with their times
 TUNING = "tuning.json"  # of a search: its ranges and points
+VOTES = "votes"  # a folder per round of people's votes (`gsbench vote`)
+VOTE_KEY = "key.json"  # of a round: which arm was on which side; beside it a file per person
 SEED = "-seed"  # between hash and seed in the name of a trial's folder
 TRIAL_GLOB = f"*/*/*{SEED}*"  # all trials' folders
 

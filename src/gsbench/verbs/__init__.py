@@ -15,6 +15,7 @@ VERBS = {  # their modules, with their purposes as `gsbench --help` lists them
     "plan": ("claims", "how many scenes and seeds you need to see a difference"),
     "ablate": ("claims", "which part of a densifier makes its gain: train all combinations of its switches"),
     "pool": ("exchange", "one answer from many archives of results (export --results)"),
+    "vote": ("vote", "ask people: a blind comparison page (make), and the verdict of their votes (judge)"),
     "site": ("exchange", "a static site from archives: tables that sort, verdicts, reports"),
     "explain": ("results", "the trials, settings and code behind a number of a table"),
     "status": ("trials", "the state of every trial: done, running, failed, missing"),

@@ -22,6 +22,7 @@ from gsbench.view import ADDRESS
 from gsbench.words import readable_bytes
 
 DONE, LEFT_OUT = 0, 1
+PAGE = ".html"
 BETTER = {1: ", more is better", -1: ", less is better", 0: ""}
 
 log = logging.getLogger(__name__)
@@ -37,14 +38,15 @@ def evaluate(argv: Sequence[str], runs: Path) -> int:
 
 def _evaluate_parser() -> ArgumentParser:
     parser = ArgumentParser("evaluate", "Names are matched, never guessed. Sizes must be equal.")
-    parser.add_argument("renders", metavar="RENDERS", help="folder of pictures")
+    parser.add_argument(
+        "renders", metavar="RENDERS", help="folder of pictures, or predictions of nerfbaselines (.zip, .tar.gz)"
+    )
     parser.add_argument("settings", nargs="*", metavar="KEY=VALUE", help="settings of the scene, and eval.…")
     parser.add_argument(
         "--truth",
         metavar="PLACE",
-        required=True,
         help="the photographs: a folder, a trial (folder or EXPERIMENT:SCENE:"
-        "DENSIFY), or a scene's name, whose test views are taken as a trial sees them",
+        "DENSIFY), or a scene's name, whose test views are taken as a trial sees them; not needed for predictions",
     )
     parser.add_argument("--protocol", choices=list(PROTOCOLS), help="default: that of the trial, or paper")
     parser.add_argument("--by-order", action="store_true", help="match sorted pictures with sorted photographs")
@@ -61,14 +63,18 @@ def export(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: 0 if the file, or folder, was written."""
     parser = ArgumentParser(
         "export",
-        "`gsbench export init TRIAL --out DIR` copies the COLMAP model that the trial started from. `gsbench export "
-        "--results EXPERIMENT` writes results, configurations and hashes as one small archive, without pixels unless "
-        "--pictures is given.",
+        "A .html file is a page with the model and the test cameras, made by npx (docs/other_models.md). `gsbench "
+        "export init TRIAL --out DIR` copies the COLMAP model that the trial started from. `gsbench export --results "
+        "EXPERIMENT` writes results, configurations and hashes as one small archive, without pixels unless --pictures "
+        "is given.",
     )
     parser.add_argument("--results", metavar="EXPERIMENT", help="the archive of its results (default: EXPERIMENT.zip)")
     parser.add_argument("trial", nargs="*", metavar="TRIAL", help=f"{ADDRESS}; after the word init: its initial model")
     parser.add_argument(
-        "--out", type=path, metavar="PATH", help="the file to write, for init the folder; a TRIAL needs it"
+        "--out",
+        type=path,
+        metavar="PATH",
+        help="the .ply or .html file to write, for init the folder; a TRIAL needs it",
     )
     parser.add_argument("--pictures", action="store_true", help="with --results: the pictures of the test views, too")
     options = parser.parse_args(argv)
@@ -87,10 +93,15 @@ def export(argv: Sequence[str], runs: Path) -> int:
         raise InputError(f"one TRIAL is exported, not {len(options.trial)}; for an initial model: export init TRIAL")
     trial = find_trial(options.trial[-1], runs)
     out = options.out
-    if not is_init:
+    is_page = not is_init and out.suffix.lower() == PAGE
+    if not is_init and not is_page:
         check_form(out)
     with writable_output(out):
-        if is_init:
+        if is_page:
+            from gsbench.view.page import write_page
+
+            write_page(trial, out)
+        elif is_init:
             entry = trial.path.parents[3] / STORE / INIT.name / trial.record.hashes[INIT.name]
             export_init(entry, out, trial.record.to_training)
         else:
@@ -123,8 +134,8 @@ def check_form(out: Path) -> None:
     """Raise InputError unless the name of the file is that of a 3DGS PLY."""
     if not out.name.lower().endswith(".ply") or out.name.lower().endswith(".compressed.ply"):
         raise InputError(
-            f"--out {out}: name a file that ends in .ply, the 3DGS form, which every viewer and trainer reads "
-            "(docs/other_models.md says what makes other forms of it)"
+            f"--out {out}: name a file that ends in .ply, the 3DGS form, which every viewer and trainer reads, or in "
+            ".html, a page for browsers (docs/other_models.md says what makes other forms)"
         )
 
 

@@ -14,7 +14,7 @@ from gsbench.analysis.paper import PAPER_TABLES, layout_of, load_paper, paper_ta
 from gsbench.analysis.quantities import Quantity, quantity
 from gsbench.analysis.results import Arm, Experiment, TrialResult, load_experiment
 from gsbench.analysis.table_formats import FORMATS
-from gsbench.analysis.tables import DEFAULT_ROWS, build_table, compared_pairs, format_cell
+from gsbench.analysis.tables import DEFAULT_ROWS, build_table, compared_pairs, format_cell, with_agreement
 from gsbench.errors import InputError
 from gsbench.files import writable_output, write_text
 from gsbench.runs.keys import AS_RELEASED
@@ -73,7 +73,7 @@ def _tables(experiment: Experiment, trials: Sequence[TrialResult], options: argp
     else:
         tables = paper_tables(experiment, layout, trials, metrics)
     suffix, writer = FORMATS[options.format]
-    named = dict(zip(("", "-difference"), tables, strict=False))
+    named = dict(zip(("", "-difference"), with_agreement(tables), strict=False))
     if options.paper is not None:
         named[f"-{options.paper}"] = published_table(with_variants(trials), options.paper)
     return {f"{end}.{suffix}": writer(table) for end, table in named.items()}

@@ -110,7 +110,7 @@ def load_viewed(trial: TrialResult, device: torch.device) -> ViewedTrial:
     """Read everything that the viewer draws of ``trial``; raises InputError naming a missing or damaged file."""
     # A page's numbers are float32, so the viewer works in the coordinates of the training.
     gaussians = read_ply(model_file(trial), device, trial.record.to_training)
-    model_dir = _model_folder(trial)
+    model_dir = model_folder(trial)
     background = trial.config.get("train.background", (0.0, 0.0, 0.0))
     return ViewedTrial(
         label=f"{trial.scene} {trial.init}-{trial.densify} seed {trial.seed}",
@@ -135,7 +135,8 @@ def read_causes(path: Path, num_gaussians: int) -> NDArray[np.uint8]:
     return causes
 
 
-def _model_folder(trial: TrialResult) -> Path:
+def model_folder(trial: TrialResult) -> Path:
+    """The COLMAP model that a trial started from; raises InputError if it is gone."""
     runs = trial.path.parents[3]
     folder = Store(runs / STORE).folder(INIT, trial.record.hashes.get("init", "")) / MODEL_FOLDER
     if not folder.is_dir():

@@ -20,12 +20,15 @@ from gsbench.analysis.images import choose_views, png_uri
 from gsbench.analysis.judgement import Verdict
 from gsbench.analysis.pairing import BASELINE, pair_trials
 from gsbench.analysis.paper import layout_of, load_paper, paper_tables
-from gsbench.analysis.quantities import COSTS, relative_change
-from gsbench.analysis.report.charts import ForestRow, forest_plot, line_chart
+from gsbench.analysis.quantities import COSTS, choose_quantities, relative_change
+from gsbench.analysis.ranks import rank_all
+from gsbench.analysis.report.charts import ForestRow, forest_plot, line_chart, rank_plot
 from gsbench.analysis.results import Arm, Experiment, TrialResult, group_by
 from gsbench.analysis.table_formats import Column, Row, Table, TableEntry, fill
-from gsbench.analysis.tables import build_table, compared_pairs
+from gsbench.analysis.tables import build_table, compared_pairs, with_agreement
 from gsbench.analysis.verdicts import PairVerdicts
+from gsbench.analysis.vote_words import describe_round, disagreements, load_rounds, vote_table
+from gsbench.analysis.votes import RoundVerdict
 from gsbench.errors import InputError
 from gsbench.eval.facts import find_metric
 from gsbench.events import RefineEvent
@@ -68,13 +71,15 @@ def build_report(experiment: Experiment, baseline: str = BASELINE) -> str:
         seeds=experiment.seeds,
         trials=trials,
         versus=[compare_arms(trials, own) for own in judged],
+        votes=[show_votes(one, trials, judged) for one in load_rounds(experiment.folder)],
         declared=declared.sentences(quantity.name) if declared and quantity else [],
         families=verdicts.families(judged),
         # The top of the page has the notes on verdicts.
         tables=[
             replace(one, notes=tuple(note for note in one.notes if not note.startswith(verdicts.VERDICT)))
-            for one in tables
+            for one in with_agreement(tables)
         ],
+        ranks=[rank_plot(one) for one in rank_all(trials, choose_quantities(trials)) if pairs],
         contradictions=[] if paper_table is None else load_paper().contradictions,
         search=search_summary(experiment.folder),
         say=verdicts,
@@ -118,6 +123,21 @@ def compare_arms(trials: Sequence[TrialResult], judged: PairVerdicts) -> dict[st
         "forests": [_forest(verdict) for verdict in judged.verdicts],
         "views": views,
         "notes": dict.fromkeys([*judged.notes, *faults]),
+    }
+
+
+def show_votes(verdict: RoundVerdict, trials: Sequence[TrialResult], judged: Sequence[PairVerdicts]) -> dict[str, Any]:
+    """Everything that the page shows of a round of people's votes."""
+    views, faults = [], list[str]()
+    for pair in verdict.pairs:
+        try:
+            views += [(pair, view) for view in disagreements(pair, trials)]
+        except InputError as error:
+            faults.append(str(error))
+    return {
+        "lines": [*describe_round(verdict), *faults],
+        "tables": [vote_table(pair, verdict.final, trials, judged) for pair in verdict.pairs],
+        "views": views,
     }
 
 

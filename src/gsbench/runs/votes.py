@@ -1,0 +1,128 @@
+"""A round of people's votes in the runs folder: its key, and the file that each person saves."""
+
+import hashlib
+import hmac
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Literal
+
+from annotated_types import MinLen
+from pydantic import Field
+
+from gsbench.errors import InputError
+from gsbench.parsing import Amount, Count, Record, Text, read_typed
+from gsbench.runs.experiments import Arm, unix_time
+from gsbench.runs.layout import VOTE_KEY
+
+PHOTOGRAPH, BLURRED = "photograph", "blurred"  # the sides of a trap
+SAME = "same"  # the answer "no difference"
+
+Kind = Literal["pair", "again", "trap"]
+Chosen = Literal["most different", "random", ""]
+RoundId = Annotated[str, Field(pattern=r"^[0-9a-f]{12}$")]
+PersonId = Annotated[str, Field(pattern=r"^[0-9a-f]{16}$")]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Showing(Record):
+    """One decision of a round: ``left`` and ``right`` name arms, or the sides of a trap.
+
+    ``chosen`` says how the view was chosen. ``of`` is the first showing of one that is shown again.
+    """
+
+    id: Text
+    kind: Kind
+    scene: str
+    view: str
+    seed: Count
+    left: Text
+    right: Text
+    chosen: Chosen = ""
+    of: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RoundKey(Record):
+    """The key of a round, which stays in the runs folder until the votes are there.
+
+    ``arms`` begin with the baseline. ``people`` is the number of people at which the round is judged. A person with
+    more than ``traps_allowed`` wrong traps is left out.
+    """
+
+    salt: Text
+    time: Text
+    arms: tuple[Arm, ...]
+    people: Count
+    traps_allowed: Count
+    showings: Annotated[tuple[Showing, ...], MinLen(1)]
+
+    def commitment(self, showing: Showing) -> str:
+        """The salted hash of a showing's sides, which the page has: without the salt it tells nothing."""
+        sides = f"{showing.id} {showing.left} {showing.right}"
+        return hmac.new(self.salt.encode(), sides.encode(), hashlib.sha256).hexdigest()
+
+    @cached_property
+    def round(self) -> str:
+        """The name of the round: a hash of all commitments, so a key that was changed later has another name."""
+        return hashlib.sha256("".join(map(self.commitment, self.showings)).encode()).hexdigest()[:12]
+
+    @property
+    def pairs(self) -> list[Showing]:
+        """The showings that count: pairs of arms, seen for the first time."""
+        return [one for one in self.showings if one.kind == "pair"]
+
+    @property
+    def votes(self) -> int:
+        """The number of votes at which the round is judged."""
+        return self.people * len(self.pairs)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Vote(Record):
+    """The answer to a showing, and the seconds that it took."""
+
+    showing: Text
+    answer: Literal["left", "right", "same"]
+    seconds: Amount
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ballot(Record):
+    """The file that a person saves at the end of a round; ``finished`` is the time of the last answer."""
+
+    round: RoundId
+    person: PersonId
+    name: Annotated[str, Field(max_length=60)] = ""
+    finished: Text
+    votes: tuple[Vote, ...]
+
+    def __post_init__(self) -> None:
+        if unix_time(self.finished) is None:
+            raise ValueError("finished is not a time")
+
+    @property
+    def label(self) -> str:
+        return f"{self.name} ({self.person[:6]})" if self.name else self.person[:6]
+
+    @cached_property
+    def answers(self) -> dict[str, str]:
+        return {vote.showing: vote.answer for vote in self.votes}
+
+
+def read_key(folder: Path) -> RoundKey:
+    """The key of the round in ``folder``; raises InputError if it is missing, damaged or was changed."""
+    if not (folder / VOTE_KEY).is_file():
+        raise InputError(f"this experiment has no round {folder.name}: `gsbench vote make` makes rounds")
+    key = read_typed(folder / VOTE_KEY, RoundKey)
+    if key.round != folder.name:
+        raise InputError(f"{folder / VOTE_KEY} was changed after the page was made: nothing can be judged by it")
+    return key
+
+
+def check_ballot(ballot: Ballot, key: RoundKey, path: Path) -> None:
+    """Raise InputError unless the ballot answers every showing of the round once."""
+    showings = {one.id for one in key.showings}
+    if ballot.answers.keys() != showings or len(ballot.votes) != len(showings):
+        known = len(ballot.answers.keys() & showings)
+        raise InputError(f"{path} answers {known} of the {len(showings)} showings of its round: only whole files count")

@@ -1,0 +1,106 @@
+"""Arms ranked over scenes: the published critical values, Friedman's test, groups, and what is left out."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from gsbench.analysis.quantities import quantity
+from gsbench.analysis.ranks import Ranking, critical_difference, rank_arms
+from gsbench.analysis.report.build import build_report
+from gsbench.analysis.report.charts import rank_plot
+from gsbench.analysis.results import Experiment
+from gsbench.claims.archive import write_archive
+from gsbench.cli import run
+from gsbench.runs.experiments import Arm
+
+SCENES = tuple("abcdefg")
+ARMS = ("adc", "mcmc", "volumetric")
+Make = Callable[..., Experiment]
+
+
+@pytest.fixture
+def seven(make_experiment: Make) -> Experiment:
+    return make_experiment(scenes=SCENES, densifiers=ARMS, effect={"psnr": 2.0, "lpips_vgg_raw": -0.1})
+
+
+@pytest.mark.parametrize(("arms", "q"), [(2, 1.960), (3, 2.343), (4, 2.569), (5, 2.728), (6, 2.850), (10, 3.164)])
+def test_the_critical_values_are_those_of_demsar(arms: int, q: float) -> None:
+    """Demšar 2006, table 5a."""
+    assert critical_difference(arms, 14) == pytest.approx(q * np.sqrt(arms * (arms + 1) / (6 * 14)), rel=5e-4)
+
+
+def test_the_example_of_demsar() -> None:
+    """Demšar 2006, section 3.2.2: four classifiers on 14 data sets have the critical difference 1.25."""
+    assert critical_difference(4, 14) == pytest.approx(1.25, abs=0.005)
+
+
+@pytest.mark.parametrize("metric", ["psnr", "lpips_vgg_raw"])
+def test_the_best_arm_has_rank_one(seven: Experiment, metric: str) -> None:
+    ranking = rank_arms(seven.trials, quantity(metric, seven.trials))
+    assert ranking is not None
+    assert (ranking.arms[0], ranking.ranks[0]) == (Arm("sfm", "volumetric"), 1.0)
+    means = {
+        arm: [np.mean([t.metrics[metric] for t in seven.trials if (t.scene, t.densify) == (s, arm)]) for s in SCENES]
+        for arm in ARMS
+    }
+    assert ranking.p == pytest.approx(stats.friedmanchisquare(*means.values()).pvalue)
+    assert sum(ranking.ranks) == pytest.approx(6)
+
+
+def test_groups_are_the_largest_that_do_not_differ() -> None:
+    made = Ranking(
+        quantity("psnr", []), tuple(Arm("sfm", c) for c in "abcde"), (1.0, 1.8, 2.7, 4.0, 5.5), SCENES, 1.2, 0.01
+    )
+    assert made.groups == [(0, 1), (1, 2)]
+    assert Ranking(made.quantity, made.arms, (1.0, 1.1, 1.2, 1.3, 5.0), SCENES, 1.2, 0.01).groups == [(0, 3)]
+    assert Ranking(made.quantity, made.arms, (1.0, 2.0, 3.0, 4.0, 5.0), SCENES, 0.9, 0.01).groups == []
+
+
+@pytest.mark.parametrize(
+    "plan",
+    [{"scenes": SCENES[:5], "densifiers": ARMS}, {"scenes": SCENES, "densifiers": ("adc",)}],
+    ids=["five scenes", "one arm"],
+)
+def test_few_scenes_or_arms_have_no_ranking(make_experiment: Make, plan: dict[str, object]) -> None:
+    experiment = make_experiment(**plan)
+    assert rank_arms(experiment.trials, quantity("psnr", experiment.trials)) is None
+    assert "Ranks of all arms" not in build_report(experiment)
+
+
+def test_a_scene_that_lacks_an_arm_is_left_out(seven: Experiment) -> None:
+    trials = [trial for trial in seven.trials if (trial.scene, trial.densify) != ("c", "mcmc")]
+    ranking = rank_arms(trials, quantity("psnr", trials))
+    assert ranking is not None
+    assert ranking.scenes == ("a", "b", "d", "e", "f", "g")
+    two = [trial for trial in trials if (trial.scene, trial.densify) != ("d", "adc")]
+    assert rank_arms(two, quantity("psnr", two)) is None
+
+
+def test_equal_arms_do_not_differ(make_experiment: Make) -> None:
+    experiment = make_experiment(
+        scenes=SCENES, densifiers=ARMS, trial_noise=0.0, residual_noise=0.0, effect_noise=0.0, scene_noise=0.0
+    )
+    ranking = rank_arms(experiment.trials, quantity("psnr", experiment.trials))
+    assert ranking is not None
+    assert set(ranking.ranks) == {2.0}
+    assert ranking.p == 1.0
+    assert ranking.groups == [(0, 2)]
+
+
+def test_report_and_site_have_the_picture(seven: Experiment, tmp_path: Path) -> None:
+    write_archive(seven, tmp_path / "exp.zip")
+    assert run(["site", str(tmp_path / "exp.zip"), "--out", str(tmp_path / "site")]) == 0
+    for page in (build_report(seven), (tmp_path / "site" / "index.html").read_text()):
+        assert page.count("ranks over 7 scenes</figcaption>") == 4  # PSNR, SSIM, LPIPS, FLIP
+    ranking = rank_arms(seven.trials, quantity("psnr", seven.trials))
+    assert ranking is not None
+    svg = rank_plot(ranking)
+    dots = [float(x) for x in re.findall(r'<circle cx="([\d.]+)"', svg)]
+    assert dots == sorted(dots)
+    assert f"CD {critical_difference(3, 7):.2f}" in svg

@@ -1,0 +1,451 @@
+"""Votes: a page that tells nothing, a whole round in a browser by keyboard, and a verdict by exact tests."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import random
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.optimize import minimize
+from scipy.stats import binomtest
+
+from gsbench.analysis.report.build import build_report
+from gsbench.analysis.results import load_experiment
+from gsbench.analysis.votes import bradley_terry, judge_round
+from gsbench.claims.vote_page import make_round
+from gsbench.cli import run
+from gsbench.errors import InputError
+from gsbench.runs.experiments import Arm, read_declarations
+from gsbench.runs.votes import Ballot, RoundKey, Showing, Vote, read_key
+from gsbench.verbs.vote import choose_arms
+from tests.analysis.synthetic import Plan, write_runs
+from tests.conftest import script
+from tests.view.browser import Browser
+
+ADC, VOLUMETRIC = "sfm-adc", "sfm-volumetric"
+Chooser = Callable[[Showing], str]
+SHARP = {"left": "right", "right": "left"}
+
+
+@pytest.fixture(scope="module")
+def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A runs folder with pictures: two scenes with seven views each, two seeds."""
+    folder = tmp_path_factory.mktemp("votes")
+    write_runs(folder, Plan(views=7, seeds=(0, 1), pictures=True, effect={"lpips_vgg_raw": 0.1}, view_noise=0.1))
+    return folder
+
+
+@pytest.fixture
+def runs(pictures: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("GSBENCH_RUNS", str(pictures))
+    return pictures
+
+
+def made(runs: Path, out: Path, *words: str) -> RoundKey:
+    """The key of a new round of the experiment ``exp``, whose page is in ``out``."""
+    before = set((runs / "exp" / "votes").glob("*"))
+    assert run(["vote", "make", "exp", "--out", str(out), *words]) == 0
+    (folder,) = set((runs / "exp" / "votes").glob("*")) - before
+    return read_key(folder)
+
+
+def prefers(arm: str) -> Chooser:
+    """Votes of a person who always prefers ``arm``, and sees through traps."""
+    return lambda showing: next((side for side in SHARP if getattr(showing, side) in (arm, "photograph")), "same")
+
+
+def ballot(key: RoundKey, person: int, choose: Chooser, minute: int = 0, name: str = "") -> Ballot:
+    votes = tuple(Vote(showing=one.id, answer=choose(one), seconds=1.0) for one in key.showings)  # type: ignore[arg-type]
+    finished = f"2026-11-27T00:{minute:02}:00Z"
+    return Ballot(round=key.round, person=f"{person:016x}", finished=finished, votes=votes, name=name)
+
+
+def saved(folder: Path, one: Ballot) -> str:
+    file = folder / f"votes-{one.person}.json"
+    file.write_text(json.dumps(one.to_json()))
+    return str(file)
+
+
+def made_up(arms: Sequence[str], scenes: int, views: int, people: int = 9, traps: int = 4) -> RoundKey:
+    """A key without pictures: every two arms on each view."""
+    showings = [
+        Showing(
+            id=f"{scene}{view}{one}{two}", kind="pair", scene=str(scene), view=str(view), seed=0, left=one, right=two
+        )
+        for scene in range(scenes)
+        for view in range(views)
+        for one, two in itertools.combinations(arms, 2)
+    ]
+    first = showings[0]
+    showings.append(replace(first, id="again", kind="again", left=first.right, right=first.left, of=first.id))
+    trap = Showing(id="", kind="trap", scene="0", view="0", seed=0, left="photograph", right="blurred")
+    showings += [replace(trap, id=f"trap{number}") for number in range(traps)]
+    named = tuple(Arm(*arm.split("-")) for arm in arms)
+    return RoundKey(
+        salt="s", time="2026-11-27T00:00:00Z", arms=named, people=people, traps_allowed=0, showings=tuple(showings)
+    )
+
+
+# ---- the page
+
+
+def test_the_page_tells_nothing_of_arms(runs: Path, tmp_path: Path) -> None:
+    key = made(runs, tmp_path / "page", "--pairs", "12", "--people", "2")
+    text = (tmp_path / "page" / "index.html").read_text()
+    for word in ("sfm", "volumetric", "courtyard", "garden", "view0", key.salt, "blurred"):
+        assert word not in text
+    for showing in key.showings:
+        assert key.commitment(showing) in text
+    files = sorted((tmp_path / "page" / "pictures").iterdir())
+    assert len(files) == 3 * len(key.showings)
+    for file in files:
+        assert not set(file.stem) - set("0123456789abcdef")
+        with Image.open(file) as image:
+            assert not image.info
+    again = made(runs, tmp_path / "again", "--pairs", "12", "--people", "2")
+    assert not set(map(key.commitment, key.showings)) & set(map(again.commitment, again.showings))
+
+
+def test_each_showing_has_the_pictures_that_its_key_says(runs: Path, tmp_path: Path) -> None:
+    page = tmp_path / "page"
+    key = made(runs, page, "--pairs", "12")
+    text = (page / "index.html").read_text()
+    entries = json.loads(text.partition('id="data">')[2].partition("</script>")[0])["showings"]
+    trials = {(t.scene, str(t.arm), t.seed): t.path for t in load_experiment(runs, "exp").trials}
+    for entry, showing in zip(entries, key.showings, strict=True):
+        photo, left, right = (np.asarray(Image.open(page / entry[what])) for what in ("photo", "left", "right"))
+        folder = trials[showing.scene, ADC, showing.seed]
+        np.testing.assert_array_equal(photo, np.asarray(Image.open(folder / "ground_truth" / f"{showing.view}.png")))
+        for side, shown in (("left", left), ("right", right)):
+            what = getattr(showing, side)
+            if showing.kind == "trap":
+                assert np.array_equal(shown, photo) == (what == "photograph")
+            else:
+                render = trials[showing.scene, what, showing.seed] / "renders" / f"{showing.view}.png"
+                np.testing.assert_array_equal(shown, np.asarray(Image.open(render)))
+
+
+def test_views_sides_repeats_and_traps_follow_the_rules(runs: Path, tmp_path: Path) -> None:
+    key = made(runs, tmp_path / "page", "--pairs", "12")
+    kinds = [one.kind for one in key.showings]
+    assert [kinds.count(kind) for kind in ("pair", "again", "trap")] == [12, 1, 4]  # type: ignore[arg-type]
+    assert [one.left for one in key.pairs].count(ADC) == 6
+    assert sorted(one.left for one in key.showings if one.kind == "trap") == 2 * ["blurred"] + 2 * ["photograph"]
+    for scene in ("courtyard", "garden"):
+        own = [one for one in key.pairs if one.scene == scene]
+        assert len({one.view for one in own}) == len(own) == 6
+        most = {one.view for one in own if one.chosen == "most different"}
+        assert len(most) == 3
+        # Views and seeds take turns, so each view has one pair of renders that may be shown.
+        differences = {}
+        for place in range(7):
+            both = [
+                np.asarray(Image.open(t.path / "renders" / f"view{place:03}.png")).astype(float)
+                for t in load_experiment(runs, "exp").trials
+                if t.scene == scene and t.seed == place % 2
+            ]
+            differences[f"view{place:03}"] = np.abs(both[0] - both[1]).mean()
+        assert most == set(sorted(differences, key=lambda view: -differences[view])[:3])
+    for showing in key.showings:
+        if showing.kind == "again":
+            first = next(one for one in key.pairs if one.id == showing.of)
+            assert (showing.left, showing.right, showing.view) == (first.right, first.left, first.view)
+            assert key.showings.index(showing) > key.showings.index(first)
+
+
+def test_more_pairs_than_views_are_said(runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    key = made(runs, tmp_path / "page", "--pairs", "40", "--people", "9")
+    out = capsys.readouterr().out
+    assert len(key.pairs) == 14
+    assert "no more than 14 views" in out
+    assert "judged at 126 votes of 9 people" in out
+    assert "decide nothing" not in out
+    made(runs, tmp_path / "two", "--people", "5")
+    assert "decide nothing: that needs 6 people" in capsys.readouterr().out
+
+
+def test_it_is_declared_and_leaves_other_declarations_alone(runs: Path, tmp_path: Path) -> None:
+    key = made(runs, tmp_path / "page", "--pairs", "12", "--people", "7")
+    declared = [one for one in read_declarations(runs / "exp") if one.vote_round == key.round]
+    assert [(one.kind, one.votes, len(one.questions)) for one in declared] == [("votes", 84, 1)]
+    page = build_report(load_experiment(runs, "exp"))
+    assert "No metric was declared beforehand" in page
+    archive = str(tmp_path / "exp.zip")
+    assert run(["export", "--results", "exp", "--out", archive]) == 0
+    assert run(["site", archive, "--out", str(tmp_path / "site")]) == 0
+    assert "vote " + key.round not in (tmp_path / "site" / "index.html").read_text()
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["make", "exp"], "needs --out"),
+        (["make", "exp", "--out", "."], "is there already"),
+        (["make", "exp", "--out", "new", "--arms", "adc"], "sfm-adc alone"),
+        (["make", "exp", "--out", "new", "--arms", "adc,mcmc"], "'mcmc' names 0 arms; there are sfm-adc"),
+        (["make", "exp", "--out", "new", "--pairs", "0"], "from 1 to 1000"),
+        (["make", "exp", "x.json", "--out", "new"], "takes no files"),
+        (["judge", "exp", "absent.json"], "absent.json is not there"),
+        (["judge", "exp", "--arms", "adc"], "files of votes alone"),
+        (["look", "exp"], "invalid choice"),
+    ],
+)
+def test_bad_input_is_one_line(
+    runs: Path, words: list[str], message: str, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: Any
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").touch()
+    assert run(["vote", *words]) == 2
+    err = capsys.readouterr().err
+    assert message in err
+    assert err.count("\n") == 1
+
+
+def test_without_pictures_there_is_no_page(tmp_path: Path) -> None:
+    write_runs(tmp_path, Plan(experiment="bare"))
+    trials = load_experiment(tmp_path, "bare").trials
+    arms = choose_arms(sorted({trial.arm for trial in trials}), ())
+    with pytest.raises(InputError, match="holds no renders"):
+        make_round(trials, arms, 4, 9, tmp_path / "page", random.Random(0))
+    assert not (tmp_path / "page").exists()
+
+
+# ---- files of votes
+
+
+def test_files_that_do_not_fit_are_refused(runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    key = made(runs, tmp_path / "page", "--pairs", "12", "--people", "2")
+    sound = ballot(key, 1, prefers(ADC))
+    part = replace(sound, person=f"{2:016x}", votes=sound.votes[:-1])
+    twice = replace(sound, person=f"{3:016x}", votes=(*sound.votes, sound.votes[0]))
+    foreign = replace(sound, person=f"{4:016x}", round="0" * 12)
+    for bad, message in (
+        (part, "answers 16 of the 17 showings"),
+        (twice, "answers 17 of the 17 showings"),
+        (foreign, "no round 000000000000"),
+    ):
+        assert run(["vote", "judge", "exp", saved(tmp_path, bad)]) == 2
+        assert message in capsys.readouterr().err
+    for change in ({"person": "../../../x"}, {"round": ".."}, {"finished": "soon"}, {"votes": 1}):
+        file = tmp_path / "changed.json"
+        file.write_text(json.dumps(sound.to_json() | change))
+        assert run(["vote", "judge", "exp", str(file)]) == 2
+        assert "is damaged" in capsys.readouterr().err
+    first = saved(tmp_path, sound)
+    assert run(["vote", "judge", "exp", first, first]) == 2
+    assert "same person" in capsys.readouterr().err
+    assert run(["vote", "judge", "exp", first]) == 0
+    assert run(["vote", "judge", "exp", saved(tmp_path, ballot(key, 1, prefers(VOLUMETRIC)))]) == 2
+    assert "other votes before" in capsys.readouterr().err
+
+
+def test_a_changed_key_judges_nothing(runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    key = made(runs, tmp_path / "page", "--pairs", "12")
+    file = runs / "exp" / "votes" / key.round / "key.json"
+    text = file.read_text()
+    first = key.showings[0]
+    swapped = [replace(first, left=first.right, right=first.left), *key.showings[1:]]
+    file.write_text(json.dumps(replace(key, showings=tuple(swapped)).to_json()))
+    assert run(["vote", "judge", "exp", saved(tmp_path, ballot(key, 1, prefers(ADC)))]) == 2
+    assert "was changed after the page was made" in capsys.readouterr().err
+    file.write_text(text)
+
+
+def test_names_of_strangers_stay_words(runs: Path, tmp_path: Path) -> None:
+    key = made(runs, tmp_path / "page", "--pairs", "12", "--people", "1")
+    careless = ballot(key, 1, lambda showing: "left", name="<img src=x onerror=alert(1)>")
+    assert run(["vote", "judge", "exp", saved(tmp_path, careless)]) == 0
+    page = build_report(load_experiment(runs, "exp"))
+    assert "&lt;img src=x" in page
+    assert "<img src=x" not in page
+
+
+def test_the_report_shows_where_people_and_lpips_disagree(runs: Path, tmp_path: Path) -> None:
+    key = made(runs, tmp_path / "page", "--pairs", "12", "--people", "1")
+    assert run(["vote", "judge", "exp", saved(tmp_path, ballot(key, 1, prefers(VOLUMETRIC)))]) == 0
+    page = build_report(load_experiment(runs, "exp"))
+    part = page.partition(f"Round {key.round}")[2].partition("</section>")[0].partition("Round ")[0]
+    # LPIPS is worse by 0.1 for the arm that this person prefers, on every view.
+    assert re.search(r"LPIPS VGG raw ↓</th><td>undecided</td><td>\+0.1\d+</td><td>0 of 12 views", part)
+    assert part.count("people prefer sfm-volumetric (mean vote +1.00), LPIPS VGG raw prefers sfm-adc") == 3
+    assert part.count("<img") == 12
+
+
+# ---- the verdict
+
+
+@pytest.mark.parametrize("agree", range(10))
+def test_people_are_the_units_of_an_exact_test(agree: int) -> None:
+    key = made_up(["sfm-a", "sfm-b"], scenes=2, views=5)
+    ballots = [ballot(key, n, prefers("sfm-b" if n < agree else "sfm-a")) for n in range(9)]
+    (pair,) = judge_round(key, ballots).pairs
+    assert pair.people is not None
+    p = binomtest(agree, 9).pvalue
+    assert pair.people.p == pytest.approx(p)
+    word = "undecided" if p > 0.05 else "supported" if agree > 4 else "refuted"
+    assert pair.people.outcome == word
+    assert (pair.wins, pair.losses, pair.ties) == (10 * agree, 90 - 10 * agree, 0)
+    assert pair.scenes is None
+
+
+def test_scenes_are_the_units_of_the_other_statement() -> None:
+    key = made_up(["sfm-a", "sfm-b"], scenes=7, views=3)
+
+    def choose(showing: Showing) -> str:
+        return prefers("sfm-b" if showing.scene < "6" else "sfm-a")(showing)
+
+    (pair,) = judge_round(key, [ballot(key, 1, choose)]).pairs
+    assert pair.scenes is not None
+    assert pair.people is None
+    assert (pair.scenes.helped, pair.scenes.scenes) == (6, 7)
+    assert pair.scenes.p == pytest.approx(binomtest(6, 7).pvalue)
+
+
+def test_traps_latecomers_and_early_looks() -> None:
+    key = made_up(["sfm-a", "sfm-b"], scenes=2, views=5, people=6)
+    good = [ballot(key, n, prefers("sfm-b"), minute=10 + n) for n in range(5)]
+    blind = ballot(key, 8, lambda showing: "same", minute=1, name="Ann")
+    early = judge_round(key, [*good, blind])
+    assert not early.final
+    assert early.left_out == {blind.label: "failed 4 of 4 traps, and 0 may fail"}
+    late = [ballot(key, 20 + n, prefers("sfm-a"), minute=30 + n) for n in range(5)]
+    full = judge_round(key, [*late, *good, blind])
+    assert full.final
+    assert [one.person for one in full.counted] == [one.person for one in (*good, late[0])]
+    assert all("came after the 6 people" in full.left_out[one.label] for one in late[1:])
+    assert full.consistent == 1.0
+    allowed = replace(key, traps_allowed=4)
+    assert blind.label not in judge_round(allowed, [replace(blind, round=allowed.round)]).left_out
+
+
+def test_who_answers_by_side_is_inconsistent() -> None:
+    key = made_up(["sfm-a", "sfm-b"], scenes=2, views=5, traps=0)
+    verdict = judge_round(key, [ballot(key, 1, lambda showing: "left")])
+    assert (verdict.consistent, verdict.left) == (0.0, 1.0)
+    assert judge_round(key, []).pairs == ()
+
+
+def test_more_arms_share_the_error_rate() -> None:
+    key = made_up(["sfm-a", "sfm-b", "sfm-c"], scenes=2, views=2)
+    order = ["sfm-a", "sfm-c", "sfm-b", "photograph"]
+
+    def choose(showing: Showing) -> str:
+        return max(
+            SHARP, key=lambda side: order.index(getattr(showing, side)) if showing.kind != "trap" else side == "left"
+        )
+
+    verdict = judge_round(key, [ballot(key, n, choose) for n in range(9)])
+    assert [str(pair.arm) for pair in verdict.pairs] == ["sfm-b", "sfm-c"]
+    assert all(pair.people is not None and pair.people.level == pytest.approx(0.025) for pair in verdict.pairs)
+    assert [str(arm) for arm, _, _ in verdict.ranking] == ["sfm-b", "sfm-c", "sfm-a"]
+    assert all(interval.low <= chance <= interval.high for _, chance, interval in verdict.ranking)
+
+
+def test_the_ranking_is_the_maximum_of_its_likelihood() -> None:
+    rng = np.random.default_rng(3)
+    wins = rng.integers(0, 20, (4, 5, 5)).astype(float)
+    for counts, chances in zip(wins, bradley_terry(wins), strict=True):
+        games = (counts + 0.5) * (1 - np.eye(5))
+
+        def loss(theta: np.ndarray, games: np.ndarray = games) -> float:
+            return float((games * np.logaddexp(0, theta[None] - theta[:, None])).sum())
+
+        theta = minimize(loss, np.zeros(5), tol=1e-12).x
+        np.testing.assert_allclose(chances, 1 / (1 + np.exp(theta.mean() - theta)), atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["everybody guesses", "people differ", "scenes differ", "people and scenes differ"])
+def test_without_an_effect_few_rounds_state_one(name: str) -> None:
+    untruths = script("vote_untruths")
+    people, scenes, both, votes = untruths.rates(untruths.KINDS[name], 0.0, 300)[1::2]
+    # The error rate is 5 %; of 300 rounds, 8.8 % lie three standard errors above it.
+    assert max(people, scenes, both) < 0.088
+    if name != "everybody guesses":
+        assert votes > 0.3  # of a test that takes all votes as independent
+
+
+def test_intervals_of_a_ranking_hold_the_truth() -> None:
+    assert script("vote_untruths").ranking_misses(9, 9, 30) < 0.1
+
+
+# ---- in a browser
+
+
+class Voter:
+    """A person at the page, who uses the keyboard alone."""
+
+    def __init__(self, browser: Browser, key: RoundKey, choose: Chooser) -> None:
+        self.browser, self.key, self.choose = browser, key, choose
+
+    def press(self, name: str, modifiers: int = 0) -> None:
+        for kind in ("keyDown", "keyUp"):
+            self.browser.call("Input.dispatchKeyEvent", type=kind, key=name, modifiers=modifiers)
+
+    def value(self, script: str) -> Any:
+        return self.browser.call("Runtime.evaluate", expression=script)["result"].get("value")
+
+    def wait(self, script: str) -> None:
+        self.browser.wait_for(lambda: self.value(script) or None, script)
+
+    def answer(self, first: int, last: int) -> None:
+        keys = {"left": "ArrowLeft", "right": "ArrowRight", "same": "ArrowDown"}
+        for number in range(first, last):
+            self.wait(f"ready && state.votes.length === {number}")
+            self.press(keys[self.choose(self.key.showings[number])])
+
+
+@pytest.mark.slow
+@pytest.mark.browser
+def test_two_people_vote_by_keyboard_and_are_judged(
+    runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    key = made(runs, tmp_path / "page", "--pairs", "12", "--people", "2")
+    address, files, last = (tmp_path / "page" / "index.html").as_uri(), [], len(key.showings)
+    for width, chooser in ((1200, prefers(VOLUMETRIC)), (400, prefers(ADC))):
+        with Browser(address, tmp_path / f"profile{width}", (width, 800)) as browser:
+            metrics = {"width": width, "height": 800, "deviceScaleFactor": 1, "mobile": False}
+            browser.call("Emulation.setDeviceMetricsOverride", **metrics)
+            browser.call("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(tmp_path / str(width)))
+            voter = Voter(browser, key, chooser)
+            voter.wait("!document.getElementById('start').hidden")
+            browser.call("Input.insertText", text=f"person {width}")
+            voter.press("Enter")
+            voter.answer(0, 7)
+            voter.wait("ready")
+            voter.value("window.before = true")
+            browser.call("Page.reload")
+            voter.wait("!window.before && state.votes.length === 7 && ready")
+            # All three pictures have the same part and zoom; a vote starts the next pair with whole pictures.
+            voter.press("+")
+            voter.press("ArrowRight", modifiers=8)
+            boxes = "[...document.querySelectorAll('.panel img')].map((i) => getComputedStyle(i).transform)"
+            assert voter.value(f"new Set({boxes}).size === 1 && !{boxes}[0].startsWith('matrix(1, 0, 0, 1, 0')")
+            voter.press("f")
+            assert voter.value("document.querySelectorAll('.side.under').length") == 1
+            voter.press("Backspace")
+            voter.answer(6, last)
+            voter.wait("!document.getElementById('end').hidden")
+            assert voter.value("document.documentElement.scrollWidth <= document.documentElement.clientWidth")
+            voter.press("Enter")
+            voter.wait("document.getElementById('saved').textContent !== ''")
+            saved_in = tmp_path / str(width)
+            browser.wait_for(lambda place=saved_in: list(place.glob("*.json")) or None, "the file")  # type: ignore[misc]
+            files += [str(file) for file in saved_in.glob("*.json")]
+    capsys.readouterr()
+    assert run(["vote", "judge", "exp", *files]) == 0
+    out = capsys.readouterr().out
+    assert "24 votes of 2 people; 24 were declared" in out
+    assert "50 % of 24 votes (12 for it, 12 against it, 0 without a difference" in out
+    assert "100 % of the pairs shown again" in out
+    stored = [json.loads(Path(file).read_text()) for file in files]
+    assert [one["name"] for one in stored] == ["person 1200", "person 400"]
+    page = build_report(load_experiment(runs, "exp"))
+    assert "24 votes of 2 people" in page

@@ -1,0 +1,125 @@
+"""Predictions of nerfbaselines, as its version 1.2.12 writes them: folder, .tar.gz, and published zip."""
+
+from __future__ import annotations
+
+import io
+import json
+import tarfile
+import zipfile
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from gsbench.cli import run
+from gsbench.errors import InputError
+from gsbench.renders.predictions import opened_renders
+
+VIEWS = ("DSC001", "sub/DSC002")
+SIZE = (24, 32)
+
+
+def png(values: np.ndarray) -> bytes:
+    stream = io.BytesIO()
+    Image.fromarray(values).save(stream, format="png")
+    return stream.getvalue()
+
+
+@pytest.fixture
+def members() -> dict[str, bytes]:
+    """The files of predictions by name: each render is 10 levels darker than its photograph."""
+    rng = np.random.default_rng(0)
+    files = {"info.json": b"{}"}
+    for view in VIEWS:
+        photograph = rng.integers(20, 255, (*SIZE, 3)).astype(np.uint8)
+        files |= {f"gt-color/{view}.png": png(photograph), f"color/{view}.png": png(photograph - 10)}
+        files |= {f"cameras/{view}.npz": b"x", f"depth-rgb/{view}.png": png(photograph)}
+    return files
+
+
+def as_folder(files: Mapping[str, bytes], place: Path) -> Path:
+    for name, content in files.items():
+        (place / name).parent.mkdir(parents=True, exist_ok=True)
+        (place / name).write_bytes(content)
+    return place
+
+
+def as_zip(files: Mapping[str, bytes], place: Path, home: str = "predictions/") -> Path:
+    with zipfile.ZipFile(place.with_suffix(".zip"), "w") as archive:
+        archive.writestr("results.json", "{}")
+        for name, content in files.items():
+            archive.writestr(f"{home}{name}", content)
+    return place.with_suffix(".zip")
+
+
+def as_tar(files: Mapping[str, bytes], place: Path) -> Path:
+    with tarfile.open(place.with_suffix(".tar.gz"), "w:gz") as archive:
+        for name, content in files.items():
+            info = tarfile.TarInfo(name)
+            info.size = len(content)
+            archive.addfile(info, io.BytesIO(content))
+    return place.with_suffix(".tar.gz")
+
+
+FORMS: dict[str, Callable[[Mapping[str, bytes], Path], Path]] = {
+    "folder": as_folder,
+    "tar": as_tar,
+    "zip": as_zip,
+    "zip without a folder": lambda files, place: as_zip(files, place, ""),
+}
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_predictions_are_measured_as_they_are(
+    form: str, members: dict[str, bytes], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    place = FORMS[form](members, tmp_path / "predictions")
+    assert run(["evaluate", str(place), "eval.lpips=[]", "eval.flip=false", "--json"]) == 0
+    measured = json.loads(capsys.readouterr().out)
+    assert set(measured["views"]) == {f"{view}.png" for view in VIEWS}
+    assert measured["metrics"]["psnr"] == pytest.approx(20 * np.log10(255 / 10))
+    photographs = as_folder({f"{view}.JPG.png": members[f"gt-color/{view}.png"] for view in VIEWS}, tmp_path / "photos")
+    for file in list(photographs.rglob("*.png")):
+        file.rename(file.with_suffix(""))
+    assert run(["evaluate", str(place), "--truth", str(photographs), "eval.lpips=[]", "eval.flip=false"]) == 0
+    assert "names matched" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("pack", [as_tar, as_zip])
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"color/../../evil.png": b"x"}, "leads out of the archive"),
+        ({"other/color/a.png": b"x", "other/gt-color/a.png": b"x"}, "and has 2"),
+    ],
+)
+def test_strange_archives_are_refused(
+    pack: Callable[..., Path], change: dict[str, bytes], message: str, members: dict[str, bytes], tmp_path: Path
+) -> None:
+    archive = pack(members | change, tmp_path / "predictions")
+    with pytest.raises(InputError, match=message), opened_renders(archive):
+        pass
+    assert not list(tmp_path.rglob("evil.png"))
+
+
+def test_what_is_no_archive_of_predictions_is_refused(
+    members: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "text.zip").write_text("no archive")
+    whole = as_tar(members, tmp_path / "whole").read_bytes()
+    (tmp_path / "part.tar.gz").write_bytes(whole[: len(whole) // 2])
+    renders = {name: content for name, content in members.items() if name.startswith("color/")}
+    half = as_zip(renders, tmp_path / "renders")
+    for place, message in (
+        (tmp_path / "text.zip", "cannot be unpacked"),
+        (tmp_path / "part.tar.gz", "cannot be unpacked"),
+        (half, "has none"),
+        (as_folder(renders, tmp_path / "plain"), "--truth PLACE is needed"),
+    ):
+        assert run(["evaluate", str(place)]) == 2
+        assert message in capsys.readouterr().err
+    monkeypatch.setattr("gsbench.renders.predictions.MAX_TOTAL_BYTES", 1000)
+    with pytest.raises(InputError, match="and 1 kB are the most"), opened_renders(as_zip(members, tmp_path / "big")):
+        pass
