@@ -203,7 +203,7 @@ def prove_apart(raster: str, device: str) -> RasterProof:
         return run_isolated(_prove_by_name, raster, device, what=f"the proof of raster={raster}")
     except torch.OutOfMemoryError as error:
         raise InputError(
-            f"device={device} has no memory left to compare raster={raster} with the reference: end other programs there"
+            f"device={device} has no memory left to prove raster={raster}: end other programs there"
         ) from error
     except CrashError as error:
         place = torch.device(device)
