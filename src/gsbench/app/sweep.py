@@ -41,7 +41,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Objective:
-    """What another sweeper learns of a job: the mean of a metric over the job's seeds.
+    """The value that another sweeper gets for a job: the mean of a metric over the job's seeds.
 
     ``sign`` says what the sweeper looks for: the largest value (1) or the least (-1). A metric whose better direction
     is the other one is negated. ``seeds`` are the words of the seeds, none for the job's own seed.

@@ -175,6 +175,7 @@ def need_no_check(trials: Sequence[Trial]) -> bool:
     for word in {word for trial in trials for word in trial.overrides}:
         key, _, value = word.lstrip("+~").partition("=")
         group = re.split("[./@]", key)[0]
-        if group == "hydra" or (group in (*COMPONENTS, "raster", "train") and value not in options(key)):
+        # Hydra's own settings change no component, unless they bring files from elsewhere.
+        if key == "hydra.searchpath" or (group in (*COMPONENTS, "raster", "train") and value not in options(key)):
             return False
     return True
