@@ -250,11 +250,10 @@ FAULTS = {
     "a sign": (COMPOSITE, "tl.fma(light, shine, -behind)", "tl.fma(light, shine, behind)"),
     "a missing term of the light behind": (COMPOSITE, "behind = tl.fma(weight, shine, behind)", "pass"),
     "no state at the border of a segment": (COMPOSITE, "light = tl.load(border + TRANSMITTANCE)", "pass"),
-    "a segment from the wrong entry": (COMPOSITE, "tl.cdiv(least - begin, SEGMENT)", "((least - begin) // SEGMENT)"),
+    "a short segment": (COMPOSITE, "tl.minimum(begin + SEGMENT, end)", "tl.minimum(begin + SEGMENT - 1, end)"),
     "swapped channels": (COMPOSITE, "tl.fma(weight, record[7], green)", "tl.fma(weight, record[8], green)"),
     "a footprint of one pixel too many": (
         COMPOSITE, "blended = (power >= LOG2_ALPHA_MIN) & (position < seen)", "blended = power >= LOG2_ALPHA_MIN"),
-    "stale rows": (PROJECTION, "written = first + k <= tl.load(", "written = -1 <= tl.load("),
     "a missing term of the position's gradient": (PROJECTION, "view_z = -(through_focal * inverse_z + ", "view_z = -("),
     "a sign of the quaternion's gradient": (PROJECTION, "qz * w_x - qx * w_z", "qz * w_x + qx * w_z"),
     "a missing term of the splitting matrix": (PROJECTION, "q11 - e * h", "q11"),
@@ -262,7 +261,7 @@ FAULTS = {
     "a swapped axis": (GEOMETRY, "offset[0] * v.r10 + offset[1] * v.r11", "offset[0] * v.r11 + offset[1] * v.r10"),
     "a weight of the loss": ("train/loss_triton.py", "(W0, W1, W2, W3, W4, W5)[k]", "(W0, W1, W2, W3, W5, W4)[k]"),
 }  # fmt: skip
-# Small, for the interpreter: two rows of blocks, lists of several segments, harmonics of all degrees, stopped pixels.
+# Small, for the interpreter: rows of blocks, lists of several segments, harmonics of all degrees.
 SCENE = "Case(18, 17, 40, sh_degree=3, log_scale=-1.0, logit=-1.0, spread=0.4)"
 PROVE = f"""
 import json, torch
