@@ -42,10 +42,21 @@ small = bool(os.environ.get("GSBENCH_SMALL"))
 if small:
     settings = ["scene.views=10", "scene.width=96", "scene.height=72"]
     settings += ["init=random", "init.count=2000", "init.size=1.2"]
-    settings += ["train.iterations=200", "train.position_steps=200", "train.densify_start=50", "train.densify_stop=180"]
+    settings += [
+        "train.iterations=200",
+        "train.position_steps=200",
+        "train.densify_start=50",
+        "train.densify_stop=180",
+    ]
     settings += ["train.densify_interval=25"]
 else:
-    settings = ["scene.views=24", "scene.width=240", "scene.height=180", "init=sfm", "train.iterations=1500"]
+    settings = [
+        "scene.views=24",
+        "scene.width=240",
+        "scene.height=180",
+        "init=sfm",
+        "train.iterations=1500",
+    ]
 settings += ["eval.lpips=[]", "tracking=none"]
 
 # %% [markdown]
@@ -85,10 +96,14 @@ for folder in folders.values():
     print("   ", ", ".join(sorted(path.name for path in folder.iterdir())))
 
 # %%
-results = {name: json.loads((folder / "results.json").read_text()) for name, folder in folders.items()}
+results = {
+    name: json.loads((folder / "results.json").read_text()) for name, folder in folders.items()
+}
 for name, result in results.items():
     metrics = ", ".join(f"{key} {value:.3f}" for key, value in result["metrics"].items())
-    print(f"{name:>10}: {metrics}; {result['num_init_points']:,} points became {result['num_gaussians']:,} Gaussians")
+    print(
+        f"{name:>10}: {metrics}; {result['num_init_points']:,} points became {result['num_gaussians']:,} Gaussians"
+    )
 
 # %% [markdown]
 # ## Renders beside the ground truth
@@ -99,7 +114,9 @@ for name, result in results.items():
 truths = sorted((folders["adc"] / "ground_truth").glob("*.png"))
 figure, axes = plt.subplots(len(truths), 3, figsize=(11, 2.8 * len(truths)), squeeze=False)
 for row, truth in zip(axes, truths, strict=True):
-    pictures = {"ground truth": truth} | {name: folder / "renders" / truth.name for name, folder in folders.items()}
+    pictures = {"ground truth": truth} | {
+        name: folder / "renders" / truth.name for name, folder in folders.items()
+    }
     for axis, (title, path) in zip(row, pictures.items(), strict=True):
         axis.imshow(Image.open(path))
         axis.set_title(f"{title} {truth.stem}")

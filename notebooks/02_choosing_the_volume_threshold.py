@@ -40,14 +40,27 @@ runs = Path(os.environ["GSBENCH_RUNS"])
 logging.disable(logging.INFO)  # only what went wrong
 
 # %% tags=["parameters"]
-small = bool(os.environ.get("GSBENCH_SMALL"))  # gsbench's own tests take a smaller scene and fewer iterations
+small = bool(
+    os.environ.get("GSBENCH_SMALL")
+)  # gsbench's own tests take a smaller scene and fewer iterations
 if small:
     settings = ["scene.views=10", "scene.width=96", "scene.height=72"]
     settings += ["init=random", "init.count=2000", "init.size=1.2"]
-    settings += ["train.iterations=200", "train.position_steps=200", "train.densify_start=50", "train.densify_stop=180"]
+    settings += [
+        "train.iterations=200",
+        "train.position_steps=200",
+        "train.densify_start=50",
+        "train.densify_stop=180",
+    ]
     settings += ["train.densify_interval=25", "train.volume_histogram=[50,100,190]"]
 else:
-    settings = ["scene.views=24", "scene.width=240", "scene.height=180", "init=sfm", "train.iterations=1000"]
+    settings = [
+        "scene.views=24",
+        "scene.width=240",
+        "scene.height=180",
+        "init=sfm",
+        "train.iterations=1000",
+    ]
     settings += ["train.volume_histogram=[300,600,950]"]
 settings += ["eval.lpips=[]", "eval.flip=false", "tracking=none"]
 
@@ -71,7 +84,9 @@ gauge = json.loads((baseline / "init_report.json").read_text())["gauge"]
 extent = gauge["scene_extent"]
 print(f"scene extent                           {extent:.3f} units")
 print(f"a sphere of volume 0.03 has the radius {gauge['threshold_radius']:.3f} units")
-print(f"which is                               {gauge['threshold_radius_over_extent']:.1%} of the extent")
+print(
+    f"which is                               {gauge['threshold_radius_over_extent']:.1%} of the extent"
+)
 print(f"V_th / extent³                         {gauge['threshold_over_extent_cubed']:.2e}")
 
 # %% [markdown]
@@ -94,7 +109,9 @@ log_volumes = log_volume(gaussians.log_scales)  # [N] natural logarithm
 volumes = log_volumes.exp().numpy()
 for q in (0.5, 0.9, 0.99, 0.9978, 0.999):
     print(f"{q:7.2%} of the volumes lie below {np.quantile(volumes, q):.2g}")
-print(f"{(volumes > 0.03).mean():7.2%} lie above 0.03, that is {(volumes > 0.03).sum()} of {len(volumes):,} Gaussians")
+print(
+    f"{(volumes > 0.03).mean():7.2%} lie above 0.03, that is {(volumes > 0.03).sum()} of {len(volumes):,} Gaussians"
+)
 
 # %% [markdown]
 # The paper reports that 99.78 % of the volumes of Mip-NeRF 360 lie below 0.03. So one way to choose is to use the same
@@ -112,7 +129,9 @@ print(f"{(volumes > 0.03).mean():7.2%} lie above 0.03, that is {(volumes > 0.03)
 # %%
 modes = {
     "absolute, 0.03": Volumetric(volume_threshold=0.03),
-    "extent_relative, 0.0002": Volumetric(volume_threshold=0.0002, threshold_mode="extent_relative"),
+    "extent_relative, 0.0002": Volumetric(
+        volume_threshold=0.0002, threshold_mode="extent_relative"
+    ),
     "quantile, 0.9978": Volumetric(threshold_mode="quantile"),
     "auto": Volumetric(threshold_mode="auto"),
 }
@@ -120,12 +139,16 @@ thresholds = {}
 for name, densifier in modes.items():
     densifier.begin(gaussians, DensifyContext(extent))
     thresholds[name] = np.exp(densifier.log_threshold(log_volumes))
-    print(f"{name:<24} V_th = {thresholds[name]:.3g}, above it {(volumes > thresholds[name]).mean():.2%}")
+    print(
+        f"{name:<24} V_th = {thresholds[name]:.3g}, above it {(volumes > thresholds[name]).mean():.2%}"
+    )
 
 # %%
 key = json.loads((baseline / "results.json").read_text())["hashes"]["init"]
 cloud = read_cloud(runs / "store" / "init" / key / "sparse" / "0")
-first = np.log10(np.exp(log_volume(gaussians_from_cloud(cloud.points, cloud.colors).log_scales).numpy()))
+first = np.log10(
+    np.exp(log_volume(gaussians_from_cloud(cloud.points, cloud.colors).log_scales).numpy())
+)
 plt.figure(figsize=(9, 4))
 bins = np.arange(-12, 2, 0.25)
 for values, label in ((first, "initial cloud"), (np.log10(volumes), "trained baseline")):
@@ -176,7 +199,9 @@ for name, words in arms.items():
 for name, folder in folders.items():
     result = json.loads((folder / "results.json").read_text())
     added, psnr = result["events"]["split_volume"], result["metrics"]["psnr"]
-    print(f"{name:<9} PSNR {psnr:6.2f} dB  {result['num_gaussians']:>7,} Gaussians  {added:>6,} added by volume")
+    print(
+        f"{name:<9} PSNR {psnr:6.2f} dB  {result['num_gaussians']:>7,} Gaussians  {added:>6,} added by volume"
+    )
 
 figure, (left, right) = plt.subplots(1, 2, figsize=(11, 3.4))
 for name, folder in folders.items():
@@ -184,7 +209,11 @@ for name, folder in folders.items():
     steps = [event["step"] for event in events]
     left.plot(steps, [event["after"] for event in events], label=name)
     if name != "adc":
-        used = [(event["step"], event["volume_threshold"]) for event in events if "volume_threshold" in event]
+        used = [
+            (event["step"], event["volume_threshold"])
+            for event in events
+            if "volume_threshold" in event
+        ]
         right.plot(*zip(*used, strict=True), color=f"C{list(folders).index(name)}", label=name)
 left.set(xlabel="iteration", ylabel="Gaussians")
 right.set(xlabel="iteration", ylabel="threshold in use", yscale="log")

@@ -40,15 +40,28 @@ runs = Path(os.environ["GSBENCH_RUNS"])
 logging.disable(logging.INFO)  # only what went wrong
 
 # %% tags=["parameters"]
-small = bool(os.environ.get("GSBENCH_SMALL"))  # gsbench's own tests take a smaller scene and fewer iterations
+small = bool(
+    os.environ.get("GSBENCH_SMALL")
+)  # gsbench's own tests take a smaller scene and fewer iterations
 if small:
     settings = ["scene.views=10", "scene.width=96", "scene.height=72"]
     settings += ["init=random", "init.count=2000", "init.size=1.2"]
-    settings += ["train.iterations=150", "train.position_steps=150", "train.densify_start=30", "train.densify_stop=140"]
+    settings += [
+        "train.iterations=150",
+        "train.position_steps=150",
+        "train.densify_start=30",
+        "train.densify_stop=140",
+    ]
     settings += ["train.densify_interval=20"]
     init = "random"
 else:
-    settings = ["scene.views=24", "scene.width=240", "scene.height=180", "init=sfm", "train.iterations=1000"]
+    settings = [
+        "scene.views=24",
+        "scene.width=240",
+        "scene.height=180",
+        "init=sfm",
+        "train.iterations=1000",
+    ]
     init = "sfm"
 settings += ["eval.lpips=[]", "eval.flip=false", "tracking=none"]
 
@@ -75,7 +88,18 @@ Markdown(to_markdown(build_table(experiment)))
 
 # %%
 frame = to_frame(experiment)
-frame[["densify", "seed", "psnr", "ssim", "num_gaussians", "seconds_train", "event_cloned", "event_split_volume"]]
+frame[
+    [
+        "densify",
+        "seed",
+        "psnr",
+        "ssim",
+        "num_gaussians",
+        "seconds_train",
+        "event_cloned",
+        "event_split_volume",
+    ]
+]
 
 # %%
 frame.groupby("densify")[["psnr", "num_gaussians"]].agg(["mean", "std", "min", "max"]).round(2)
@@ -89,7 +113,9 @@ frame.groupby("densify")[["psnr", "num_gaussians"]].agg(["mean", "std", "min", "
 
 # %%
 adc, volumetric = Arm(init, "adc"), Arm(init, "volumetric")
-question = Question(metric="psnr", sign=1, least=0.1, baseline=adc, arm=volumetric)  # 0.1 dB is what matters
+question = Question(
+    metric="psnr", sign=1, least=0.1, baseline=adc, arm=volumetric
+)  # 0.1 dB is what matters
 (verdict,) = judge(experiment.trials, declared_now(questions=(question,)))
 (differences,) = verdict.pairs.differences  # [seeds], one row a scene
 
@@ -125,7 +151,9 @@ print(f"verdict          {verdict.outcome}, on {', '.join(verdict.pairs.scenes)}
 
 # %%
 for difference in (0.05, 0.1, 0.2, 0.5):
-    print(f"{difference:4} dB: {seeds_needed(verdict.deviation, 1, difference) or 'more than 40'} seeds an arm")
+    print(
+        f"{difference:4} dB: {seeds_needed(verdict.deviation, 1, difference) or 'more than 40'} seeds an arm"
+    )
 
 # %% [markdown]
 # More seeds tell more about *this* scene only. For "scenes like these", gsbench needs at least six scenes; then the
@@ -140,9 +168,14 @@ for difference in (0.05, 0.1, 0.2, 0.5):
 views, _ = choose_views(pair_trials(experiment.trials, adc, volumetric))
 rows = []
 for view in (views[-1], views[0]):
-    pictures = [(view.first, "adc"), (view.second, "volumetric"), (view.difference, "where they differ")]
+    pictures = [
+        (view.first, "adc"),
+        (view.second, "volumetric"),
+        (view.difference, "where they differ"),
+    ]
     cells = "".join(
-        f'<td><img src="{uri}" width="200"><br>{name or "where they differ"}</td>' for uri, name in pictures
+        f'<td><img src="{uri}" width="200"><br>{name or "where they differ"}</td>'
+        for uri, name in pictures
     )
     rows.append(f"<tr>{cells}</tr><tr><td colspan=3>{view.which}: {view.view}</td></tr>")
 HTML(f"<table>{''.join(rows)}</table>")

@@ -33,14 +33,27 @@ os.environ["GSBENCH_RUNS"] = "runs"
 logging.disable(logging.INFO)  # only what went wrong
 
 # %% tags=["parameters"]
-small = bool(os.environ.get("GSBENCH_SMALL"))  # gsbench's own tests take a smaller scene and fewer iterations
+small = bool(
+    os.environ.get("GSBENCH_SMALL")
+)  # gsbench's own tests take a smaller scene and fewer iterations
 if small:
     settings = ["scene.views=10", "scene.width=96", "scene.height=72"]
     settings += ["init=random", "init.count=2000", "init.size=1.2"]
-    settings += ["train.iterations=200", "train.position_steps=200", "train.densify_start=50", "train.densify_stop=180"]
+    settings += [
+        "train.iterations=200",
+        "train.position_steps=200",
+        "train.densify_start=50",
+        "train.densify_stop=180",
+    ]
     settings += ["train.densify_interval=25"]
 else:
-    settings = ["scene.views=24", "scene.width=240", "scene.height=180", "init=sfm", "train.iterations=1500"]
+    settings = [
+        "scene.views=24",
+        "scene.width=240",
+        "scene.height=180",
+        "init=sfm",
+        "train.iterations=1500",
+    ]
 settings += ["eval.lpips=[]", "eval.flip=false", "tracking=none"]
 
 # %% [markdown]
@@ -81,7 +94,12 @@ class Tightening(ADC):
 # terminal.
 
 # %%
-own = ["densify=adc", "densify._target_=tightening.Tightening", "densify.name=tightening", "+densify.final_factor=3"]
+own = [
+    "densify=adc",
+    "densify._target_=tightening.Tightening",
+    "densify.name=tightening",
+    "+densify.final_factor=3",
+]
 common = ["scene=courtyard", "seed=0", "name=own", "allow_targets=[tightening]", *settings]
 run(["densify=adc", *common])
 run([*own, *common])
@@ -99,11 +117,17 @@ run([*own[:-1], "+densify.final_factor=0.5", *common, "name=wrong"])
 # before + cloned + split − pruned`.
 
 # %%
-folders = {path.parent.parent.name.split("-")[1]: path.parent for path in Path("runs/own").glob("*/*/*/results.json")}
+folders = {
+    path.parent.parent.name.split("-")[1]: path.parent
+    for path in Path("runs/own").glob("*/*/*/results.json")
+}
 events = {}
 for name, folder in sorted(folders.items()):
     events[name] = [json.loads(line) for line in (folder / "events.jsonl").read_text().splitlines()]
-    total = {key: sum(event[key] for event in events[name]) for key in ("cloned", "split_gradient", "pruned_opacity")}
+    total = {
+        key: sum(event[key] for event in events[name])
+        for key in ("cloned", "split_gradient", "pruned_opacity")
+    }
     print(f"{name:>10}: {total}")
 
 # %%
@@ -111,7 +135,9 @@ figure, (left, right) = plt.subplots(1, 2, figsize=(11, 3.4))
 for name in events:
     steps = [event["step"] for event in events[name]]
     left.plot(steps, [event["after"] for event in events[name]], label=name)
-    right.plot(steps, [event["cloned"] + event["split_gradient"] for event in events[name]], label=name)
+    right.plot(
+        steps, [event["cloned"] + event["split_gradient"] for event in events[name]], label=name
+    )
 left.set(xlabel="iteration", ylabel="Gaussians")
 right.set(xlabel="iteration", ylabel="added in one refinement")
 left.legend()

@@ -1,9 +1,9 @@
 """Write the pages of the site to build/pages/, from which Zensical builds it (``make docs``).
 
-The pages are docs/, the `PAGES` of the root, the findings, and pages generated from the code (`reference.py`). In the
-repository a page may link to any file. On the site, a link to a file that is no page leads to the repository if its
-address is known (``$GSBENCH_REPOSITORY``); otherwise only the file's name stays. A broken link is left as it is, so
-that Zensical refuses it.
+The pages are docs/, the `PAGES` of the root, the findings, and pages generated from the code
+(`reference.py`). In the repository a page may link to any file. On the site, a link to a file that
+is no page leads to the repository if its address is known (``$GSBENCH_REPOSITORY``); otherwise only
+the file's name stays. A broken link is left as it is, so that Zensical refuses it.
 """
 
 from __future__ import annotations
@@ -25,11 +25,13 @@ PAGES = {
 }  # file of the repository: page of the site
 LINK = re.compile(r"(?<!!)\[(?P<text>[^\]]*)\]\((?P<target>[^)#\s]+)(?P<anchor>#[^)]*)?\)")
 FENCE = re.compile(r"(^```.*?^```$)", re.DOTALL | re.MULTILINE)
-GENERATED = {"settings.md": "settings", "results.md": "results"}  # page: the part that `reference.py` adds to its end
+# page: the part that `reference.py` adds to its end
+GENERATED = {"settings.md": "settings", "results.md": "results"}
 
 
 def with_site_links(markdown: str, folder: Path, repository: str | None) -> str:
-    """The text of a page in ``folder`` with links that work on the site. Blocks of code stay unchanged."""
+    """The text of a page in ``folder`` with links that work on the site. Blocks of code stay
+    unchanged."""
 
     def replace(match: re.Match[str]) -> str:
         text, target, anchor = match["text"], match["target"], match["anchor"] or ""
@@ -40,9 +42,11 @@ def with_site_links(markdown: str, folder: Path, repository: str | None) -> str:
         page = page_of(name)
         if page is not None:
             own_page = page_of(folder.relative_to(ROOT).as_posix() + "/x.md") or ""
-            return f"[{text}]({os.path.relpath(page, Path(own_page).parent).replace(os.sep, '/')}{anchor})"
+            relative = os.path.relpath(page, Path(own_page).parent).replace(os.sep, "/")
+            return f"[{text}]({relative}{anchor})"
         if repository:
-            return f"[{text}]({repository.rstrip('/')}/{'tree' if path.is_dir() else 'blob'}/main/{name}{anchor})"
+            kind = "tree" if path.is_dir() else "blob"
+            return f"[{text}]({repository.rstrip('/')}/{kind}/main/{name}{anchor})"
         return text if name in text else f"{text} (`{name}`)"
 
     parts = FENCE.split(markdown)
@@ -67,10 +71,16 @@ def write_pages(target: Path, repository: str | None) -> None:
     for folder in (DOCS, ROOT / "findings"):
         for path in sorted(folder.rglob("*")) if folder.is_dir() else ():
             if path.suffix in {".jpg", ".png", ".svg", ".txt", ".css"}:
-                place = target / str(page_of(path.relative_to(ROOT).as_posix()) or path.relative_to(ROOT))
+                place = target / str(
+                    page_of(path.relative_to(ROOT).as_posix()) or path.relative_to(ROOT)
+                )
                 place.parent.mkdir(parents=True, exist_ok=True)
                 shutil.copyfile(path, place)
-    sources = [*DOCS.rglob("*.md"), *(ROOT / "findings").glob("*.md"), *(ROOT / name for name in PAGES)]
+    sources = [
+        *DOCS.rglob("*.md"),
+        *(ROOT / "findings").glob("*.md"),
+        *(ROOT / name for name in PAGES),
+    ]
     for path in sources:
         if not path.is_file():
             continue
@@ -86,4 +96,7 @@ def write_pages(target: Path, repository: str | None) -> None:
 
 
 if __name__ == "__main__":
-    write_pages(Path(sys.argv[1]) if sys.argv[1:] else ROOT / "build" / "pages", os.environ.get("GSBENCH_REPOSITORY"))
+    write_pages(
+        Path(sys.argv[1]) if sys.argv[1:] else ROOT / "build" / "pages",
+        os.environ.get("GSBENCH_REPOSITORY"),
+    )

@@ -1,12 +1,14 @@
-"""docs/fidelity.md: each arm with its source, the parts compared with a restatement, and the largest difference.
+"""docs/fidelity.md: each arm with its source, the parts compared with a restatement, and the
+largest difference.
 
     python scripts/fidelity.py            say whether the page agrees with what the tests measure
     python scripts/fidelity.py --write    write it
 
-A restatement is a second implementation of a source's rules in tests/densify: one Gaussian at a time in numpy, from the
-facts of the source, with no code shared with gsbench or the source. Differences are relative to the larger of 1 and the
-value, over all raw parameters and both Adam moments of every Gaussian after a refinement, in float64. The page states
-the next power of ten. Only the first and the last case of a test are measured; the test itself runs all.
+A restatement is a second implementation of a source's rules in tests/densify: one Gaussian at a
+time in numpy, from the facts of the source, with no code shared with gsbench or the source.
+Differences are relative to the larger of 1 and the value, over all raw parameters and both Adam
+moments of every Gaussian after a refinement, in float64. The page states the next power of ten.
+Only the first and the last case of a test are measured; the test itself runs all.
 """
 
 from __future__ import annotations
@@ -55,7 +57,8 @@ one pixel off the mean. In gsbench small pictures have 8 bits.
 
 @dataclass(frozen=True)
 class Arm:
-    """A row of the page: an arm's source, the compared parts, the tests that compare them, and deviations."""
+    """A row of the page: an arm's source, the compared parts, the tests that compare them, and
+    deviations."""
 
     source: str
     compared: str
@@ -84,14 +87,24 @@ def calls_of(function: Any) -> Iterator[dict[str, Any]]:
     for mark in getattr(function, "pytestmark", []):
         if mark.name == "parametrize":
             names, values = mark.args
-            names = [name.strip() for name in names.split(",")] if isinstance(names, str) else list(names)
-            tables.append([dict(zip(names, value if len(names) > 1 else [value], strict=True)) for value in values])
+            names = (
+                [name.strip() for name in names.split(",")]
+                if isinstance(names, str)
+                else list(names)
+            )
+            tables.append(
+                [
+                    dict(zip(names, value if len(names) > 1 else [value], strict=True))
+                    for value in values
+                ]
+            )
     for parts in itertools.product(*tables):
         yield {name: value for part in parts for name, value in part.items()}
 
 
 def measured(arm: str) -> float:
-    """The largest difference that the tests of an arm measure. Raises AssertionError if one fails."""
+    """The largest difference that the tests of an arm measure. Raises AssertionError if one
+    fails."""
     sys.path.insert(0, str(ROOT))
     try:
         restatement = importlib.import_module("tests.densify.restatement")
@@ -113,12 +126,19 @@ def measured(arm: str) -> float:
 
 def bound(difference: float) -> str:
     """The next power of ten as text; 0 for no difference."""
-    return "0" if difference == 0 else f"1e{math.ceil(math.log10(difference)):+03d}".replace("e-0", "e-")
+    return (
+        "0"
+        if difference == 0
+        else f"1e{math.ceil(math.log10(difference)):+03d}".replace("e-0", "e-")
+    )
 
 
 def page(bounds: dict[str, str]) -> str:
     """The text of the page; ``bounds`` is the largest difference of each arm as text."""
-    rows = (f"| `{k}` | {a.source} | {a.compared} | {bounds[k]} | {a.otherwise} |" for k, a in ARMS.items())
+    rows = (
+        f"| `{k}` | {a.source} | {a.compared} | {bounds[k]} | {a.otherwise} |"
+        for k, a in ARMS.items()
+    )
     return HEAD + "\n".join(rows) + "\n" + TAIL
 
 

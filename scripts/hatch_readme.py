@@ -1,4 +1,5 @@
-"""Build hook: gives the README on the package index absolute links, from the address in ``[project.urls]``.
+"""Build hook: gives the README on the package index absolute links, from the address in
+``[project.urls]``.
 
 In the repository its links stay relative, so that they work in every clone and on every forge.
 """
@@ -16,7 +17,8 @@ FENCE = re.compile(r"(^```.*?^```$)", re.DOTALL | re.MULTILINE)
 
 
 def absolute_links(markdown: str, repository: str) -> str:
-    """The text with absolute links into the repository. Links within the page and blocks of code stay unchanged."""
+    """The text with absolute links into the repository. Links within the page and blocks of code
+    stay unchanged."""
 
     def replace(match: re.Match[str]) -> str:
         target = match["target"]
@@ -36,4 +38,7 @@ class ReadmeHook(MetadataHookInterface):
     def update(self, metadata: dict[str, Any]) -> None:
         text = (Path(self.root) / "README.md").read_text(encoding="utf-8")
         repository = metadata["urls"]["Repository"]
-        metadata["readme"] = {"content-type": "text/markdown", "text": absolute_links(text, repository)}
+        metadata["readme"] = {
+            "content-type": "text/markdown",
+            "text": absolute_links(text, repository),
+        }

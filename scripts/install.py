@@ -1,10 +1,11 @@
-"""Install into the environment of this Python: by uv, which is ten times as quick as pip, otherwise by pip.
+"""Install into the environment of this Python: by uv, which is ten times as quick as pip, otherwise
+by pip.
 
     python scripts/install.py -e . --group dev
 
-The arguments are those of ``pip install``. uv reads none of pip's settings, so those that say where packages lie are
-passed to it. If uv cannot be installed, or fails, pip installs. Neither compiles modules to byte code: Python does that
-for the modules that are used.
+The arguments are those of ``pip install``. uv reads none of pip's settings, so those that say where
+packages lie are passed to it. If uv cannot be installed, or fails, pip installs. Neither compiles
+modules to byte code: Python does that for the modules that are used.
 """
 
 from __future__ import annotations
@@ -27,14 +28,25 @@ PASSED_SETTINGS = {
 
 
 def main(words: list[str]) -> int:
-    """Install the packages that ``words`` name; returns the exit code of the last program that tried."""
+    """Install the packages that ``words`` name; returns the exit code of the last program that
+    tried."""
     what = " ".join(words)
     uv = find_uv()
     if uv is not None:
         print(f"installing {what} by uv", flush=True)
-        # unsafe-best-match: like pip, the best version of all indexes, not only of the first that has the package.
+        # unsafe-best-match: like pip, the best version of all indexes, not only of the first that
+        # has the package.
         environment = {"UV_INDEX_STRATEGY": "unsafe-best-match"} | uv_settings() | dict(os.environ)
-        command = [uv, "pip", "install", "--quiet", "--python", sys.executable, *CONSTRAINTS, *words]
+        command = [
+            uv,
+            "pip",
+            "install",
+            "--quiet",
+            "--python",
+            sys.executable,
+            *CONSTRAINTS,
+            *words,
+        ]
         if subprocess.run(command, env=environment, check=False).returncode == 0:
             return 0
     print(f"installing {what} by pip, some minutes", flush=True)
@@ -44,17 +56,23 @@ def main(words: list[str]) -> int:
 
 
 def find_uv() -> str | None:
-    """The program uv: on the PATH, or in this environment, where pip installs it if needed; None if that fails."""
+    """The program uv: on the PATH, or in this environment, where pip installs it if needed; None if
+    that fails."""
     own = Path(sys.executable).with_name("uv")
     if found := shutil.which("uv") or shutil.which(own):
         return found
-    subprocess.run([*PIP, "install", "--quiet", *CONSTRAINTS, "uv"], stderr=subprocess.DEVNULL, check=False)
+    subprocess.run(
+        [*PIP, "install", "--quiet", *CONSTRAINTS, "uv"], stderr=subprocess.DEVNULL, check=False
+    )
     return shutil.which(own)
 
 
 def uv_settings() -> dict[str, str]:
-    """The variables for uv with the values of pip's settings. If pip lists a setting twice, the later counts."""
-    listing = subprocess.run([*PIP, "config", "list"], capture_output=True, text=True, check=False).stdout
+    """The variables for uv with the values of pip's settings. If pip lists a setting twice, the
+    later counts."""
+    listing = subprocess.run(
+        [*PIP, "config", "list"], capture_output=True, text=True, check=False
+    ).stdout
     variables = {}
     for line in listing.splitlines():
         key, _, value = line.partition("=")

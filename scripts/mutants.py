@@ -1,22 +1,23 @@
-"""Mutation testing: plant small faults one at a time in a copy, and see whether the quick tests notice them.
+"""Mutation testing: plant small faults one at a time in a copy, and see whether the quick tests
+notice them.
 
-    python scripts/mutants.py                               # 160 faults over all rooms below, two at a time
+    python scripts/mutants.py # 160 faults over all rooms below, two at a time
     python scripts/mutants.py --rooms densify eval --count 40 --seed 3
 
 A fault is one of these:
 
 - comparison: becomes its opposite, ``<`` becomes ``>=`` and ``==`` becomes ``!=``;
-- border: a comparison with a whole number includes its border or excludes it, ``> 0`` becomes ``>= 0``. Other
-  comparisons are not changed so: between continuous values that has no visible effect;
+- border: a comparison with a whole number includes its border or excludes it, ``> 0`` becomes ``>=
+  0``. Other comparisons are not changed so: between continuous values that has no visible effect;
 - sign: ``+`` becomes ``-``, ``*`` becomes ``/``, ``and`` becomes ``or``, and the other way round;
 - off by one: a whole number becomes one larger;
 - dropped: a statement is removed;
 - swapped: the first two arguments of a call change places.
 
-Texts, messages and annotations get no faults. A fault is caught if a test of ``make test`` fails or hangs. A table and
-the survivors are printed as Markdown. A survivor either shows a gap in the tests or changes nothing. The tests that run
-for a fault are those of its room, then others that import its module. Triton's kernels are left out: their tests belong
-to ``make test-all``.
+Texts, messages and annotations get no faults. A fault is caught if a test of ``make test`` fails or
+hangs. A table and the survivors are printed as Markdown. A survivor either shows a gap in the tests
+or changes nothing. The tests that run for a fault are those of its room, then others that import
+its module. Triton's kernels are left out: their tests belong to ``make test-all``.
 """
 
 from __future__ import annotations
@@ -40,7 +41,19 @@ from queue import Queue
 
 ROOT = Path(__file__).parents[1]
 SOURCE = "src/gsbench"
-ROOMS = ["analysis", "claims", "densify", "eval", "gaussians", "init", "pipeline", "raster", "runs", "scene", "train"]
+ROOMS = [
+    "analysis",
+    "claims",
+    "densify",
+    "eval",
+    "gaussians",
+    "init",
+    "pipeline",
+    "raster",
+    "runs",
+    "scene",
+    "train",
+]
 YAML = ["tests/config/test_yaml_defaults.py"]  # the defaults of classes
 FURTHER_TESTS = {
     "claims": ["tests/app/test_sweeps.py"],
@@ -57,11 +70,25 @@ SPEED_ONLY = {"prefetch"}  # calls that change no result
 SECONDS = 1800  # time limit for the tests of one fault
 Replacements = dict[type[ast.AST], type[ast.AST]]
 OPPOSITE: Replacements = {
-    **{ast.Lt: ast.GtE, ast.GtE: ast.Lt, ast.Gt: ast.LtE, ast.LtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq},
+    **{
+        ast.Lt: ast.GtE,
+        ast.GtE: ast.Lt,
+        ast.Gt: ast.LtE,
+        ast.LtE: ast.Gt,
+        ast.Eq: ast.NotEq,
+        ast.NotEq: ast.Eq,
+    },
 }
 BORDER: Replacements = {ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt}
 OTHER_SIGN: Replacements = {
-    **{ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult, ast.And: ast.Or, ast.Or: ast.And},
+    **{
+        ast.Add: ast.Sub,
+        ast.Sub: ast.Add,
+        ast.Mult: ast.Div,
+        ast.Div: ast.Mult,
+        ast.And: ast.Or,
+        ast.Or: ast.And,
+    },
 }
 
 
@@ -105,30 +132,46 @@ def changed_nodes(node: ast.AST) -> Iterator[tuple[str, ast.AST]]:
                 changed.ops[0] = replacements[first]()  # type: ignore[call-overload]
                 yield kind, changed
     elif isinstance(new, ast.BinOp | ast.BoolOp) and type(new.op) in OTHER_SIGN:
-        if isinstance(new, ast.BinOp) and any(isinstance(side, ast.JoinedStr) for side in (new.left, new.right)):
+        if isinstance(new, ast.BinOp) and any(
+            isinstance(side, ast.JoinedStr) for side in (new.left, new.right)
+        ):
             return
         new.op = OTHER_SIGN[type(new.op)]()  # type: ignore[assignment]
         yield "sign", new
     elif is_whole_number(new):
         new.value += 1  # type: ignore[attr-defined]
         yield "off by one", new
-    elif isinstance(new, ast.AugAssign) or (isinstance(new, ast.Expr) and isinstance(new.value, ast.Call)):
+    elif isinstance(new, ast.AugAssign) or (
+        isinstance(new, ast.Expr) and isinstance(new.value, ast.Call)
+    ):
         yield "dropped", ast.Pass()
-    elif isinstance(new, ast.Call) and len(new.args) > 1 and all(isinstance(arg, ast.Name) for arg in new.args[:2]):
-        if ast.unparse(new.func).rpartition(".")[2] in SYMMETRIC or new.args[0].id == new.args[1].id:
+    elif (
+        isinstance(new, ast.Call)
+        and len(new.args) > 1
+        and all(isinstance(arg, ast.Name) for arg in new.args[:2])
+    ):
+        if (
+            ast.unparse(new.func).rpartition(".")[2] in SYMMETRIC
+            or new.args[0].id == new.args[1].id
+        ):
             return
         new.args[:2] = new.args[1::-1]
         yield "swapped", new
 
 
 def is_silent(node: ast.AST) -> bool:
-    """Return whether a node is a message, a text or a hint to the processor, below which no faults are planted."""
+    """Return whether a node is a message, a text or a hint to the processor, below which no faults
+    are planted."""
     if isinstance(node, ast.Raise | ast.JoinedStr | ast.Assert):
         return True
     called = node.func if isinstance(node, ast.Call) else None
     if isinstance(called, ast.Name) and called.id in SPEED_ONLY:
         return True
-    return isinstance(called, ast.Attribute) and isinstance(called.value, ast.Name) and called.value.id == "log"
+    return (
+        isinstance(called, ast.Attribute)
+        and isinstance(called.value, ast.Name)
+        and called.value.id == "log"
+    )
 
 
 def visited(node: ast.AST) -> Iterator[ast.AST]:
@@ -151,11 +194,16 @@ def faults_of(path: Path) -> list[Fault]:
     for line in text.encode().splitlines(keepends=True):  # columns of the syntax tree count bytes
         lines.append(lines[-1] + len(line))
     faults = []
-    changes = ((node, *change) for node in visited(ast.parse(text)) for change in changed_nodes(node))
+    changes = (
+        (node, *change) for node in visited(ast.parse(text)) for change in changed_nodes(node)
+    )
     for node, kind, changed in changes:
         start, end = (
             lines[row - 1] + column
-            for row, column in ((node.lineno, node.col_offset), (node.end_lineno, node.end_col_offset))
+            for row, column in (
+                (node.lineno, node.col_offset),
+                (node.end_lineno, node.end_col_offset),
+            )
         )  # type: ignore[attr-defined]
         before, after = text.encode()[start:end].decode(), ast.unparse(changed)
         if isinstance(changed, ast.BinOp | ast.BoolOp | ast.Compare):
@@ -166,7 +214,8 @@ def faults_of(path: Path) -> list[Fault]:
 
 
 def choose_faults(rooms: list[str], count: int, seed: int) -> list[Fault]:
-    """Choose about ``count`` faults, by the square root of the rooms' sizes; all kinds are equally likely."""
+    """Choose about ``count`` faults, by the square root of the rooms' sizes; all kinds are equally
+    likely."""
     rng = random.Random(seed)
     by_room = {
         room: [
@@ -180,7 +229,9 @@ def choose_faults(rooms: list[str], count: int, seed: int) -> list[Fault]:
     weights = {room: len(faults) ** 0.5 for room, faults in by_room.items()}
     picked = []
     for room, faults in by_room.items():
-        by_kind = {kind: [f for f in faults if f.kind == kind] for kind in sorted({f.kind for f in faults})}
+        by_kind = {
+            kind: [f for f in faults if f.kind == kind] for kind in sorted({f.kind for f in faults})
+        }
         for _ in range(max(1, round(count * weights[room] / sum(weights.values())))):
             kind = rng.choice([kind for kind, left in by_kind.items() if left])
             picked.append(by_kind[kind].pop(rng.randrange(len(by_kind[kind]))))
@@ -188,7 +239,8 @@ def choose_faults(rooms: list[str], count: int, seed: int) -> list[Fault]:
 
 
 def copy_checkout(folder: Path) -> Path:
-    """Copy the checkout, tracked and new files, into ``folder``, and link development data beside it, if any."""
+    """Copy the checkout, tracked and new files, into ``folder``, and link development data beside
+    it, if any."""
     listing = subprocess.run(
         ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"],
         cwd=ROOT,
@@ -207,7 +259,8 @@ def copy_checkout(folder: Path) -> Path:
 
 
 def tests_of(fault: Fault, place: Path) -> list[str]:
-    """The test files for a fault: the module's own, then those of its room, then others that import the module."""
+    """The test files for a fault: the module's own, then those of its room, then others that import
+    the module."""
     module = Path(fault.file).relative_to("src").with_suffix("").as_posix().replace("/", ".")
     parent, _, name = module.rpartition(".")
     imports = re.compile(rf"{re.escape(module)}\b|from {re.escape(parent)} import .*\b{name}\b")
@@ -222,26 +275,48 @@ def tests_of(fault: Fault, place: Path) -> list[str]:
 
 
 def is_caught(fault: Fault | None, place: Path, room: str) -> bool:
-    """Plant the fault in the copy, run its tests, and remove it again. Without a fault, run the room's tests."""
+    """Plant the fault in the copy, run its tests, and remove it again. Without a fault, run the
+    room's tests."""
     tests = [f"tests/{room}"]
     original = b""
     if fault is not None:
         tests = tests_of(fault, place)
         original = (place / fault.file).read_bytes()
-        (place / fault.file).write_bytes(original[: fault.start] + fault.after.encode() + original[fault.end :])
+        (place / fault.file).write_bytes(
+            original[: fault.start] + fault.after.encode() + original[fault.end :]
+        )
     tests += FURTHER_TESTS.get(room, [])
-    words = [sys.executable, "-m", "pytest", "-q", "-x", "-m", "not slow", "-p", "no:cacheprovider", "-n", "0", *tests]
+    words = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-q",
+        "-x",
+        "-m",
+        "not slow",
+        "-p",
+        "no:cacheprovider",
+        "-n",
+        "0",
+        *tests,
+    ]
     # No byte code of faulty files is kept: Python takes files of one size and second for the same.
-    environment = os.environ | {"PYTHONPATH": str(place / "src"), "PYTHONDONTWRITEBYTECODE": "1" if fault else ""}
+    environment = os.environ | {
+        "PYTHONPATH": str(place / "src"),
+        "PYTHONDONTWRITEBYTECODE": "1" if fault else "",
+    }
     try:
-        done = subprocess.run(words, cwd=place, env=environment, capture_output=True, timeout=SECONDS, check=False)
+        done = subprocess.run(
+            words, cwd=place, env=environment, capture_output=True, timeout=SECONDS, check=False
+        )
         return done.returncode != 0
     except subprocess.TimeoutExpired:
         return True
     finally:
         if fault is not None:
             (place / fault.file).write_bytes(original)
-            shutil.copystat(ROOT / fault.file, place / fault.file)  # makes its kept byte code valid again
+            # makes its kept byte code valid again
+            shutil.copystat(ROOT / fault.file, place / fault.file)
 
 
 def main() -> int:
@@ -271,20 +346,29 @@ def main() -> int:
         broken = [
             room
             for room, fails in zip(
-                arguments.rooms, pool.map(caught, [None] * len(arguments.rooms), arguments.rooms), strict=True
+                arguments.rooms,
+                pool.map(caught, [None] * len(arguments.rooms), arguments.rooms),
+                strict=True,
             )
             if fails
         ]
         if broken:
             print(f"the tests of {', '.join(broken)} fail without a fault: mend them first")
             return 1
-        results = dict(zip(faults, pool.map(caught, faults, [fault.room for fault in faults]), strict=True))
-    planted, seen = Counter(fault.room for fault in results), Counter(fault.room for fault in results if results[fault])
+        results = dict(
+            zip(faults, pool.map(caught, faults, [fault.room for fault in faults]), strict=True)
+        )
+    planted, seen = (
+        Counter(fault.room for fault in results),
+        Counter(fault.room for fault in results if results[fault]),
+    )
     print("\n| room | planted | caught |\n|---|---|---|")
     for room in sorted(planted):
         print(f"| {room} | {planted[room]} | {seen[room]} |")
     print(f"| all | {planted.total()} | {seen.total()} ({seen.total() / planted.total():.0%}) |\n")
-    for fault in sorted((f for f, found in results.items() if not found), key=lambda f: (f.file, f.line)):
+    for fault in sorted(
+        (f for f, found in results.items() if not found), key=lambda f: (f.file, f.line)
+    ):
         print(f"- {describe(fault)}")
     return 0
 

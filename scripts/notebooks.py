@@ -1,7 +1,8 @@
 """Run the notebooks and keep their outputs in the .ipynb files: ``make notebooks``.
 
-A notebook's source is its .py file. A forge shows the .ipynb, so that file holds the outputs of the cells, with small
-pictures and without what differs between machines: paths, execution times and execution counts.
+A notebook's source is its .py file. A forge shows the .ipynb, so that file holds the outputs of the
+cells, with small pictures and without what differs between machines: paths, execution times and
+execution counts.
 """
 
 from __future__ import annotations
@@ -23,11 +24,13 @@ from PIL import Image
 NOTEBOOKS = Path(__file__).resolve().parents[1] / "notebooks"
 MAX_BYTES = 300_000  # of a notebook
 WIDTH = 640  # px, of a picture
-SCRATCH = re.compile(r"(/[\w.-]+)*/gsbench-\w+(?=/|\b)")  # the temporary folder that each notebook makes
+# the temporary folder that each notebook makes
+SCRATCH = re.compile(r"(/[\w.-]+)*/gsbench-\w+(?=/|\b)")
 
 
 def main(names: list[str]) -> int:
-    """Run the notebooks whose names begin with one of ``names``, or all; returns the number of too large ones."""
+    """Run the notebooks whose names begin with one of ``names``, or all; returns the number of too
+    large ones."""
     too_large = 0
     for source in sorted(NOTEBOOKS.glob("*.py")):
         if names and not source.name.startswith(tuple(names)):
@@ -45,7 +48,9 @@ def executed(notebook: Any) -> Any:
     with tempfile.TemporaryDirectory() as folder:
         os.environ["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
         resources = {"metadata": {"path": folder}}
-        nbclient.NotebookClient(notebook, timeout=1800, kernel_name="python3", resources=resources).execute()
+        nbclient.NotebookClient(
+            notebook, timeout=1800, kernel_name="python3", resources=resources
+        ).execute()
     notebook.metadata.pop("language_info", None)
     for number, cell in enumerate(notebook.cells):
         cell["id"] = f"cell-{number}"
@@ -61,7 +66,11 @@ def joined(outputs: list[Any]) -> list[Any]:
     """The outputs, with the pieces of each stream joined."""
     kept: list[Any] = []
     for output in outputs:
-        streams = [old for old in kept if output.output_type == "stream" == old.output_type and old.name == output.name]
+        streams = [
+            old
+            for old in kept
+            if output.output_type == "stream" == old.output_type and old.name == output.name
+        ]
         if streams:
             streams[0].text += output.text
         else:
@@ -88,7 +97,9 @@ def small(png: str) -> str:
     """A picture of at most `WIDTH` px and 128 colours, as base64."""
     picture = Image.open(io.BytesIO(base64.b64decode(png))).convert("RGB")
     if picture.width > WIDTH:
-        picture = picture.resize((WIDTH, round(picture.height * WIDTH / picture.width)), Image.Resampling.LANCZOS)
+        picture = picture.resize(
+            (WIDTH, round(picture.height * WIDTH / picture.width)), Image.Resampling.LANCZOS
+        )
     target = io.BytesIO()
     picture.quantize(128).save(target, "PNG", optimize=True)
     return base64.b64encode(target.getvalue()).decode()

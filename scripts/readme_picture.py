@@ -1,7 +1,7 @@
 """Draw the README's picture from the trials of ``gsbench +experiment=demo``: ``make picture``.
 
-A strip of one held-out view (photograph, initial cloud, baseline, idea, where the two differ) above the table of the
-experiment with its verdict.
+A strip of one held-out view (photograph, initial cloud, baseline, idea, where the two differ) above
+the table of the experiment with its verdict.
 """
 
 from __future__ import annotations
@@ -36,9 +36,14 @@ def pixels(path: Path) -> NDArray[np.float64]:
 
 
 def initial_cloud(model: Path, view: str, size: tuple[int, int]) -> NDArray[np.float64]:
-    """The points of a COLMAP model as the camera of ``view`` sees them, near points in front: [H, W, 3]."""
+    """The points of a COLMAP model as the camera of ``view`` sees them, near points in front: [H,
+    W, 3]."""
     reconstruction = pycolmap.Reconstruction(model)
-    (image,) = (entry for entry in reconstruction.images.values() if Path(entry.name).stem == Path(view).stem)
+    (image,) = (
+        entry
+        for entry in reconstruction.images.values()
+        if Path(entry.name).stem == Path(view).stem
+    )
     width, height = size
     points = np.array([point.xyz for point in reconstruction.points3D.values()])
     colors = np.array([point.color for point in reconstruction.points3D.values()]) / 255
@@ -60,7 +65,11 @@ def verdict() -> str:
     """The note with the verdict that ``gsbench tables demo`` prints; empty if there is none."""
     with contextlib.redirect_stdout(io.StringIO()) as printed:
         run(["tables", "demo"])
-    notes = [line.removeprefix("- ") for line in printed.getvalue().splitlines() if line.startswith("- Verdict")]
+    notes = [
+        line.removeprefix("- ")
+        for line in printed.getvalue().splitlines()
+        if line.startswith("- Verdict")
+    ]
     return notes[0] if notes else ""
 
 
@@ -69,7 +78,8 @@ def main(runs: Path) -> None:
     experiment = load_experiment(runs, "demo")
     frame = to_frame(experiment)
     arms = {
-        arm: min((t for t in experiment.trials if t.densify == arm), key=lambda t: t.seed) for arm in (BASELINE, IDEA)
+        arm: min((t for t in experiment.trials if t.densify == arm), key=lambda t: t.seed)
+        for arm in (BASELINE, IDEA)
     }
     views = sorted(path.name for path in (arms[IDEA].path / "renders").glob("*.png"))
     view = views[len(views) // 2]
@@ -78,18 +88,30 @@ def main(runs: Path) -> None:
     errors = {arm: np.abs(picture - truth).mean(-1) for arm, picture in renders.items()}
     gain = gaussian_filter(errors[BASELINE] - errors[IDEA], 2.0)
     key = arms[IDEA].record.hashes["init"]
-    cloud = initial_cloud(runs / "store" / "init" / key / "sparse" / "0", view, (truth.shape[1], truth.shape[0]))
+    cloud = initial_cloud(
+        runs / "store" / "init" / key / "sparse" / "0", view, (truth.shape[1], truth.shape[0])
+    )
 
     figure = plt.figure(figsize=(12.5, 3.3), dpi=110)
     grid = figure.add_gridspec(
         2, 5, height_ratios=(2.1, 1), left=0.005, right=0.995, top=0.92, bottom=0.02, wspace=0.02
     )
-    panels = {"photograph": truth, "initial cloud": cloud, f"baseline: {BASELINE}": renders[BASELINE]}
+    panels = {
+        "photograph": truth,
+        "initial cloud": cloud,
+        f"baseline: {BASELINE}": renders[BASELINE],
+    }
     panels |= {f"idea: {IDEA}": renders[IDEA], "blue: idea nearer; red: baseline": gain}
     for place, (title, picture) in enumerate(panels.items()):
         axis = figure.add_subplot(grid[0, place])
         bound = 0.06 if picture.ndim == 2 else None
-        axis.imshow(picture, cmap="RdBu", vmin=-bound if bound else None, vmax=bound, interpolation="lanczos")
+        axis.imshow(
+            picture,
+            cmap="RdBu",
+            vmin=-bound if bound else None,
+            vmax=bound,
+            interpolation="lanczos",
+        )
         axis.set_title(title, fontsize=11)
         axis.axis("off")
     below = figure.add_subplot(grid[1, :])
@@ -98,7 +120,10 @@ def main(runs: Path) -> None:
     cells = []
     for arm in (BASELINE, IDEA):
         rows = frame[frame["densify"] == arm]
-        values = [f"{FORMATS[n].format(rows[n].mean())} ± {FORMATS[n].format(rows[n].std())}" for n in columns]
+        values = [
+            f"{FORMATS[n].format(rows[n].mean())} ± {FORMATS[n].format(rows[n].std())}"
+            for n in columns
+        ]
         cells.append([arm, *values])
     labels = ["", *(COLUMNS[name] for name in columns)]
     table = below.table(cells, colLabels=labels, loc="upper center", cellLoc="center")
@@ -107,7 +132,9 @@ def main(runs: Path) -> None:
     table.scale(0.8, 1.25)
     for cell in table.get_celld().values():
         cell.set_edgecolor("#cccccc")
-    below.text(0.5, -0.02, verdict(), ha="center", va="bottom", fontsize=11, transform=below.transAxes)
+    below.text(
+        0.5, -0.02, verdict(), ha="center", va="bottom", fontsize=11, transform=below.transAxes
+    )
     figure.savefig(TARGET, pil_kwargs={"quality": 88})
     print(f"{TARGET}: {TARGET.stat().st_size // 1000} kB")
 

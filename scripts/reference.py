@@ -1,6 +1,8 @@
-"""Pages of the site that are generated from the code: all settings, the keys of ``results.json``, the public names.
+"""Pages of the site that are generated from the code: all settings, the keys of ``results.json``,
+the public names.
 
-``python scripts/reference.py settings|results|api`` prints one of them as Markdown, ``schema`` the JSON Schema.
+``python scripts/reference.py settings|results|api`` prints one of them as Markdown, ``schema`` the
+JSON Schema.
 """
 
 from __future__ import annotations
@@ -31,34 +33,47 @@ PYTHON_BLOCK = re.compile(r"^```python\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 YAML_COMMENT = re.compile(r"^(\w+):[^#\n]* # *(.+)$", re.MULTILINE)
 
 
-# --- comments of fields ---------------------------------------------------------------------------------------------
+# --- comments of fields ---------------------------------------------------------------------------
 
 
 @cache
 def comments_of(cls: type) -> dict[str, str]:
-    """The comments at the ends of lines, by field, of a class and its base classes."""
+    """The comments above fields and at the ends of their lines, of a class and its base classes."""
     comments: dict[str, str] = {}
     for kind in reversed(cls.__mro__):
         if not kind.__module__.startswith("gsbench"):
             continue
         source = Path(str(inspect.getsourcefile(kind))).read_text(encoding="utf-8")
+        source_lines = source.splitlines()
         at_line = {
             token.start[0]: token.string.lstrip("# ")
             for token in tokenize.generate_tokens(io.StringIO(source).readline)
-            if token.type == tokenize.COMMENT and token.line.strip() != token.string.strip()
+            if token.type == tokenize.COMMENT
         }
-        (node,) = (n for n in ast.walk(ast.parse(source)) if isinstance(n, ast.ClassDef) and n.name == kind.__name__)
+        (node,) = (
+            n
+            for n in ast.walk(ast.parse(source))
+            if isinstance(n, ast.ClassDef) and n.name == kind.__name__
+        )
         for entry in node.body:
             if isinstance(entry, ast.AnnAssign) and isinstance(entry.target, ast.Name):
-                lines = range(entry.lineno, (entry.end_lineno or entry.lineno) + 1)
-                words = " ".join(at_line[line] for line in lines if line in at_line and "noqa" not in at_line[line])
+                first = entry.lineno
+                while source_lines[first - 2].lstrip().startswith("#"):
+                    first -= 1
+                lines = range(first, (entry.end_lineno or entry.lineno) + 1)
+                words = " ".join(
+                    at_line[line]
+                    for line in lines
+                    if line in at_line and "noqa" not in at_line[line]
+                )
                 comments[entry.target.id] = words.removeprefix("type: ignore[misc]").strip()
     return comments
 
 
 @cache
 def yaml_comments_of(group: str) -> dict[str, str]:
-    """The comments at the ends of lines, by key, in a group's files; of several for one key the first."""
+    """The comments at the ends of lines, by key, in a group's files; of several for one key the
+    first."""
     comments: dict[str, str] = {}
     for file in sorted((ROOT / "conf" / group).rglob("*.yaml")):
         for key, words in YAML_COMMENT.findall(file.read_text(encoding="utf-8")):
@@ -83,7 +98,7 @@ def default_text(value: Any) -> str:
     return f"`{text if len(text) <= 60 else text[:57] + '...'}`"
 
 
-# --- settings -------------------------------------------------------------------------------------------------------
+# --- settings -------------------------------------------------------------------------------------
 
 HEADS = ("setting", "allowed", "default", "meaning")
 
@@ -94,9 +109,15 @@ def settings_of(cls: type, group: str, leave_out: frozenset[str] = frozenset()) 
     for entry in option_fields(cls):
         if entry.name in leave_out or entry.name.startswith("_"):
             continue
-        default = entry.default if entry.default_factory is dataclasses.MISSING else entry.default_factory()
+        default = (
+            entry.default
+            if entry.default_factory is dataclasses.MISSING
+            else entry.default_factory()
+        )
         key = f"{group}.{entry.name}" if group else entry.name
-        meaning = comments_of(cls).get(entry.name, "") or yaml_comments_of(group).get(entry.name, "")
+        meaning = comments_of(cls).get(entry.name, "") or yaml_comments_of(group).get(
+            entry.name, ""
+        )
         yield row(f"`{key}`", describe(hints[entry.name]), default_text(default), meaning)
 
 
@@ -149,12 +170,15 @@ def settings_page() -> str:
     return "\n".join(lines) + "\n"
 
 
-# --- results.json ---------------------------------------------------------------------------------------------------
+# --- results.json ---------------------------------------------------------------------------------
 
 
 def schema() -> dict[str, Any]:
     """The JSON Schema of ``results.json``."""
-    title = {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "results.json of gsbench"}
+    title = {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "title": "results.json of gsbench",
+    }
     return title | adapter(TrialRecord).json_schema(ref_template="#/$defs/{model}")
 
 
@@ -178,9 +202,12 @@ def type_text(part: dict[str, Any]) -> str:
         inner = part.get("prefixItems") or [part.get("items") or {}]
         return f"[{', '.join(type_text(item) for item in inner)}]"
     least = " ≥ 0" if part.get("minimum") == 0 else ""
-    return {"string": "text", "integer": "whole number", "number": "number", "boolean": "true or false"}.get(
-        kind, kind
-    ) + least
+    return {
+        "string": "text",
+        "integer": "whole number",
+        "number": "number",
+        "boolean": "true or false",
+    }.get(kind, kind) + least
 
 
 def results_page() -> str:
@@ -190,7 +217,12 @@ def results_page() -> str:
     lines: list[str] = []
     for name, part in {"TrialRecord": whole, **whole.get("$defs", {})}.items():
         cls = getattr(records, name)
-        lines += [f"### {'The file' if cls is TrialRecord else name}", "", as_markdown(inspect.getdoc(cls) or ""), ""]
+        lines += [
+            f"### {'The file' if cls is TrialRecord else name}",
+            "",
+            as_markdown(inspect.getdoc(cls) or ""),
+            "",
+        ]
         lines += table("key", "value", "", "meaning")
         required = set(part.get("required", ()))
         for key, value in part["properties"].items():
@@ -205,11 +237,12 @@ def as_markdown(text: str) -> str:
     return text.replace("``", "`")
 
 
-# --- public names ---------------------------------------------------------------------------------------------------
+# --- public names ---------------------------------------------------------------------------------
 
 
 def public_names() -> dict[str, list[str]]:
-    """The public names by module: those in the ``__all__`` of a package, and those that the documents import."""
+    """The public names by module: those in the ``__all__`` of a package, and those that the
+    documents import."""
     public: dict[str, set[str]] = {}
     for file in sorted((ROOT / "src" / "gsbench").glob("*/__init__.py")):
         module = f"gsbench.{file.parent.name}"
@@ -224,9 +257,14 @@ def public_names() -> dict[str, list[str]]:
         for block in PYTHON_BLOCK.findall(page.read_text(encoding="utf-8")):
             for node in ast.walk(ast.parse(block)):
                 if isinstance(node, ast.ImportFrom) and str(node.module).startswith("gsbench."):
-                    public.setdefault(str(node.module), set()).update(alias.name for alias in node.names)
-    internal = ("gsbench.bench", "gsbench.tracking")  # packages with an `__all__` for the program's own use
-    return {module: sorted(names) for module, names in sorted(public.items()) if module not in internal}
+                    public.setdefault(str(node.module), set()).update(
+                        alias.name for alias in node.names
+                    )
+    # packages with an `__all__` for the program's own use
+    internal = ("gsbench.bench", "gsbench.tracking")
+    return {
+        module: sorted(names) for module, names in sorted(public.items()) if module not in internal
+    }
 
 
 def api_page() -> str:
@@ -234,7 +272,8 @@ def api_page() -> str:
     lines = [
         "# Public names",
         "",
-        "A program may rely on these names, and on no others. [Releasing](releasing.md) says how long they stay.",
+        "A program may rely on these names, and on no others. [Releasing](releasing.md) says how "
+        "long they stay.",
         "",
     ]
     for module, names in public_names().items():

@@ -1,11 +1,12 @@
-"""Simulated checks of claims whose truth is known: how often each verdict is wrong, for the table of docs/verdict.md.
+"""Simulated checks of claims whose truth is known: how often each verdict is wrong, for the table
+of docs/verdict.md.
 
     python scripts/untruths.py                 write the table into the page (about ten minutes)
     python scripts/untruths.py --checks 200    print it from fewer checks
 
-A check has four claims that share an error rate of 5 %. It looks at 2, 3 and 4 seeds, and trains no further once a
-claim is decided. Differences are in standard deviations of a pair of trainings; `LEAST` is the least effect that
-matters.
+A check has four claims that share an error rate of 5 %. It looks at 2, 3 and 4 seeds, and trains no
+further once a claim is decided. Differences are in standard deviations of a pair of trainings;
+`LEAST` is the least effect that matters.
 """
 
 from __future__ import annotations
@@ -33,7 +34,8 @@ LOOKS = (2, 3, 4)
 LEAST = 1.0
 
 Array = NDArray[np.float64]
-# Draws, for each scene: the noise of both arms [2, K], the scene's own effect, and the mean of its noise.
+# Draws, for each scene: the noise of both arms [2, K], the scene's own effect, and the mean of its
+# noise.
 Draw = Callable[[np.random.Generator], tuple[list[Array], Array, Array]]
 
 
@@ -59,7 +61,10 @@ class Rates:
 def _normal(
     rng: np.random.Generator, counts: Sequence[int], noise: Sequence[float]
 ) -> tuple[list[Array], Array, Array]:
-    rows = [rng.normal(0, scale / 2**0.5, (2, count)) for count, scale in zip(counts, noise, strict=True)]
+    rows = [
+        rng.normal(0, scale / 2**0.5, (2, count))
+        for count, scale in zip(counts, noise, strict=True)
+    ]
     return rows, np.zeros(len(counts)), np.zeros(len(counts))
 
 
@@ -68,7 +73,8 @@ def normal(rng: np.random.Generator, scenes: int = 3) -> tuple[list[Array], Arra
 
 
 def standing_out(rng: np.random.Generator) -> tuple[list[Array], Array, Array]:
-    """Eight scenes of a population where one in eight gains .044 and the others lose .0063; deviations are .005."""
+    """Eight scenes of a population where one in eight gains .044 and the others lose .0063;
+    deviations are .005."""
     rows, _, _ = normal(rng, 8)
     return rows, np.where(rng.random(8) < 1 / 8, 0.044, -0.0063) / 0.005, np.zeros(8)
 
@@ -78,7 +84,8 @@ def noisy(rng: np.random.Generator) -> tuple[list[Array], Array, Array]:
 
 
 def failing(rng: np.random.Generator, arms: tuple[int, ...]) -> tuple[list[Array], Array, Array]:
-    """One training in ten of each of these ``arms`` is worse by ten deviations, which changes the true mean."""
+    """One training in ten of each of these ``arms`` is worse by ten deviations, which changes the
+    true mean."""
     rows, effects, _ = normal(rng)
     for row in rows:
         for arm in arms:
@@ -102,7 +109,8 @@ KINDS = {
 
 
 def rates(kind: Kind, effect: float, checks: int, seed: int = 0) -> Rates:
-    """The rates over ``checks`` simulated checks. The real ``effect`` is in units of the least that matters."""
+    """The rates over ``checks`` simulated checks. The real ``effect`` is in units of the least that
+    matters."""
     rng = np.random.default_rng([seed, round(1000 * effect)])
     words = ("supported", "refuted", "too small to matter", "undecided")
     counts, untrue, like_these = dict.fromkeys(words, 0), dict.fromkeys(words[:3], 0), 0
@@ -111,23 +119,37 @@ def rates(kind: Kind, effect: float, checks: int, seed: int = 0) -> Rates:
         for verdict, _ in claims:
             counts[verdict.outcome] += 1
         for word in untrue:
-            untrue[word] += any(v.outcome == word and not _is_true(word, truth) for v, truth in claims)
+            untrue[word] += any(
+                v.outcome == word and not _is_true(word, truth) for v, truth in claims
+            )
         median = effect * LEAST + kind.median
-        like_these += any(v.like_these and not _is_true(v.like_these.outcome, median) for v, _ in claims)
+        like_these += any(
+            v.like_these and not _is_true(v.like_these.outcome, median) for v, _ in claims
+        )
     shares = {word: count / checks / kind.claims for word, count in counts.items()}
-    return Rates(shares, {word: count / checks for word, count in untrue.items()}, like_these / checks)
+    return Rates(
+        shares, {word: count / checks for word, count in untrue.items()}, like_these / checks
+    )
 
 
 def _is_true(word: str, truth: float) -> bool:
-    """Return whether the verdict ``word`` on the claim "more" is right if ``truth`` is the real difference."""
-    return {"supported": truth > 0, "refuted": truth < 0, "too small to matter": abs(truth) < LEAST}.get(word, True)
+    """Return whether the verdict ``word`` on the claim "more" is right if ``truth`` is the real
+    difference."""
+    return {
+        "supported": truth > 0,
+        "refuted": truth < 0,
+        "too small to matter": abs(truth) < LEAST,
+    }.get(word, True)
 
 
 def _claim(kind: Kind, effect: float, rng: np.random.Generator) -> tuple[Verdict, float]:
     """The verdict on one claim, and the true mean difference of its scenes."""
     rows, effects, shift = kind.draw(rng)
     pairs = Pairs(
-        tuple(scene_pairs(k, row, effect + own) for k, (row, own) in enumerate(zip(rows, effects, strict=True)))
+        tuple(
+            scene_pairs(k, row, effect + own)
+            for k, (row, own) in enumerate(zip(rows, effects, strict=True))
+        )
     )
     question = Question(metric="psnr", sign=1, least=LEAST)
     asked = Verdict(question, QUANTITY, pairs)
@@ -141,7 +163,8 @@ def _claim(kind: Kind, effect: float, rng: np.random.Generator) -> tuple[Verdict
 def scene_pairs(place: int, noise: Array, effect: float) -> ScenePairs:
     count = noise.shape[1]
     trials: Any = tuple(
-        (SimpleNamespace(path=Path(f"{place}/a{k}")), SimpleNamespace(path=Path(f"{place}/b{k}"))) for k in range(count)
+        (SimpleNamespace(path=Path(f"{place}/a{k}")), SimpleNamespace(path=Path(f"{place}/b{k}")))
+        for k in range(count)
     )
     return ScenePairs(str(place), tuple(range(count)), trials, noise[0], noise[1] + effect)
 
@@ -153,24 +176,39 @@ EFFECTS = (0.0, 0.5, 1.0, 2.0)
 
 
 def table(checks: int) -> str:
-    """The table: for each kind of sweep and real effect, how often each verdict occurs, and how often it is wrong."""
-    lines = ["| differences | effect | supported | refuted | too small | undecided | untrue: supported | refuted | "]
+    """The table: for each kind of sweep and real effect, how often each verdict occurs, and how
+    often it is wrong."""
+    lines = [
+        "| differences | effect | supported | refuted | too small | undecided | untrue: supported "
+        "| refuted | "
+    ]
     lines[0] += "too small | scenes like these |"
     lines.append("|" + "---|" * 10)
     for name, kind in KINDS.items():
         for effect in EFFECTS:
             measured = rates(kind, effect, checks)
             shares = [*measured.outcomes.values(), *measured.untrue.values(), measured.like_these]
-            lines.append(f"| {name} | {effect:g} | " + " | ".join(f"{100 * share:.1f} %" for share in shares) + " |")
+            lines.append(
+                f"| {name} | {effect:g} | "
+                + " | ".join(f"{100 * share:.1f} %" for share in shares)
+                + " |"
+            )
     return "\n".join(lines) + "\n"
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--checks", type=int, help="print the table from this many checks a row; the page stays")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--checks", type=int, help="print the table from this many checks a row; the page stays"
+    )
     wanted = parser.parse_args().checks
     made = table(wanted or 3000)
     if wanted is None:
-        PAGE.write_text(SECTION.sub(lambda m: m[1] + made + m[2], PAGE.read_text(encoding="utf-8")), encoding="utf-8")
+        PAGE.write_text(
+            SECTION.sub(lambda m: m[1] + made + m[2], PAGE.read_text(encoding="utf-8")),
+            encoding="utf-8",
+        )
     else:
         print(made, end="")

@@ -1,11 +1,13 @@
-"""Simulated rounds of votes whose truth is known: how often a verdict is wrong, for the table of docs/verdict.md.
+"""Simulated rounds of votes whose truth is known: how often a verdict is wrong, for the table of
+docs/verdict.md.
 
     python scripts/vote_untruths.py                  write the tables into the page (three minutes)
     python scripts/vote_untruths.py --rounds 200     print it from fewer rounds
 
-The log-odds of a vote for the arm are the sum of a real effect, of person, scene and view; a fifth of the votes say "no
-difference". A statement about people is about these views: it is wrong unless it has the sign that the median person
-has on them. A statement about scenes is about these people, in the same way.
+The log-odds of a vote for the arm are the sum of a real effect, of person, scene and view; a fifth
+of the votes say "no difference". A statement about people is about these views: it is wrong unless
+it has the sign that the median person has on them. A statement about scenes is about these people,
+in the same way.
 """
 
 from __future__ import annotations
@@ -50,10 +52,11 @@ EFFECTS = (0.0, 1.0)
 
 
 def rates(kind: Kind, effect: float, rounds: int, seed: int = 0) -> list[float]:
-    """The shares of rounds: people decided, wrongly; scenes decided, wrongly; both, wrongly; all votes, wrongly.
+    """The shares of rounds: people decided, wrongly; scenes decided, wrongly; both, wrongly; all
+    votes, wrongly.
 
-    "Both" needs the same outcome for people and scenes, and is about people and scenes like these. "All votes" is a
-    binomial test that takes every vote as independent.
+    "Both" needs the same outcome for people and scenes, and is about people and scenes like these.
+    "All votes" is a binomial test that takes every vote as independent.
     """
     rng = np.random.default_rng([seed, round(1000 * effect)])
     counts = np.zeros(8)
@@ -63,7 +66,9 @@ def rates(kind: Kind, effect: float, rounds: int, seed: int = 0) -> list[float]:
         scenes = rng.normal(0, kind.scenes_differ, kind.scenes)
         views = scenes[scene_of] + rng.normal(0, kind.views_differ, PAIRS)
         chance = 1 / (1 + np.exp(-(effect + people[:, None] + views)))
-        votes = np.where(rng.random(chance.shape) < chance, 1, -1) * (rng.random(chance.shape) >= SAME)
+        votes = np.where(rng.random(chance.shape) < chance, 1, -1) * (
+            rng.random(chance.shape) >= SAME
+        )
         of_views = [np.tanh((effect + views[scene_of == k]) / 2).mean() for k in range(kind.scenes)]
         truths = (float(np.mean(of_views)), float(np.tanh((effect + people) / 2).mean()))
         stated = [sign_of(like) for like in judge_votes(votes, list(map(str, scene_of)), LEVEL)]
@@ -90,15 +95,18 @@ def naive(votes: NDArray[np.int_]) -> int:
 
 
 def ranking_misses(people: int, scenes: int, rounds: int) -> float:
-    """The share of intervals of a ranking of three arms that miss the arm's chance over all people and scenes.
+    """The share of intervals of a ranking of three arms that miss the arm's chance over all people
+    and scenes.
 
-    The arms' strengths are 0, 0.5 and 1 (log-odds); each person and each scene has its own, with a deviation of 0.7.
-    Three views of each scene show each pair of arms.
+    The arms' strengths are 0, 0.5 and 1 (log-odds); each person and each scene has its own, with a
+    deviation of 0.7. Three views of each scene show each pair of arms.
     """
     rng = np.random.default_rng([people, scenes])
     real, deviation, views = np.array([0.0, 0.5, 1.0]), 0.7, 3
 
-    def chances(of_people: NDArray[np.float64], of_scenes: NDArray[np.float64]) -> NDArray[np.float64]:
+    def chances(
+        of_people: NDArray[np.float64], of_scenes: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
         own = real + of_people[:, None] + of_scenes[None]  # [K, S, A]
         return 1 / (1 + np.exp(own[:, :, None, :] - own[:, :, :, None]))
 
@@ -106,7 +114,9 @@ def ranking_misses(people: int, scenes: int, rounds: int) -> float:
     truth = bradley_terry(1e4 * many.mean(axis=(0, 1))[None] * (1 - np.eye(3)))[0]
     missed = 0
     for _ in range(rounds):
-        chance = chances(rng.normal(0, deviation, (people, 3)), rng.normal(0, deviation, (scenes, 3)))
+        chance = chances(
+            rng.normal(0, deviation, (people, 3)), rng.normal(0, deviation, (scenes, 3))
+        )
         wins = np.triu(rng.binomial(views, chance), 1).astype(float)
         wins += np.tril(views - wins.swapaxes(2, 3), -1)
         _, low, high = rank_wins(wins)
@@ -119,9 +129,11 @@ SECTION = re.compile(r"(<!-- votes -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
 def table(rounds: int) -> str:
-    """The table: for each kind of round and real effect, how often each statement decides, and how often wrongly."""
+    """The table: for each kind of round and real effect, how often each statement decides, and how
+    often wrongly."""
     lines = [
-        "| votes | effect | people decide | wrong | scenes decide | wrong | both | wrong | all votes as one | wrong |"
+        "| votes | effect | people decide | wrong | scenes decide | wrong | both | wrong | all "
+        "votes as one | wrong |"
     ]
     lines.append("|" + "---|" * 10)
     for name, kind in KINDS.items():
@@ -131,17 +143,25 @@ def table(rounds: int) -> str:
     lines += ["", "| intervals of a ranking of three arms | miss |", "|---|---|"]
     for people, scenes in ((9, 9), (20, 9), (9, 3), (3, 3)):
         lines.append(
-            f"| {people} people, {scenes} scenes | {100 * ranking_misses(people, scenes, rounds // 10):.1f} % |"
+            f"| {people} people, {scenes} scenes | "
+            f"{100 * ranking_misses(people, scenes, rounds // 10):.1f} % |"
         )
     return "\n".join(lines) + "\n"
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rounds", type=int, help="print the table from this many rounds a row; the page stays")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--rounds", type=int, help="print the table from this many rounds a row; the page stays"
+    )
     wanted = parser.parse_args().rounds
     made = table(wanted or 3000)
     if wanted is None:
-        PAGE.write_text(SECTION.sub(lambda m: m[1] + made + m[2], PAGE.read_text(encoding="utf-8")), encoding="utf-8")
+        PAGE.write_text(
+            SECTION.sub(lambda m: m[1] + made + m[2], PAGE.read_text(encoding="utf-8")),
+            encoding="utf-8",
+        )
     else:
         print(made, end="")

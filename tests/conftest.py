@@ -9,14 +9,18 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # before torch is imported, as the program itself does
+# before torch is imported, as the program itself does
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 os.environ["MLFLOW_DISABLE_TELEMETRY"] = "true"
 
 import pytest
 from hypothesis import HealthCheck, settings
 
-# The same examples on every machine and however loaded it is: `pytest --hypothesis-profile=explore` tries new ones.
-settings.register_profile("gsbench", derandomize=True, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+# The same examples on every machine and however loaded it is: `pytest --hypothesis-profile=explore`
+# tries new ones.
+settings.register_profile(
+    "gsbench", derandomize=True, deadline=None, suppress_health_check=[HealthCheck.too_slow]
+)
 settings.register_profile("explore", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("gsbench")
 
@@ -36,7 +40,8 @@ def script(name: str) -> Any:
 
 @pytest.fixture(scope="session")
 def shared() -> Path:
-    """The folder with development data beside the checkout; the test is skipped where it is absent."""
+    """The folder with development data beside the checkout; the test is skipped where it is
+    absent."""
     folder = ROOT.parent / "shared"
     if not (folder / "data").is_dir():
         pytest.skip(f"needs the development data in {folder}")
@@ -53,18 +58,21 @@ def shared_weights(shared: Path) -> Path:
 
 @pytest.fixture(autouse=True)
 def _own_search_path(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Forget what the program, called within a test, tells its children of where not to import from."""
+    """Forget what the program, called within a test, tells its children of where not to import
+    from."""
     monkeypatch.setenv("PYTHONSAFEPATH", "")  # so that it is known here, and put back at the end
     monkeypatch.delenv("PYTHONSAFEPATH")
 
 
 @pytest.fixture
 def caplog(caplog: pytest.LogCaptureFixture) -> Iterator[pytest.LogCaptureFixture]:
-    """Catch gsbench's own lines, too, whose logger passes nothing on once a command has run, in whichever order."""
+    """Catch gsbench's own lines, too, whose logger passes nothing on once a command has run, in
+    whichever order."""
     from gsbench.logs import LOGGER, set_up_logging
 
     handlers, propagate = LOGGER.handlers[:], LOGGER.propagate
     set_up_logging()
     LOGGER.addHandler(caplog.handler)
     yield caplog
-    LOGGER.handlers[:], LOGGER.propagate = handlers, propagate  # a stream that this test had is closed then
+    # a stream that this test had is closed then
+    LOGGER.handlers[:], LOGGER.propagate = handlers, propagate

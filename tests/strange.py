@@ -1,4 +1,5 @@
-"""A place where a user types, with files of a stranger's: modules that leave a mark when they are imported."""
+"""A place where a user types, with files of a stranger's: modules that leave a mark when they are
+imported."""
 
 from __future__ import annotations
 
@@ -55,7 +56,9 @@ def no_trial(trials: Any) -> Any:
     raise InputError("the trials began")
 
 
-def ask(words: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> str:
+def ask(
+    words: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> str:
     """The one line with which a command is refused."""
     monkeypatch.setattr("gsbench.app.command.run_batch", no_trial)
     monkeypatch.setattr("gsbench.app.command.list_trials", no_trial)

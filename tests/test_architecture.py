@@ -1,4 +1,5 @@
-"""Who may know whom (docs/architecture.md): read from the import statements, those inside functions included."""
+"""Who may know whom (docs/architecture.md): read from the import statements, those inside functions
+included."""
 
 from __future__ import annotations
 
@@ -13,7 +14,8 @@ import pytest
 import gsbench
 
 PACKAGE = Path(gsbench.__file__).parent
-# The house from the top floor down. A room may import those on floors below its own, and the ground floor.
+# The house from the top floor down. A room may import those on floors below its own, and the ground
+# floor.
 FLOORS = (
     {"__main__"},
     {"cli"},
@@ -41,13 +43,15 @@ GROUND_FLOOR = {
     "weights",
     "words",
 }
-LIBRARY = ("train", "densify", "raster", "eval", "scene", "gaussians", "init", "external")  # usable without the program
+# usable without the program
+LIBRARY = ("train", "densify", "raster", "eval", "scene", "gaussians", "init", "external")
 WITHOUT_TORCH = ("analysis", "runs", "datasets", "system", "config", "claims", "cli")
 KNOW_HYDRA = {"app", "config"}
 HYDRA = {"hydra", "omegaconf"}
 # What a room may import of a room below it, where that is less than all.
 ONLY = {
-    ("analysis", "eval"): {"gsbench.eval.facts", "gsbench.eval.protocol"},  # tables of facts, which load no torch
+    # tables of facts, which load no torch
+    ("analysis", "eval"): {"gsbench.eval.facts", "gsbench.eval.protocol"},
     ("config", "train"): {"gsbench.train.options"},
     ("config", "external"): {"gsbench.external.settings"},
 }
@@ -65,7 +69,8 @@ def modules() -> dict[str, Path]:
 
 
 def imports_of(path: Path, inside_functions: bool = True) -> Iterator[str]:
-    """The dotted names that a file imports anywhere but for type checkers: modules, or names in them."""
+    """The dotted names that a file imports anywhere but for type checkers: modules, or names in
+    them."""
     pending: list[ast.AST] = [ast.parse(path.read_text(encoding="utf-8"))]
     while pending:
         node = pending.pop()
@@ -83,7 +88,8 @@ def imports_of(path: Path, inside_functions: bool = True) -> Iterator[str]:
 
 @functools.cache
 def arrows(inside_functions: bool = True) -> dict[str, set[str]]:
-    """For each module of gsbench, the modules of gsbench that it imports, and the names of foreign packages."""
+    """For each module of gsbench, the modules of gsbench that it imports, and the names of foreign
+    packages."""
     known = modules()
     graph: dict[str, set[str]] = {}
     for name, path in known.items():
@@ -110,7 +116,8 @@ def reached(start: str) -> set[str]:
 
 
 def room(module: str) -> str:
-    """The folder below ``gsbench`` in which a module stands; a file beside the folders is a room of its own."""
+    """The folder below ``gsbench`` in which a module stands; a file beside the folders is a room of
+    its own."""
     parts = module.split(".")
     return parts[1] if parts[0] == "gsbench" and len(parts) > 1 else ""
 
@@ -120,12 +127,15 @@ def by_room(graph: Graph) -> dict[str, set[str]]:
     rooms: dict[str, set[str]] = {room(module): set() for module in graph if room(module)}
     for module, targets in graph.items():
         if room(module):
-            rooms[room(module)] |= {room(target) for target in targets if room(target)} - {room(module)}
+            rooms[room(module)] |= {room(target) for target in targets if room(target)} - {
+                room(module)
+            }
     return rooms
 
 
 def circle(graph: Graph) -> list[str]:
-    """The members of a circle of arrows in order, the first named again at the end; empty where there is none."""
+    """The members of a circle of arrows in order, the first named again at the end; empty where
+    there is none."""
     done: set[str] = set()
 
     def visit(name: str, way: list[str]) -> list[str]:
@@ -156,7 +166,8 @@ def upward(graph: Graph) -> list[str]:
 
 
 def way_to(graph: Graph, start: str, goals: Iterable[str]) -> list[str]:
-    """A shortest chain of imports from a module to one of ``goals``; importing a module runs the packages it is in."""
+    """A shortest chain of imports from a module to one of ``goals``; importing a module runs the
+    packages it is in."""
     goals, ways = set(goals), {start: [start]}
     pending = [start]
     while pending:
@@ -202,7 +213,11 @@ def test_a_room_that_may_see_a_part_of_another(above: str, below: str) -> None:
 
 @pytest.mark.parametrize("name", LIBRARY)
 def test_the_library_reaches_neither_hydra_nor_mlflow_nor_the_pipeline(name: str) -> None:
-    program = {module for module in arrows() if room(module) in {"pipeline", "config", "app", "launch", "tracking"}}
+    program = {
+        module
+        for module in arrows()
+        if room(module) in {"pipeline", "config", "app", "launch", "tracking"}
+    }
     for module in arrows():
         if room(module) == name:
             way = way_to(arrows(), module, HYDRA | {"mlflow"} | program)
@@ -218,12 +233,15 @@ def test_what_answers_at_once_loads_no_torch(name: str) -> None:
             assert not way, " imports ".join(way)
 
 
-MAY_LOAD_TORCH = ("gsbench.system.resources", "gsbench.system.device")  # the second is about torch alone
+# the second is about torch alone
+MAY_LOAD_TORCH = ("gsbench.system.resources", "gsbench.system.device")
 
 
 def test_hydra_is_known_in_two_rooms() -> None:
     for module, targets in arrows().items():
-        assert not targets & HYDRA or room(module) in KNOW_HYDRA, f"{module} imports {targets & HYDRA}"
+        assert not targets & HYDRA or room(module) in KNOW_HYDRA, (
+            f"{module} imports {targets & HYDRA}"
+        )
 
 
 @pytest.mark.parametrize("library", sorted(HYDRA))
@@ -234,7 +252,8 @@ def test_what_hydra_does_not_promise_to_keep_is_imported_nowhere(library: str) -
 
 
 def test_verbs_do_not_know_each_other() -> None:
-    shared = {"gsbench.verbs.arguments", "gsbench.verbs"}  # how all of them read their words; which there are
+    # how all of them read their words; which there are
+    shared = {"gsbench.verbs.arguments", "gsbench.verbs"}
     for module, targets in arrows().items():
         if room(module) == "verbs":
             others = {target for target in targets if room(target) == "verbs"} - shared
@@ -247,8 +266,14 @@ def test_the_checks_can_fail() -> None:
     modules_apart = {"gsbench.train.x": {"gsbench.eval.x"}, "gsbench.eval.y": {"gsbench.train.y"}}
     assert not circle(modules_apart)  # no circle of modules, and yet
     assert circle(by_room(modules_apart)) == ["eval", "train", "eval"]
-    assert upward(modules_apart) == ["gsbench.eval.y imports gsbench.train.y, which stands no lower"]
+    assert upward(modules_apart) == [
+        "gsbench.eval.y imports gsbench.train.y, which stands no lower"
+    ]
     assert upward({"gsbench.words": {"gsbench.runs.x"}})
     assert not upward({"gsbench.settings": {"gsbench.words"}, "gsbench.runs.x": {"gsbench.words"}})
-    chain = {"gsbench.train.x": {"gsbench.runs.x"}, "gsbench.runs": {"mlflow"}, "gsbench.runs.x": set()}
+    chain = {
+        "gsbench.train.x": {"gsbench.runs.x"},
+        "gsbench.runs": {"mlflow"},
+        "gsbench.runs.x": set(),
+    }
     assert way_to(chain, "gsbench.train.x", {"mlflow"})[-2:] == ["gsbench.runs", "mlflow"]

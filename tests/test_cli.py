@@ -52,7 +52,9 @@ def test_help_and_reading_verbs_load_no_torch(runs: Path) -> None:
         "c.run(['-m', 'seed=0,1', '--dry-run'])\n"
         "sys.exit(any(name in sys.modules for name in ('torch', 'mlflow', 'numba', 'pycolmap')))"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False
+    )
     assert done.returncode == 0, done.stderr
     assert "2 trials: 2 missing" in done.stdout
 
@@ -62,12 +64,20 @@ def test_help_and_reading_verbs_load_no_torch(runs: Path) -> None:
     [
         (InputError("bad photo"), 2, "gsbench: bad photo\n"),
         (GsbenchError("went wrong"), 1, "gsbench: went wrong\n"),
-        (Stopped(15), 143, "gsbench: stopped by SIGTERM; to continue, give the same command again\n"),
+        (
+            Stopped(15),
+            143,
+            "gsbench: stopped by SIGTERM; to continue, give the same command again\n",
+        ),
         (KeyboardInterrupt(), 130, "gsbench: stopped; to continue, give the same command again\n"),
     ],
 )
 def test_errors_become_a_line_and_an_exit_code(
-    error: BaseException, code: int, text: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    error: BaseException,
+    code: int,
+    text: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     def fail(argv: list[str]) -> int:
         raise error
@@ -103,7 +113,9 @@ def make_experiment(runs: Path) -> list[Path]:
     return folders
 
 
-def test_status_lists_what_deserves_attention(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_status_lists_what_deserves_attention(
+    runs: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     folders = make_experiment(runs)
     assert cli.run(["status", "x"]) == 1
     lines = capsys.readouterr().out.splitlines()
@@ -111,7 +123,9 @@ def test_status_lists_what_deserves_attention(runs: Path, capsys: pytest.Capture
     assert "the loss became nan" in lines[0]
     assert lines[2] == "3 trials: 1 done, 1 missing, 1 failed"
     assert cli.run(["status", "x", "--json"]) == 1
-    states = {Path(trial["folder"]): trial["state"] for trial in json.loads(capsys.readouterr().out)}
+    states = {
+        Path(trial["folder"]): trial["state"] for trial in json.loads(capsys.readouterr().out)
+    }
     assert states == dict(zip(folders, ("done", "failed", "missing"), strict=True))
     assert cli.run(["status"]) == 0
     assert " ".join(capsys.readouterr().out.split()) == "x 3 trials: 1 done, 1 missing, 1 failed"
@@ -131,7 +145,10 @@ def test_retry_runs_the_unfinished_with_their_own_settings(
     assert cli.run(["retry", "x", "--dry-run"]) == 0
     assert "2 trials: 1 missing, 1 failed" in capsys.readouterr().out
     assert cli.run(["retry", "x", "launch=local", "launch.parallel=3"]) == 0
-    assert [(t.values["densify"]["name"], t.values["seed"]) for t in ran] == [("adc", 1), ("adc", 2)]
+    assert [(t.values["densify"]["name"], t.values["seed"]) for t in ran] == [
+        ("adc", 1),
+        ("adc", 2),
+    ]
     assert {t.values["launch"]["parallel"] for t in ran} == {3}
     assert {TrialFolder.of(t.values).runs for t in ran} == {runs}
 
@@ -149,7 +166,9 @@ def test_retry_of_a_trial_without_a_plan_takes_its_own_configuration(runs: Path)
         trials.recompose(folders[1], None, runs, ["launch=local"], "theirs")
 
 
-def test_a_second_retry_without_a_plan_runs_the_same_trial(runs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_second_retry_without_a_plan_runs_the_same_trial(
+    runs: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     folders = make_experiment(runs)
     (runs / "x" / "plan.json").unlink()
     ran: list[Path] = []
@@ -189,7 +208,9 @@ def test_export_of_the_model_and_the_initial_cloud(
 ) -> None:
     folder = finished_trial(runs, gaussians)
     assert cli.run(["export", "x:courtyard:adc:0", "--out", "new/model.ply"]) == 0
-    assert (tmp_path / "new" / "model.ply").read_bytes() == (folder / "point_cloud.ply").read_bytes()
+    assert (tmp_path / "new" / "model.ply").read_bytes() == (
+        folder / "point_cloud.ply"
+    ).read_bytes()
     assert "new/model.ply: x/courtyard/sfm-adc/" in capsys.readouterr().out
     assert cli.run(["export", "init", str(folder), "--out", "model"]) == 0
     assert (tmp_path / "model" / "sparse" / "0" / "points3D.bin").read_bytes() == b"points"
@@ -225,7 +246,9 @@ def test_ui_serves_on_this_machine_only(monkeypatch: pytest.MonkeyPatch) -> None
     assert commands[0][commands[0].index("--host") + 1] == "127.0.0.1"
 
 
-def test_doctor_names_the_packages_that_triton_compiles_with(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_doctor_names_the_packages_that_triton_compiles_with(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(machine, "version_of", lambda package: "3.7.1")
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.delenv("CC", raising=False)
@@ -278,6 +301,8 @@ def test_ctrl_c_while_the_first_modules_load_is_one_line(module: str, tmp_path: 
         "sys.meta_path.insert(0, Interrupt())\n"
         "from gsbench.cli import main\nmain()\n"
     )
-    done = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
     assert done.returncode == 130
     assert done.stderr == "gsbench: stopped before it began\n"

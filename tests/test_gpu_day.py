@@ -1,4 +1,5 @@
-"""scripts/gpu_day.sh without a GPU: no line of it may fail for the first time where time is short."""
+"""scripts/gpu_day.sh without a GPU: no line of it may fail for the first time where time is
+short."""
 
 from __future__ import annotations
 
@@ -20,8 +21,8 @@ from tests.raster.conftest import interpreter_fault
 
 ROOT = Path(__file__).resolve().parents[1]
 SCRIPT = ROOT / "scripts" / "gpu_day.sh"
-# In place of Python: parts fail, hang, or are killed as a test wants; others give what real ones give.
-# Anything else, such as the script itself, is run by Python.
+# In place of Python: parts fail, hang, or are killed as a test wants; others give what real ones
+# give. Anything else, such as the script itself, is run by Python.
 STAND_IN = r"""#!{python} -IS
 import json, os, signal, sys, time
 words = sys.argv[1:]
@@ -106,10 +107,16 @@ class Day:
     ) -> subprocess.Popen[str]:
         environment = self.environment | {"FAULTS": json.dumps(faults or {})} | more
         return subprocess.Popen(
-            ["bash", str(SCRIPT), *words], env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
+            ["bash", str(SCRIPT), *words],
+            env=environment,
+            text=True,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
         )
 
-    def run(self, *words: str, faults: dict[str, tuple[str, str]] | None = None, **more: str) -> tuple[int, str]:
+    def run(
+        self, *words: str, faults: dict[str, tuple[str, str]] | None = None, **more: str
+    ) -> tuple[int, str]:
         with self.start(*words, faults=faults, **more) as process:
             said, _ = process.communicate(timeout=1700)
         return process.returncode, said
@@ -120,7 +127,9 @@ class Day:
             file = archive.extractfile(f"results/parts-{verb}.jsonl")
             assert file is not None
             records = [json.loads(line) for line in file.read().splitlines()]
-            return {record["part"]: record["end"] for record in records} | {"files": archive.getnames()}
+            return {record["part"]: record["end"] for record in records} | {
+                "files": archive.getnames()
+            }
 
 
 @pytest.fixture
@@ -149,9 +158,21 @@ def test_parts_that_fail_hang_or_are_killed_cost_no_other_part(day: Day) -> None
         "bench-triton-3": 1,
         "train-volumetric-0": "out of time",
     }
-    well = {"install", "bits", "compilation", "train-adc-0", "train-volumetric_once-0", "bench-cpu", "proof-cpu"}
+    well = {
+        "install",
+        "bits",
+        "compilation",
+        "train-adc-0",
+        "train-volumetric_once-0",
+        "bench-cpu",
+        "proof-cpu",
+    }
     assert ends.keys() - faults.keys() == well | {"contract-cpu", "memcheck", "racecheck"}
-    assert {"results/train-adc-0/results.json", "results/bench-cpu.out", "results/proof-triton.log"} <= set(files)
+    assert {
+        "results/train-adc-0/results.json",
+        "results/bench-cpu.out",
+        "results/proof-triton.log",
+    } <= set(files)
     assert "broken on purpose" in said  # the end of what it wrote
     for name in ("proof-triton", "train-volumetric-0"):  # what a part left behind has ended, too
         child = Path("/proc") / (day.state / "results" / f"{name}.out").read_text().strip()
@@ -212,7 +233,8 @@ def test_without_a_compiled_gsplat_its_parts_are_not_tried(day: Day) -> None:
 
 
 def test_what_it_brings(tmp_path: Path, shared: Path) -> None:
-    """The packages, and the scene without tracks, of which a training takes the same points in order."""
+    """The packages, and the scene without tracks, of which a training takes the same points in
+    order."""
     from gsbench.scene.colmap import model_points, read_reference
     from gsbench.scene.readers import read_colmap
 
@@ -225,12 +247,22 @@ def test_what_it_brings(tmp_path: Path, shared: Path) -> None:
     with tarfile.open(tmp_path / "brought" / "brought.tar.xz") as archive:
         archive.extractall(tmp_path / "there", filter="data")
     there = tmp_path / "there"
-    assert {file.name for file in (there / "site").iterdir()} >= {"gsplat", "pycolmap", "antlr4_python3_runtime"}
-    assert len(list((there / "bonsai" / "images").iterdir())) == len(list((scene / "images").iterdir()))
-    before, after = (read_reference(read_colmap("scene", folder)) for folder in (scene, there / "bonsai"))
+    assert {file.name for file in (there / "site").iterdir()} >= {
+        "gsplat",
+        "pycolmap",
+        "antlr4_python3_runtime",
+    }
+    assert len(list((there / "bonsai" / "images").iterdir())) == len(
+        list((scene / "images").iterdir())
+    )
+    before, after = (
+        read_reference(read_colmap("scene", folder)) for folder in (scene, there / "bonsai")
+    )
     for old, new in zip(model_points(before), model_points(after), strict=True):
         assert (old == new).all()
-    assert {image.name for image in after.images.values()} == {image.name for image in before.images.values()}
+    assert {image.name for image in after.images.values()} == {
+        image.name for image in before.images.values()
+    }
     assert len(list((there / "weights").iterdir())) == 2
 
 
@@ -240,16 +272,22 @@ def test_a_table_of_two_commands(day: Day) -> None:
     code, said = day.run("table", str(day.out))
     assert code == 0
     assert re.search(
-        r"^- proof-triton: yes, \d+ s; device a GPU; versions .*3.6.0.*; errors .*image", said, re.MULTILINE
+        r"^- proof-triton: yes, \d+ s; device a GPU; versions .*3.6.0.*; errors .*image",
+        said,
+        re.MULTILINE,
     )
     assert re.search(r"^- bits: yes, \d+ s; 3 passed in 1.2s$", said, re.MULTILINE)
     assert "| triton | 3 | 16x16 | - | - | - | - | 1.25 | - | - | - |" in said
-    assert 'triton, 3: {"kernels_ms": {"_blend": 0.5}, "waits": {"cudaStreamSynchronize": 1.0}' in said
+    assert (
+        'triton, 3: {"kernels_ms": {"_blend": 0.5}, "waits": {"cudaStreamSynchronize": 1.0}' in said
+    )
     assert "| train-volumetric_once-0 | 30000 | 12345 | 99.5 | - | 31.543 | - | - | - |" in said
 
 
 def test_a_sanitizer_that_refuses_the_device_is_not_a_failure_of_the_kernels(day: Day) -> None:
-    (day.out.parent / "compute-sanitizer").write_text("#!/bin/sh\necho '= Error: Device not supported'; exit 1\n")
+    (day.out.parent / "compute-sanitizer").write_text(
+        "#!/bin/sh\necho '= Error: Device not supported'; exit 1\n"
+    )
     assert day.run("rest", "60", "memcheck")[0] == 1
     assert "- memcheck: not tried, since" in day.run("table", str(day.out))[1]
 
@@ -276,5 +314,7 @@ def test_the_whole_day_in_the_interpreter(day: Day) -> None:
     assert re.search(r"^- memcheck: yes, \d+ s; 1 passed", said, re.MULTILINE)
     assert re.search(r"^\| triton \| 3 \| 16x16 \| [\d.]+ \|", said, re.MULTILINE)
     assert re.search(
-        r"^\| train-volumetric-0 \| 2 \| \d+ \| [\d.]+ \| [\d.]+ \| [\d.]+ \| [\d.]+ \|", said, re.MULTILINE
+        r"^\| train-volumetric-0 \| 2 \| \d+ \| [\d.]+ \| [\d.]+ \| [\d.]+ \| [\d.]+ \|",
+        said,
+        re.MULTILINE,
     )

@@ -16,13 +16,24 @@ def install() -> ModuleType:
     return script("install")
 
 
-def test_places_that_pip_was_told_are_handed_on(install: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_places_that_pip_was_told_are_handed_on(
+    install: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
     listed = "global.index-url='https://a.org/simple'\nglobal.timeout='9'\n:env:.extra-index-url='https://b.org'\n"
-    monkeypatch.setattr(install.subprocess, "run", lambda *_, **__: subprocess.CompletedProcess([], 0, stdout=listed))
-    assert install.uv_settings() == {"UV_DEFAULT_INDEX": "https://a.org/simple", "UV_INDEX": "https://b.org"}
+    monkeypatch.setattr(
+        install.subprocess,
+        "run",
+        lambda *_, **__: subprocess.CompletedProcess([], 0, stdout=listed),
+    )
+    assert install.uv_settings() == {
+        "UV_DEFAULT_INDEX": "https://a.org/simple",
+        "UV_INDEX": "https://b.org",
+    }
 
 
-@pytest.mark.parametrize(("uv", "code", "last"), [("uv", 0, "uv"), ("uv", 1, "pip"), (None, 0, "pip")])
+@pytest.mark.parametrize(
+    ("uv", "code", "last"), [("uv", 0, "uv"), ("uv", 1, "pip"), (None, 0, "pip")]
+)
 def test_pip_does_what_uv_does_not(
     install: ModuleType, monkeypatch: pytest.MonkeyPatch, uv: str | None, code: int, last: str
 ) -> None:

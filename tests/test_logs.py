@@ -44,14 +44,19 @@ def test_control_characters_are_written_out(text: str) -> None:
 @given(st.text(st.characters(exclude_categories=[])))
 def test_nothing_that_a_terminal_obeys_is_left_and_nothing_else_is_changed(text: str) -> None:
     shown = printable(text)
-    assert not [c for c in shown if unicodedata.category(c) in ("Cc", "Cs", "Zl", "Zp") and c not in "\n\t"]
+    assert not [
+        c for c in shown if unicodedata.category(c) in ("Cc", "Cs", "Zl", "Zp") and c not in "\n\t"
+    ]
     assert not [
         c
         for c in shown
-        if unicodedata.bidirectional(c) in ("LRE", "RLE", "LRO", "RLO", "PDF", "LRI", "RLI", "FSI", "PDI")
+        if unicodedata.bidirectional(c)
+        in ("LRE", "RLE", "LRO", "RLO", "PDF", "LRI", "RLI", "FSI", "PDI")
     ]
     assert printable(shown) == shown
-    if all(c.isprintable() or c in "\n\t" for c in text) and not set(text) & set("\u061c\u200e\u200f"):
+    if all(c.isprintable() or c in "\n\t" for c in text) and not set(text) & set(
+        "\u061c\u200e\u200f"
+    ):
         assert shown == text
     shown.encode()  # half characters, as names of files may have, cannot be
 

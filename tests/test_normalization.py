@@ -26,10 +26,14 @@ def cameras(seed: int, count: int) -> np.ndarray:
 def as_colmap_leaves(centers: np.ndarray) -> np.ndarray:
     """The centres after COLMAP's own normalisation of a model."""
     model = pycolmap.Reconstruction()
-    model.add_camera_with_trivial_rig(pycolmap.Camera.create_from_model_name(1, "PINHOLE", 50.0, 40, 30))
+    model.add_camera_with_trivial_rig(
+        pycolmap.Camera.create_from_model_name(1, "PINHOLE", 50.0, 40, 30)
+    )
     for index, center in enumerate(centers):
         image = pycolmap.Image(name=f"{index}.png", camera_id=1, image_id=index + 1)
-        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(np.column_stack([np.eye(3), -center])))
+        model.add_image_with_trivial_frame(
+            image, pycolmap.Rigid3d(np.column_stack([np.eye(3), -center]))
+        )
     model.normalize()
     return np.array([image.projection_center() for _, image in sorted(model.images.items())])
 
@@ -50,9 +54,12 @@ def test_a_similarity_leaves_the_normalized_cameras_as_they_are(
     again = find_normalization(moved)
     own, other = normalization.apply(centers), again.apply(moved)
     if again.scale != 1:
-        np.testing.assert_allclose(other, own, atol=2e-3)  # float64 at 1e7 resolves 2e-9, and the size may be 1e-4
+        # float64 at 1e7 resolves 2e-9, and the size may be 1e-4
+        np.testing.assert_allclose(other, own, atol=2e-3)
         assert COLMAP_SIZE / 4 < np.ptp(other, axis=0).max() < 6 * COLMAP_SIZE
-    np.testing.assert_allclose(again.undo(other), moved, rtol=1e-12, atol=1e-12 * np.abs(moved).max())
+    np.testing.assert_allclose(
+        again.undo(other), moved, rtol=1e-12, atol=1e-12 * np.abs(moved).max()
+    )
 
 
 @given(SEEDS, st.integers(8, 40), st.floats(3, 12))
@@ -66,7 +73,9 @@ def test_one_camera_far_off_does_not_decide(seed: int, count: int, log_distance:
 
 def test_a_rotation_changes_the_scale_by_less_than_two() -> None:
     centers = cameras(3, 30)
-    scales = [find_normalization(Rotation.random(random_state=k).apply(centers)).scale for k in range(20)]
+    scales = [
+        find_normalization(Rotation.random(random_state=k).apply(centers)).scale for k in range(20)
+    ]
     assert max(scales) / min(scales) < 2
 
 
@@ -75,7 +84,9 @@ def test_cameras_at_one_place_have_no_size_to_go_by(centers: np.ndarray) -> None
     assert find_normalization(centers) is IDENTITY
 
 
-@pytest.mark.parametrize(("center", "scale"), [((0, 0, 0), 0), ((0, 0, 0), -1), ((0, float("nan"), 0), 1)])
+@pytest.mark.parametrize(
+    ("center", "scale"), [((0, 0, 0), 0), ((0, 0, 0), -1), ((0, float("nan"), 0), 1)]
+)
 def test_a_normalization_from_a_file_must_make_sense(center: tuple, scale: float) -> None:
     with pytest.raises(ValueError, match="positive scale"):
         Normalization(center, scale)

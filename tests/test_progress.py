@@ -9,7 +9,9 @@ import pytest
 from gsbench.logs import progress
 
 
-def test_a_log_gets_the_first_line_of_a_phase_and_the_last(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_log_gets_the_first_line_of_a_phase_and_the_last(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     caplog.set_level(logging.INFO, "gsbench")
     with progress("train") as report:
         for done in range(1, 5):

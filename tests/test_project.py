@@ -37,7 +37,11 @@ def names(requirements: list[str]) -> set[str]:
 
 
 def steps(workflow: Path) -> list[dict[str, Any]]:
-    return [step for job in yaml.safe_load(workflow.read_text())["jobs"].values() for step in job["steps"]]
+    return [
+        step
+        for job in yaml.safe_load(workflow.read_text())["jobs"].values()
+        for step in job["steps"]
+    ]
 
 
 def test_the_lock_has_the_versions_of_the_constraints() -> None:
@@ -58,17 +62,29 @@ def test_the_lock_locks_what_the_project_file_asks_for() -> None:
     (own,) = (package for package in locked() if "editable" in package["source"])
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     groups = tomllib.loads((ROOT / "pyproject.toml").read_text())["dependency-groups"]
-    asked = [*project["dependencies"], *(line for extra in project["optional-dependencies"].values() for line in extra)]
+    asked = [
+        *project["dependencies"],
+        *(line for extra in project["optional-dependencies"].values() for line in extra),
+    ]
     assert own["name"] == project["name"]
-    assert {entry["name"] for entry in own["metadata"]["requires-dist"]} == names(asked), "make lock"
+    assert {entry["name"] for entry in own["metadata"]["requires-dist"]} == names(asked), (
+        "make lock"
+    )
     for group, lines in groups.items():
-        assert {entry["name"] for entry in own["metadata"]["requires-dev"][group]} == names(lines), "make lock"
-    assert tomllib.loads((ROOT / "uv.lock").read_text())["requires-python"] == project["requires-python"], "make lock"
+        assert {entry["name"] for entry in own["metadata"]["requires-dev"][group]} == names(
+            lines
+        ), "make lock"
+    assert (
+        tomllib.loads((ROOT / "uv.lock").read_text())["requires-python"]
+        == project["requires-python"]
+    ), "make lock"
 
 
 def test_the_lock_names_public_places_only() -> None:
     text = (ROOT / "uv.lock").read_text()
-    assert {urlsplit(address).hostname for address in re.findall(r'"([a-z+]+://[^"]*)"', text)} == PUBLIC
+    assert {
+        urlsplit(address).hostname for address in re.findall(r'"([a-z+]+://[^"]*)"', text)
+    } == PUBLIC
     sources = [package["source"] for package in locked()]
     assert {*map(tuple, sources)} == {("registry",), ("editable",)}
     assert [source["editable"] for source in sources if "editable" in source] == ["."]
@@ -91,7 +107,11 @@ def test_the_check_before_a_commit_formats_as_ours_does() -> None:
 @pytest.mark.parametrize("workflow", WORKFLOWS, ids=lambda path: path.stem)
 def test_workflows_call_targets_and_files_that_there_are(workflow: Path) -> None:
     targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
-    called = {name for step in steps(workflow) for name in re.findall(r"\bmake ([a-z-]+)", step.get("run", ""))}
+    called = {
+        name
+        for step in steps(workflow)
+        for name in re.findall(r"\bmake ([a-z-]+)", step.get("run", ""))
+    }
     assert called <= targets
     for step in steps(workflow):
         for name in re.findall(r"@(\S+)", step.get("run", "")):
@@ -100,13 +120,19 @@ def test_workflows_call_targets_and_files_that_there_are(workflow: Path) -> None
 
 def test_the_scripts_that_make_runs_are_there() -> None:
     assert [
-        name for name in re.findall(r"scripts/\S+", (ROOT / "Makefile").read_text()) if not (ROOT / name).is_file()
+        name
+        for name in re.findall(r"scripts/\S+", (ROOT / "Makefile").read_text())
+        if not (ROOT / name).is_file()
     ] == []
 
 
 def test_every_target_for_tests_is_called_by_a_workflow_and_by_ci() -> None:
     makefile = (ROOT / "Makefile").read_text()
-    wanted = {name for name in re.findall(r"^([a-z-]+):.*##", makefile, re.MULTILINE) if name.startswith("test")}
+    wanted = {
+        name
+        for name in re.findall(r"^([a-z-]+):.*##", makefile, re.MULTILINE)
+        if name.startswith("test")
+    }
     wanted |= {"lint", "docs"}
     text = "".join(step.get("run", "") + "\n" for workflow in WORKFLOWS for step in steps(workflow))
     assert wanted <= set(re.findall(r"\bmake ([a-z-]+)", text))
@@ -159,16 +185,34 @@ REPOSITORY = "https://example.org/owner/gsbench/"
         ("[a](../README.md)", "docs", None, "[a](index.md)"),
         ("[a](../conf/densify/)", "docs", None, "a (`conf/densify`)"),
         ("[conf/densify](../conf/densify/)", "docs", None, "conf/densify"),
-        ("[a](../conf/densify/)", "docs", REPOSITORY, "[a](https://example.org/owner/gsbench/tree/main/conf/densify)"),
-        ("[a](LICENSE)", "", REPOSITORY, "[a](https://example.org/owner/gsbench/blob/main/LICENSE)"),
+        (
+            "[a](../conf/densify/)",
+            "docs",
+            REPOSITORY,
+            "[a](https://example.org/owner/gsbench/tree/main/conf/densify)",
+        ),
+        (
+            "[a](LICENSE)",
+            "",
+            REPOSITORY,
+            "[a](https://example.org/owner/gsbench/blob/main/LICENSE)",
+        ),
         ("[a](https://example.org)", "docs", None, "[a](https://example.org)"),
         ("![a](demo.jpg)", "docs", None, "![a](demo.jpg)"),
-        ("[a](nowhere.md)", "docs", REPOSITORY, "[a](nowhere.md)"),  # is left to MkDocs, which refuses it
-        ("[a](../../../../../../etc/passwd)", "docs", REPOSITORY, "[a](../../../../../../etc/passwd)"),
+        # is left to MkDocs, which refuses it
+        ("[a](nowhere.md)", "docs", REPOSITORY, "[a](nowhere.md)"),
+        (
+            "[a](../../../../../../etc/passwd)",
+            "docs",
+            REPOSITORY,
+            "[a](../../../../../../etc/passwd)",
+        ),
         ("```\n[a](../conf/densify/)\n```", "docs", None, "```\n[a](../conf/densify/)\n```"),
     ],
 )
-def test_links_lead_on_from_the_site(link: str, folder: str, repository: str | None, wanted: str) -> None:
+def test_links_lead_on_from_the_site(
+    link: str, folder: str, repository: str | None, wanted: str
+) -> None:
     assert script("build_site").with_site_links(link, ROOT / folder, repository) == wanted
 
 

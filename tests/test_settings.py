@@ -1,4 +1,5 @@
-"""Values are held against the annotations of dataclasses, gsbench's and a user's, in a line that names the key."""
+"""Values are held against the annotations of dataclasses, gsbench's and a user's, in a line that
+names the key."""
 
 from __future__ import annotations
 
@@ -57,8 +58,16 @@ class Options:
         ("kind", "curve", "options.kind must be 'soft' or 'hard', got 'curve'"),
         ("limit", 1, "options.limit must be a whole number of at least 2 or null, got 1"),
         ("color", [0, 0], "options.color must be a list of 3, each a number, got [0, 0]"),
-        ("color", [0, 0, True], "options.color must be a list of 3, each a number, got [0, 0, True]"),
-        ("steps", [3, -1], "options.steps must be a list, each a whole number above 0, got [3, -1]"),
+        (
+            "color",
+            [0, 0, True],
+            "options.color must be a list of 3, each a number, got [0, 0, True]",
+        ),
+        (
+            "steps",
+            [3, -1],
+            "options.steps must be a list, each a whole number above 0, got [3, -1]",
+        ),
         ("label", {"a": 1}, "options.label must be a text, got {'a': 1}"),
         ("digits", "x", "options.digits must be digits only, got 'x'"),
         ("flag", "maybe", "options.flag must be true or false, got 'maybe'"),
@@ -75,7 +84,14 @@ def test_words_for_what_is_not_allowed(name: str, given: Any, words: str) -> Non
 def test_values_are_converted_to_their_type() -> None:
     given = {"count": 1e3, "rate": 2, "color": [0, 1, 2], "label": 7, "flag": "yes", "folder": "a"}
     result = check_values(Options, given, "options")
-    assert result == {"count": 1000, "rate": 2.0, "color": (0, 1, 2), "label": "7", "flag": True, "folder": Path("a")}
+    assert result == {
+        "count": 1000,
+        "rate": 2.0,
+        "color": (0, 1, 2),
+        "label": "7",
+        "flag": True,
+        "folder": Path("a"),
+    }
     assert [type(result[name]) for name in ("count", "rate", "label")] == [int, float, str]
 
 
@@ -87,7 +103,8 @@ def test_the_authors_default_may_be_what_no_user_may_give() -> None:
 
 def test_unknown_keys_name_the_nearest() -> None:
     with pytest.raises(
-        InputError, match=r"^options\.cuont is not a setting; did you mean count\? \(there are: count, "
+        InputError,
+        match=r"^options\.cuont is not a setting; did you mean count\? \(there are: count, ",
     ):
         check_values(Options, {"cuont": 1}, "options")
     with pytest.raises(InputError, match=r"options\.state is not a setting"):
@@ -119,7 +136,8 @@ def test_library_callers_get_the_same_errors(make: Any, key: str) -> None:
 
 @dataclass
 class Own(ADC):
-    """A user's class: its own fields carry no rule but their type, and its author knows nothing of this module."""
+    """A user's class: its own fields carry no rule but their type, and its author knows nothing of
+    this module."""
 
     patience: int = 5
 
@@ -133,7 +151,9 @@ def test_a_users_own_fields_are_checked_by_their_type() -> None:
 
 ANYTHING = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
-    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=3), inner, max_size=3),
+    lambda inner: (
+        st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=3), inner, max_size=3)
+    ),
     max_leaves=6,
 )
 

@@ -16,13 +16,21 @@ import pytest
 import torch
 
 from gsbench.errors import InputError
-from gsbench.weights import MissingWeightsError, WeightsFile, find_all_weights, find_weights, load_state
+from gsbench.weights import (
+    MissingWeightsError,
+    WeightsFile,
+    find_all_weights,
+    find_weights,
+    load_state,
+)
 from tests.datasets.server import Manners, Server, serve
 
 STATE = {"a.weight": torch.arange(6.0).reshape(2, 3), "a.bias": torch.zeros(2)}
 
 
-def spec(content: bytes | None = None, url: str | None = None, digits: int = 64, name: str = "net.pth") -> WeightsFile:
+def spec(
+    content: bytes | None = None, url: str | None = None, digits: int = 64, name: str = "net.pth"
+) -> WeightsFile:
     sha256 = None if content is None else hashlib.sha256(content).hexdigest()[:digits]
     return WeightsFile((name, f"other/{name}"), url, sha256, "example.org")
 
@@ -37,7 +45,11 @@ def empty_caches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_search_order_is_argument_environment_cache(
     tmp_path: Path, empty_caches: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    places = [tmp_path / "argument" / "deep" / "below", tmp_path / "environment" / "other", empty_caches]
+    places = [
+        tmp_path / "argument" / "deep" / "below",
+        tmp_path / "environment" / "other",
+        empty_caches,
+    ]
     for place in places:
         place.mkdir(parents=True)
         (place / "net.pth").write_bytes(b"x")
@@ -49,11 +61,15 @@ def test_search_order_is_argument_environment_cache(
 
 
 @pytest.mark.parametrize("digits", [16, 64])
-def test_wrong_checksum_is_refused_and_a_right_copy_elsewhere_taken(tmp_path: Path, empty_caches: Path, digits: int):
+def test_wrong_checksum_is_refused_and_a_right_copy_elsewhere_taken(
+    tmp_path: Path, empty_caches: Path, digits: int
+):
     folder = tmp_path / "mine"
     folder.mkdir()
     (folder / "net.pth").write_bytes(b"truncat")
-    with pytest.raises(MissingWeightsError, match=r"net.pth has sha256 .* wrong or truncated; replace it"):
+    with pytest.raises(
+        MissingWeightsError, match=r"net.pth has sha256 .* wrong or truncated; replace it"
+    ):
         find_weights(spec(b"truncated", digits=digits), folder)
     empty_caches.mkdir(parents=True)
     (empty_caches / "net.pth").write_bytes(b"truncated")
@@ -64,7 +80,13 @@ def test_missing_files_are_named_together_with_places_and_sources(tmp_path: Path
     with pytest.raises(MissingWeightsError) as caught:
         find_all_weights([spec(), spec(name="second.pth")], tmp_path, download=False)
     message = str(caught.value)
-    for part in ("net.pth, second.pth", str(tmp_path), "GSBENCH_WEIGHTS", "example.org", "switched off"):
+    for part in (
+        "net.pth, second.pth",
+        str(tmp_path),
+        "GSBENCH_WEIGHTS",
+        "example.org",
+        "switched off",
+    ):
         assert part in message
     assert "\n" not in message
     with pytest.raises(InputError, match="does not exist"):
@@ -92,7 +114,9 @@ def test_download_is_checked_and_kept(server: Server, empty_caches: Path):
     assert len(server.requests) == 1
 
 
-def test_download_says_how_far_it_is(server: Server, empty_caches: Path, caplog: pytest.LogCaptureFixture):
+def test_download_says_how_far_it_is(
+    server: Server, empty_caches: Path, caplog: pytest.LogCaptureFixture
+):
     caplog.set_level(logging.INFO, "gsbench")
     url = served(server, b"g" * 2_500_000)
     find_weights(spec(b"g" * 2_500_000, url))
@@ -108,7 +132,8 @@ def test_download_shows_a_bar_on_a_terminal(server: Server):
     pty = pytest.importorskip("pty", reason="needs terminals as Unix has them")
     code = (
         "from gsbench.weights import WeightsFile, find_weights\n"
-        f"find_weights(WeightsFile(('net.pth',), {served(server, b'g' * 2_500_000)!r}, None, 'example.org'))"
+        f"find_weights(WeightsFile(('net.pth',), {served(server, b'g' * 2_500_000)!r}, None, "
+        "'example.org'))"
     )
     ours, theirs = pty.openpty()
     environment = dict(os.environ) | {"TERM": "xterm", "COLUMNS": "100"}
@@ -146,7 +171,9 @@ def test_download_that_ends_early_or_is_damaged_leaves_nothing(
 
 def test_without_a_network_the_answer_comes_at_once():
     """One attempt, and no waiting for another."""
-    with pytest.raises(MissingWeightsError, match=r"the download failed: .*1 failures in a row .*refused"):
+    with pytest.raises(
+        MissingWeightsError, match=r"the download failed: .*1 failures in a row .*refused"
+    ):
         find_weights(spec(url="http://127.0.0.1:9/net.pth"))
 
 

@@ -1,4 +1,5 @@
-"""Every word on the command line is understood, or refused before any work: exit code 2 and one line that says why."""
+"""Every word on the command line is understood, or refused before any work: exit code 2 and one
+line that says why."""
 
 from __future__ import annotations
 
@@ -69,7 +70,8 @@ REFUSED = {  # command line: a part of the line that refuses it
     "densify=adc densify.volume_threshold=1": "it belongs to densify=volumetric",
     f"+densify.x={'[' * 50}": "more than 40 brackets within each other",
     f"seed={'1' * 5000}": "is not a setting like key=value",
-    "+experiment=typo --config-dir conf": "train.iteration is not a setting in experiment/typo.yaml; did you mean it",
+    "+experiment=typo --config-dir conf": "train.iteration is not a setting in "
+    "experiment/typo.yaml; did you mean it",
     "+experiment=bomb --config-dir bombs": "its aliases stand for more than 100,000 values",
     "densify=null": "choose one by its name",
     "scene=[courtyard]": "choose one by its name",
@@ -88,7 +90,8 @@ REFUSED = {  # command line: a part of the line that refuses it
     "-m densify.volume_threshold=interval(nan,1)": "from a number to a larger one",
     "-m densify.volume_threshold=interval(0,inf)": "from a number to a larger one",
     "-m densify=adc densify.volume_threshold=interval(0,1)": "it belongs to densify=volumetric",
-    "-m hydra.sweeper.tune.seed=-1 densify.volume_threshold=interval(0,1)": "seed must be a whole number in [0,",
+    "-m hydra.sweeper.tune.seed=-1 densify.volume_threshold=interval(0,1)": "seed must be a whole "
+    "number in [0,",
     "-m hydra.sweeper.tune.at_onec=2 seed=0,1": "did you mean at_once?",
     "-m hydra/sweeper=nosuch seed=0,1": "a search is an interval and hydra.sweeper.tune.points",
     "-m hydra.sweeper.params=x seed=0,1": "must map settings to values",
@@ -104,7 +107,7 @@ REFUSED = {  # command line: a part of the line that refuses it
     "seed=${nosuch}": "Interpolation key 'nosuch' not found",
     "seed=${": "is not a setting like key=value",
     "seed=": "got ''",
-    "name=größe": "name=\"größe\"",
+    "name=größe": 'name="größe"',
     "name=store": "none of store",
     "name=../up": "a plain folder name",
     "name=a:b": "a plain folder name",
@@ -138,17 +141,24 @@ REFUSED = {  # command line: a part of the line that refuses it
     # components
     "densify.start=-1": "densify.start must be a whole number of at least 0, got -1",
     "densify.volume_interval=150": "a multiple of densify.interval (100)",
-    "-m densify.volume_threshold=0.03,-1": "densify.volume_threshold must be a number above 0, got -1",
+    "-m densify.volume_threshold=0.03,-1": "densify.volume_threshold must be a number above 0, "
+    "got -1",
     "--dry-run densify.volume_threshold=-1": "densify.volume_threshold must be",
     "densify._target_=gsbench.errors.InputError": "not a class for densify",
     "densify._target_=os.system": "allow_targets=[os]",
-    "densify._target_=own.Own allow_targets=[own]": "remove it by ~densify.volume_threshold, or start",
+    "densify._target_=own.Own allow_targets=[own]": "remove it by ~densify.volume_threshold, or "
+    "start",
     "densify._target_=nosuch.X allow_targets=[nosuch]": "No module named 'nosuch'",
     "densify._target_=broken.X allow_targets=[broken]": "SyntaxError",
-    "densify=adc densify._target_=own.Raises allow_targets=[own]": "own.Raises cannot be made (KeyError",
-    "densify=adc densify._target_=own.Own allow_targets=[own] +densify.patiense=1": "did you mean patience?",
-    "densify=adc densify._target_=own.Own allow_targets=[own] +densify.patience=x": "must be a whole number, got 'x'",
-    "densify=pixelgs raster=gsplat": "does not give them; take raster=reference or raster=cpu or raster=triton",
+    "densify=adc densify._target_=own.Raises allow_targets=[own]": "own.Raises cannot be made "
+    "(KeyError",
+    "densify=adc densify._target_=own.Own allow_targets=[own] +densify.patiense=1": "did you mean "
+    "patience?",
+    "densify=adc densify._target_=own.Own allow_targets=[own] +densify.patience=x": "must be a "
+    "whole "
+    "number, got 'x'",
+    "densify=pixelgs raster=gsplat": "does not give them; take raster=reference or raster=cpu or "
+    "raster=triton",
     "init._target_=5": "the import path of a class",
     # verbs and questions
     "tables": "required: experiment",
@@ -170,7 +180,7 @@ REFUSED = {  # command line: a part of the line that refuses it
     "tables x --zzz": "unrecognized arguments: --zzz (see",
     "--cfg nosuch": "invalid choice",
     "--resolve": "ask one thing",
-}  # fmt: skip
+}
 OWN = """
 from dataclasses import dataclass
 from gsbench.densify import ADC
@@ -198,16 +208,23 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         "# @package _global_\nhydra:\n  callbacks:\n    x:\n      _target_: os.system\n"
     )
     (experiments / "typo.yaml").write_text("# @package _global_\ntrain: {iteration: 300}\n")
-    bomb = ["a0: &a0 [x]", *(f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]" for i in range(1, 10))]
+    bomb = [
+        "a0: &a0 [x]",
+        *(f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]" for i in range(1, 10)),
+    ]
     (tmp_path / "bombs" / "experiment").mkdir(parents=True)
-    (tmp_path / "bombs" / "experiment" / "bomb.yaml").write_text("\n".join(["# @package _global_", *bomb]) + "\n")
+    (tmp_path / "bombs" / "experiment" / "bomb.yaml").write_text(
+        "\n".join(["# @package _global_", *bomb]) + "\n"
+    )
     for module in ("own", "broken"):
         monkeypatch.delitem(sys.modules, module, raising=False)
     return tmp_path
 
 
 @pytest.mark.parametrize("command", REFUSED)
-def test_what_is_not_understood_is_refused(command: str, place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_is_not_understood_is_refused(
+    command: str, place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert cli.run(shlex.split(command)) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("gsbench: ")
@@ -216,7 +233,9 @@ def test_what_is_not_understood_is_refused(command: str, place: Path, capsys: py
 
 
 @pytest.mark.parametrize("command", ["", "-m", "--multirun"])
-def test_no_setting_is_a_question(command: str, place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_no_setting_is_a_question(
+    command: str, place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert cli.run(shlex.split(command)) == 0
     assert "gsbench --help" in capsys.readouterr().out
     assert not (place / "runs").exists()
@@ -229,7 +248,9 @@ def test_no_setting_is_a_question(command: str, place: Path, capsys: pytest.Capt
         "check --dry-run allow_targets=[x] {}",
     ],
 )
-def test_permission_counts_wherever_it_stands(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_permission_counts_wherever_it_stands(
+    command: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert cli.run(shlex.split(command.format("nosuch.yaml"))) == 2
     assert "nosuch.yaml cannot be read" in capsys.readouterr().err
 
@@ -237,7 +258,11 @@ def test_permission_counts_wherever_it_stands(command: str, capsys: pytest.Captu
 @pytest.mark.parametrize("command", ["seed=1", "status", "tables x"])
 @pytest.mark.parametrize("runs", ["file", "file/below", "~nosuchuser/x", ""])
 def test_a_runs_folder_that_cannot_be(
-    runs: str, command: str, place: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    runs: str,
+    command: str,
+    place: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     (place / "file").touch()
     monkeypatch.setenv("GSBENCH_RUNS", runs)
@@ -258,7 +283,9 @@ def test_a_few_through_a_process_of_their_own(place: Path) -> None:
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     for command in ("+extra=1", "-m seed=range(0,0)", "=3"):
         argv = [sys.executable, "-m", "gsbench.cli", *shlex.split(command)]
-        done = subprocess.run(argv, capture_output=True, text=True, env=environment, timeout=120, check=False)
+        done = subprocess.run(
+            argv, capture_output=True, text=True, env=environment, timeout=120, check=False
+        )
         assert (done.returncode, len(done.stderr.splitlines())) == (2, 1), done.stderr
 
 
@@ -275,7 +302,9 @@ def test_a_few_through_a_process_of_their_own(place: Path) -> None:
 )
 def test_what_is_meant_is_understood(words: list[str]) -> None:
     (trial,) = compose_trials(words)
-    assert trial.values["launch"]["sbatch"] == ({"constraint": "a100"} if words[0] == "launch=slurm" else {})
+    assert trial.values["launch"]["sbatch"] == (
+        {"constraint": "a100"} if words[0] == "launch=slurm" else {}
+    )
 
 
 def test_glob_lists_the_options_of_a_group() -> None:
@@ -294,10 +323,16 @@ def test_report_writes_into_a_folder_as_tables_does(place: Path) -> None:
 
 # ---- property: any value of any setting is taken and then stays, or refused in one line
 
-SCHEMA_KEYS = [(group, entry.name) for group, schema in GROUP_SCHEMAS.items() for entry in option_fields(schema)]
+SCHEMA_KEYS = [
+    (group, entry.name)
+    for group, schema in GROUP_SCHEMAS.items()
+    for entry in option_fields(schema)
+]
 VALUES: st.SearchStrategy[Any] = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text("aB1./~é \n", max_size=6),
-    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.sampled_from("abc"), inner, max_size=2),
+    lambda inner: (
+        st.lists(inner, max_size=4) | st.dictionaries(st.sampled_from("abc"), inner, max_size=2)
+    ),
     max_leaves=5,
 )
 
@@ -320,16 +355,40 @@ def test_any_value_of_any_setting(key: tuple[str, str], value: Any) -> None:
 
 HASHES = {
     (): "5d59aece011332a8ab4b106f91ac3a6cc962543c4b3f993c9e6b4cfa67b2faa7",
-    ("scene=photos", "scene.path=/data/p", "scene.max_size=800", "densify=adc", "train=paper", "eval=standard"):
-        "bb9e7023169c84457ca7abbe7b639da069e14c71e0c29b496ccdab2097e93bbc",
-    ("train.opacity=1", "train.max_seconds=60", "train.background=[1,1,1]", "densify.prune_size=1", "eval.lpips=[vgg]",
-     "train.volume_histogram=[]", "init.peak_threshold=1"):
-        "e5017d6ba47870e7fc87eb787ac6119f07f10790c8aefe1cdd8c9c2aad5dea76",
-    ("densify=mcmc", "init=random", "densify.max_gaussians=1e5", "scene.downscale=2", "launch=local", "tracking=none"):
-        "9cf12f152de05c002f1bcb5729ff5265d6c8a6ece7083aac0a668483e5a7fd38",
-    ("scene.name=2024", "scene.train_list=a.txt", "eval.weights=null", "threads=3", "seed=7", "densify.name=0.5"):
-        "ff7b55a4b6262dcdb3355bb95141cf9b517195a4d9da4ebce8bf36114510132f",
-}  # fmt: skip
+    (
+        "scene=photos",
+        "scene.path=/data/p",
+        "scene.max_size=800",
+        "densify=adc",
+        "train=paper",
+        "eval=standard",
+    ): "bb9e7023169c84457ca7abbe7b639da069e14c71e0c29b496ccdab2097e93bbc",
+    (
+        "train.opacity=1",
+        "train.max_seconds=60",
+        "train.background=[1,1,1]",
+        "densify.prune_size=1",
+        "eval.lpips=[vgg]",
+        "train.volume_histogram=[]",
+        "init.peak_threshold=1",
+    ): "e5017d6ba47870e7fc87eb787ac6119f07f10790c8aefe1cdd8c9c2aad5dea76",
+    (
+        "densify=mcmc",
+        "init=random",
+        "densify.max_gaussians=1e5",
+        "scene.downscale=2",
+        "launch=local",
+        "tracking=none",
+    ): "9cf12f152de05c002f1bcb5729ff5265d6c8a6ece7083aac0a668483e5a7fd38",
+    (
+        "scene.name=2024",
+        "scene.train_list=a.txt",
+        "eval.weights=null",
+        "threads=3",
+        "seed=7",
+        "densify.name=0.5",
+    ): "ff7b55a4b6262dcdb3355bb95141cf9b517195a4d9da4ebce8bf36114510132f",
+}
 
 
 @pytest.mark.parametrize("words", HASHES)

@@ -1,11 +1,13 @@
-"""Make the captures of the findings ready: cameras for each, and a thin cloud that leaves room to grow.
+"""Make the captures of the findings ready: cameras for each, and a thin cloud that leaves room to
+grow.
 
     python findings/scripts/captures.py DATA OUT
 
-``DATA`` holds a folder for each capture with ``images`` and perhaps ``sparse/0``. A capture without a model gets that
-of ``init=sfm``, since sectors of cameras need cameras before initialisation. Of each
-model `MOST_POINTS` points are kept, drawn once, so that densifiers decide where the others go. What is in ``OUT``
-already is left as it is.
+``DATA`` holds a folder for each capture with ``images`` and perhaps ``sparse/0``. A capture without
+a model gets that of ``init=sfm``, since sectors of cameras need cameras before initialisation. Of
+each
+model `MOST_POINTS` points are kept, drawn once, so that densifiers decide where the others go. What
+is in ``OUT`` already is left as it is.
 """
 
 from __future__ import annotations
@@ -18,7 +20,8 @@ from pathlib import Path
 
 import numpy as np
 
-# Each capture with what ``init=sfm`` needs to be told of it, where its defaults place too few views.
+# Each capture with what ``init=sfm`` needs to be told of it, where its defaults place too few
+# views.
 COARSE = "init.first_octave=0"
 CAPTURES: dict[str, tuple[str, ...]] = {
     "bonsai": (),
@@ -43,7 +46,8 @@ MOST_POINTS = 6000  # about what the smaller captures have
 
 
 def prepare(data: Path, out: Path) -> None:
-    """Write ``OUT/CAPTURE/{images,sparse/0}`` for each of `CAPTURES` that ``data`` holds; images are a link."""
+    """Write ``OUT/CAPTURE/{images,sparse/0}`` for each of `CAPTURES` that ``data`` holds; images
+    are a link."""
     for name in CAPTURES:
         source, target = (data / name).resolve(), out / name
         if not source.is_dir() or (target / MODEL).is_dir():
@@ -60,7 +64,8 @@ def prepare(data: Path, out: Path) -> None:
 
 
 def thin(model: Path, out: Path, most: int = MOST_POINTS) -> int:
-    """Write the COLMAP model in ``model`` with at most ``most`` of its points to ``out``; returns how many it has."""
+    """Write the COLMAP model in ``model`` with at most ``most`` of its points to ``out``; returns
+    how many it has."""
     import pycolmap
 
     reconstruction = pycolmap.Reconstruction(model)
@@ -82,7 +87,14 @@ def _estimated(name: str, source: Path, out: Path) -> Path:
     """Return the folder of the model that ``init=sfm`` makes of the photographs in ``source``."""
     model = out / "estimated" / name
     if not (model / MODEL).is_dir():
-        words = [f"scene.path={source}", f"scene.name={name}", "scene=photos", "init=sfm", "train=none", "densify=none"]
+        words = [
+            f"scene.path={source}",
+            f"scene.name={name}",
+            "scene=photos",
+            "init=sfm",
+            "train=none",
+            "densify=none",
+        ]
         words += CAPTURES[name]
         program = [str(Path(sys.executable).with_name("gsbench"))]
         settings = [f"runs={out / 'runs'}", "name=captures", "eval.lpips=[]", "tracking=none"]

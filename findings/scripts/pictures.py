@@ -1,4 +1,5 @@
-"""Write ``findings/pictures``: held-out views side by side, the photograph first, then the first seed of each arm.
+"""Write ``findings/pictures``: held-out views side by side, the photograph first, then the first
+seed of each arm.
 
     python findings/scripts/pictures.py RUNS
 
@@ -40,7 +41,8 @@ def _cap(trial: TrialResult) -> str:
     return str(trial.config["densify.cap"])
 
 
-# By the name of the picture, of the experiment findings_NAME: arm, control, and which trials make a pair of rows each.
+# By the name of the picture, of the experiment findings_NAME: arm, control, and which trials make a
+# pair of rows each.
 SHOWN: dict[str, tuple[str, str, KindOf, Sequence[str]]] = {
     "plants": ("volumetric", "adc", _split, ("interpolation", "extrapolation")),
     "parts": ("no_shrink", "adc", _split, ("interpolation",)),
@@ -56,7 +58,8 @@ SHOWN: dict[str, tuple[str, str, KindOf, Sequence[str]]] = {
 def for_and_against(
     trials: Sequence[TrialResult], rule: str, control: str, kind_of: KindOf, kinds: Sequence[str]
 ) -> Image.Image:
-    """Draw, of all scenes, the view at which ``rule`` gains most over ``control`` and that at which it loses most.
+    """Draw, of all scenes, the view at which ``rule`` gains most over ``control`` and that at which
+    it loses most.
 
     A pair of rows for each of the ``kinds`` of trials, which ``kind_of`` says of a trial.
     """
@@ -64,11 +67,15 @@ def for_and_against(
     for kind in kinds:
         found: list[tuple[float, str, Sequence[TrialResult]]] = []
         for scene in dict.fromkeys(trial.scene for trial in trials):
-            own = _first_seeds([trial for trial in trials if (trial.scene, kind_of(trial)) == (scene, kind)])
+            own = _first_seeds(
+                [trial for trial in trials if (trial.scene, kind_of(trial)) == (scene, kind)]
+            )
             if not own:  # a scene that was not split so
                 continue
             one, other = read_views(own[control]), read_views(own[rule])
-            found += [(other[view][LPIPS] - one[view][LPIPS], view, list(own.values())) for view in other]
+            found += [
+                (other[view][LPIPS] - one[view][LPIPS], view, list(own.values())) for view in other
+            ]
         found.sort(key=lambda entry: entry[:2])
         rows += [_pictures(own, view) for _, view, own in (found[0], found[-1])]
     return _joined(rows)
@@ -91,7 +98,9 @@ def _joined(rows: Sequence[Sequence[Image.Image]]) -> Image.Image:
     """Join the rows below each other, each picture in a column as wide as the widest."""
     width = max(picture.width for row in rows for picture in row)
     heights = [max(picture.height for picture in row) for row in rows]
-    joined = Image.new("RGB", (len(rows[0]) * (width + GAP) - GAP, sum(heights) + GAP * (len(rows) - 1)), "white")
+    joined = Image.new(
+        "RGB", (len(rows[0]) * (width + GAP) - GAP, sum(heights) + GAP * (len(rows) - 1)), "white"
+    )
     for index, pictures in enumerate(rows):
         for column, picture in enumerate(pictures):
             joined.paste(picture, (column * (width + GAP), sum(heights[:index]) + GAP * index))

@@ -2,7 +2,8 @@
 
     python findings/scripts/scenes.py PREPARED
 
-``PREPARED`` is what ``captures.py`` wrote. `tables.py` holds these facts against the gain of the volume rule.
+``PREPARED`` is what ``captures.py`` wrote. `tables.py` holds these facts against the gain of the
+volume rule.
 """
 
 from __future__ import annotations
@@ -16,17 +17,21 @@ from PIL import Image
 
 FACTS = Path(__file__).parents[1] / "archives" / "scenes.csv"
 MAX_SIZE = 256  # px, as in training
-EXTENT = 1.1  # 3DGS: the scene's extent is this times the largest distance of a camera from their mean
+EXTENT = (
+    1.1  # 3DGS: the scene's extent is this times the largest distance of a camera from their mean
+)
 RENAMED = {"herz_jesus_p25": "herz_jesus"}  # as the claims call it
 
 
 def facts_of(capture: Path) -> dict[str, float]:
-    """Measure a capture with ``images`` and ``sparse/0``; lengths are in scene extents, angles in degrees.
+    """Measure a capture with ``images`` and ``sparse/0``; lengths are in scene extents, angles in
+    degrees.
 
-    ``camera_distance``: of a point to the camera nearest to it, median. ``depth_spread``: in a view, the ratio of the
-    90 % and the 10 % quantile of the depths of its points, median over views. ``texture``: mean slope of luminance,
-    in grey values a pixel. ``camera_angle``: between the axes of a camera and of the one nearest in angle, median.
-    ``points_per_pixel``: points by all pixels of all views.
+    ``camera_distance``: of a point to the camera nearest to it, median. ``depth_spread``: in a
+    view, the ratio of the 90 % and the 10 % quantile of the depths of its points, median over
+    views. ``texture``: mean slope of luminance, in grey values a pixel. ``camera_angle``: between
+    the axes of a camera and of the one nearest in angle, median. ``points_per_pixel``: points by
+    all pixels of all views.
     """
     import pycolmap
 
@@ -47,7 +52,13 @@ def facts_of(capture: Path) -> dict[str, float]:
             grey = np.asarray(picture.convert("L"), float)
         pixels += grey.size
         slopes.append(np.hypot(*np.gradient(grey)).mean())
-        seen = np.array([model.points3D[p.point3D_id].xyz for p in image.points2D if p.point3D_id in model.points3D])
+        seen = np.array(
+            [
+                model.points3D[p.point3D_id].xyz
+                for p in image.points2D
+                if p.point3D_id in model.points3D
+            ]
+        )
         if len(seen) > 1:
             low, high = np.quantile(seen @ pose[2, :3] + pose[2, 3], (0.1, 0.9))
             spreads.append(high / low)

@@ -1,4 +1,5 @@
-"""``scripts/captures.py`` on captures of made cameras: which points are kept, what is asked of gsbench, what stays."""
+"""``scripts/captures.py`` on captures of made cameras: which points are kept, what is asked of
+gsbench, what stays."""
 
 from __future__ import annotations
 
@@ -60,7 +61,9 @@ def test_a_thin_cloud_with_the_same_cameras_and_photographs(tmp_path: Path) -> N
     assert len(points_of(tmp_path / "data" / "fox")) == COUNT, "the capture itself stays as it is"
 
 
-def test_what_is_there_stays_and_what_is_not_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_is_there_stays_and_what_is_not_is_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     write_capture(tmp_path / "data" / "fox", points=20)
     captures.prepare(tmp_path / "data", tmp_path / "out")
     files = {path: path.stat().st_mtime_ns for path in (tmp_path / "out").rglob("*")}
@@ -73,8 +76,11 @@ def test_what_is_there_stays_and_what_is_not_is_said(tmp_path: Path, capsys: pyt
     assert len(lines) == len(captures.CAPTURES)
 
 
-def test_a_run_that_was_killed_is_gone_on_with(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A capture counts as ready when all of it is there; the photographs behind the link stay in any case."""
+def test_a_run_that_was_killed_is_gone_on_with(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A capture counts as ready when all of it is there; the photographs behind the link stay in
+    any case."""
     write_capture(tmp_path / "data" / "fox", points=20)
 
     def killed(self: pycolmap.Reconstruction, folder: Path) -> None:
@@ -92,8 +98,11 @@ def test_a_run_that_was_killed_is_gone_on_with(tmp_path: Path, monkeypatch: pyte
     assert (tmp_path / "data" / "fox" / "images" / "0.png").is_file()
 
 
-def test_a_capture_without_a_model_gets_the_estimated_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The two commands are understood by gsbench, and the entry that the second names is where the first writes."""
+def test_a_capture_without_a_model_gets_the_estimated_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The two commands are understood by gsbench, and the entry that the second names is where the
+    first writes."""
     write_capture(tmp_path / "data" / "monstree", model=False)
     asked: list[str] = []
 
@@ -114,7 +123,9 @@ def test_a_capture_without_a_model_gets_the_estimated_one(tmp_path: Path, monkey
     monkeypatch.setattr(captures.subprocess, "run", answer)
     captures.prepare(tmp_path / "data", tmp_path / "out")
     assert len(asked) == 2
-    np.testing.assert_array_equal(points_of(tmp_path / "out" / "monstree"), np.unique(np.eye(3), axis=0))
+    np.testing.assert_array_equal(
+        points_of(tmp_path / "out" / "monstree"), np.unique(np.eye(3), axis=0)
+    )
     (tmp_path / "out" / "monstree" / "sparse" / "0").rename(tmp_path / "moved")
     (tmp_path / "out" / "monstree" / "images").unlink()
     captures.prepare(tmp_path / "data", tmp_path / "out")

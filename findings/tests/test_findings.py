@@ -18,9 +18,24 @@ import tables  # noqa: E402
 
 pytestmark = pytest.mark.slow
 
-FIGURE = re.compile(r"[+−]\d+\.\d+|(?<![\d.,])0\.\d+|\d{1,3}(?:,\d{3})+")  # differences, shares and large counts
-# Figures of settings, and one of a training without a cap that is in no archive (1.96 million is written otherwise).
-SETTINGS = {"1,000", "2,000", "3,000", "5,000", "6,000", "10,000", "15,000", "20,000", "30,000", "40,000", "100,000"}
+FIGURE = re.compile(
+    r"[+−]\d+\.\d+|(?<![\d.,])0\.\d+|\d{1,3}(?:,\d{3})+"
+)  # differences, shares and large counts
+# Figures of settings, and one of a training without a cap that is in no archive (1.96 million is
+# written otherwise).
+SETTINGS = {
+    "1,000",
+    "2,000",
+    "3,000",
+    "5,000",
+    "6,000",
+    "10,000",
+    "15,000",
+    "20,000",
+    "30,000",
+    "40,000",
+    "100,000",
+}
 PAGE = tables.README.read_text(encoding="utf-8")
 
 
@@ -38,7 +53,9 @@ def test_every_figure_of_the_page_stands_in_a_table() -> None:
 
 
 def test_what_the_page_says_of_seeds_is_so() -> None:
-    def of(name: str, arm: str, scene: str, split: str = "interpolation", **kept: object) -> tuple[float, float]:
+    def of(
+        name: str, arm: str, scene: str, split: str = "interpolation", **kept: object
+    ) -> tuple[float, float]:
         frame = tables.read_trials(name)
         for key, value in kept.items():
             frame = frame[frame[key] == value]
@@ -48,7 +65,10 @@ def test_what_the_page_says_of_seeds_is_so() -> None:
     for split in tables.SPLITS:
         assert of("volume", "volumetric", "flower", split)[1] < 0
         assert of("dimension", "volumetric-1", "flower", split)[1] < 0
-    assert all(of("dimension", "volumetric-1", scene)[0] > 0 for scene in ("bonsai", "courtyard", "kitchen"))
+    assert all(
+        of("dimension", "volumetric-1", scene)[0] > 0
+        for scene in ("bonsai", "courtyard", "kitchen")
+    )
     assert of("full", "volumetric", "bonsai", cap="soft")[0] > 0
     assert of("full", "volumetric_once", "bonsai", cap="soft")[1] < 0
     clouds = tables.differences(tables.read_trials("initialisers"), "sfm", "random", tables.LPIPS)
@@ -71,14 +91,20 @@ def test_claims_can_be_read(file: Path) -> None:
     assert read_claims(file).claims
 
 
-@pytest.mark.parametrize("file", sorted(FINDINGS.glob("experiment/*.yaml")), ids=lambda file: file.stem)
+@pytest.mark.parametrize(
+    "file", sorted(FINDINGS.glob("experiment/*.yaml")), ids=lambda file: file.stem
+)
 def test_experiments_are_composed(file: Path) -> None:
     path = ["init.path=/somewhere"] if "override /init: points" in file.read_text() else []
-    trials = compose_trials([f"hydra.searchpath=['file://{FINDINGS}']", f"+experiment={file.stem}", *path])
+    trials = compose_trials(
+        [f"hydra.searchpath=['file://{FINDINGS}']", f"+experiment={file.stem}", *path]
+    )
     assert len(trials) >= 6
 
 
-@pytest.mark.parametrize("file", sorted(FINDINGS.glob("archives/*.zip")), ids=lambda file: file.stem)
+@pytest.mark.parametrize(
+    "file", sorted(FINDINGS.glob("archives/*.zip")), ids=lambda file: file.stem
+)
 def test_archives_are_small_and_name_no_folder_of_a_machine(file: Path) -> None:
     assert file.stat().st_size < 300_000
     with zipfile.ZipFile(file) as archive:

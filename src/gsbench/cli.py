@@ -1,4 +1,5 @@
-"""The command line: ``gsbench`` is a Hydra app, and a first word without ``=``, ``+``, ``~`` or ``-`` is a verb.
+"""The command line: ``gsbench`` is a Hydra app, and a first word without ``=``, ``+``, ``~`` or
+``-`` is a verb.
 
 Nothing here loads torch, so that ``--help`` and the verbs that only read files answer at once.
 """
@@ -54,7 +55,8 @@ def run(argv: list[str]) -> int:
         return _refuse(error, TRIAL_FAILED)
     except KeyboardInterrupt as stop:
         print(
-            f"gsbench: stopped{f' by {stop}' if str(stop) else ''}; to continue, give the same command again",
+            f"gsbench: stopped{f' by {stop}' if str(stop) else ''}; to continue, give the same "
+            "command again",
             file=sys.stderr,
         )
         return getattr(stop, "exit_code", INTERRUPTED)
@@ -70,15 +72,20 @@ def run(argv: list[str]) -> int:
 
 
 def _is_interrupt(error: BaseException | None) -> bool:
-    """Return whether a Ctrl-C caused an error: a native module that it stops while loading raises ImportError."""
+    """Return whether a Ctrl-C caused an error: a native module that it stops while loading raises
+    ImportError."""
     return error is not None and (
         isinstance(error, KeyboardInterrupt) or _is_interrupt(error.__cause__ or error.__context__)
     )
 
 
 def _refuse(error: GsbenchError, code: int) -> int:
-    """Print an error as one line, also if a file's name or a library's message has line breaks or odd bytes."""
-    print("gsbench: " + " ".join(str(error).split()).encode("utf-8", "backslashreplace").decode(), file=sys.stderr)
+    """Print an error as one line, also if a file's name or a library's message has line breaks or
+    odd bytes."""
+    print(
+        "gsbench: " + " ".join(str(error).split()).encode("utf-8", "backslashreplace").decode(),
+        file=sys.stderr,
+    )
     return code
 
 
@@ -102,7 +109,7 @@ gsbench tests whether an idea helps 3D Gaussian Splatting.
   gsbench -m densify=adc,volumetric seed=0,1,2                   a sweep
   gsbench +experiment=demo                                       a sweep from a file
   gsbench scene=photos scene.path=/my/photos                     your own photographs
-  gsbench +experiment=table1 --dry-run                           list the trials and their state; run nothing
+  gsbench +experiment=table1 --dry-run                           list the trials; run nothing
   gsbench --cfg job [settings]                                   show the configuration
   gsbench --version                                              say which gsbench this is
 """

@@ -20,7 +20,8 @@ MAX_PAUSE_SECONDS = 30.0
 
 
 class FetchError(GsbenchError):
-    """Error of the network or the server (exit code 1). The same command continues where it stopped."""
+    """Error of the network or the server (exit code 1). The same command continues where it
+    stopped."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +34,8 @@ class RetryPolicy:
 
 
 def with_retries(action: Callable[[], T], url: str, policy: RetryPolicy) -> T:
-    """The result of ``action``, which requests ``url`` and is repeated after failures of the network.
+    """The result of ``action``, which requests ``url`` and is repeated after failures of the
+    network.
 
     Raises `InputError` for a permanent refusal by the server, and `FetchError` after the last try.
     """
@@ -48,17 +50,21 @@ def with_retries(action: Callable[[], T], url: str, policy: RetryPolicy) -> T:
                 f"{url}: the certificate is not trusted here ({error}): fix it, or give --mirror"
             ) from None
         except (requests.exceptions.InvalidURL, requests.exceptions.InvalidSchema) as error:
-            raise InputError(f"{url}: no address that can be fetched ({error}): give another with --mirror") from None
+            raise InputError(
+                f"{url}: no address that can be fetched ({error}): give another with --mirror"
+            ) from None
         except (requests.RequestException, urllib3.exceptions.HTTPError) as error:
             answer = getattr(error, "response", None)
             if answer is not None and answer.status_code not in TRANSIENT:
                 raise InputError(
-                    f"{url}: the server says {answer.status_code} {answer.reason}: give another address with --mirror"
+                    f"{url}: the server says {answer.status_code} {answer.reason}: give another "
+                    "address with --mirror"
                 ) from None
             reason = _reason(error)
             if failures == policy.tries:
                 raise FetchError(
-                    f"{url}: {failures} failures in a row ({reason}): to continue, give the same command again"
+                    f"{url}: {failures} failures in a row ({reason}): to continue, give the same "
+                    "command again"
                 ) from error
         pause = min(MAX_PAUSE_SECONDS, policy.pause * 2 ** (failures - 1))
         log.info("%s: trying again in %.3g s", reason, pause)
@@ -66,11 +72,13 @@ def with_retries(action: Callable[[], T], url: str, policy: RetryPolicy) -> T:
     raise AssertionError("no try was allowed")
 
 
-def download(url: str, target: Path, policy: RetryPolicy, advance: Callable[[int, int | None], None]) -> str:
+def download(
+    url: str, target: Path, policy: RetryPolicy, advance: Callable[[int, int | None], None]
+) -> str:
     """Write the file at ``url`` to ``target``; returns its sha256 in hexadecimal.
 
-    ``advance`` gets the number of bytes so far and in total, or None if the server does not say. Each try starts from
-    the beginning. Raises the errors of `with_retries`.
+    ``advance`` gets the number of bytes so far and in total, or None if the server does not say.
+    Each try starts from the beginning. Raises the errors of `with_retries`.
     """
     import requests
 
@@ -97,13 +105,18 @@ def download(url: str, target: Path, policy: RetryPolicy, advance: Callable[[int
 
 
 def _reason(error: Exception) -> str:
-    """The innermost cause of an error of requests, which wraps errors of urllib3, in a few words."""
+    """The innermost cause of an error of requests, which wraps errors of urllib3, in a few
+    words."""
     import requests
     import urllib3
 
-    if isinstance(error, requests.exceptions.Timeout | urllib3.exceptions.TimeoutError) or "timed out" in str(error):
+    if isinstance(
+        error, requests.exceptions.Timeout | urllib3.exceptions.TimeoutError
+    ) or "timed out" in str(error):
         return "no answer in time"
-    if isinstance(error, requests.exceptions.ChunkedEncodingError | urllib3.exceptions.ProtocolError):
+    if isinstance(
+        error, requests.exceptions.ChunkedEncodingError | urllib3.exceptions.ProtocolError
+    ):
         return "the connection was cut"
     inner = error
     while isinstance(inner, Exception) and inner.args and isinstance(inner.args[0], Exception):

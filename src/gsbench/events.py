@@ -10,7 +10,8 @@ from typing import ClassVar
 
 
 class Cause(IntEnum):
-    """Cause of a Gaussian's existence: its number in ``lineage.npz``, words, and a colour (r, g, b) for pictures.
+    """Cause of a Gaussian's existence: its number in ``lineage.npz``, words, and a colour (r, g, b)
+    for pictures.
 
     The colours are from Okabe and Ito (2008), so that colour-blind people can distinguish them.
     """
@@ -42,14 +43,15 @@ class Cause(IntEnum):
 class RefineEvent:
     """Counts of one refinement by cause.
 
-    ``after`` is ``before`` plus the counts in ``GROWN`` minus the counts in ``PRUNED``. A split counts the Gaussians
-    that it adds beyond the parent, which is one for two children. ``relocated`` dead Gaussians change no count
-    (3DGS-MCMC). ``blocked_by_cap`` counts candidates that the budget refused. ``isotropic_resplit`` counts parents
-    split by volume whose children are still above the threshold, so that the next refinement splits them again.
-    ``vanished`` counts parents split by volume whose children are far smaller than a pixel.
+    ``after`` is ``before`` plus the counts in ``GROWN`` minus the counts in ``PRUNED``. A split
+    counts the Gaussians that it adds beyond the parent, which is one for two children.
+    ``relocated`` dead Gaussians change no count (3DGS-MCMC). ``blocked_by_cap`` counts candidates
+    that the budget refused. ``isotropic_resplit`` counts parents split by volume whose children are
+    still above the threshold, so that the next refinement splits them again. ``vanished`` counts
+    parents split by volume whose children are far smaller than a pixel.
 
-    Under ``cap=governor``, ``target`` is the intended count, ``strictness`` the factor on the thresholds of growth, and
-    ``cull`` the factor on the opacity below which Gaussians are pruned.
+    Under ``cap=governor``, ``target`` is the intended count, ``strictness`` the factor on the
+    thresholds of growth, and ``cull`` the factor on the opacity below which Gaussians are pruned.
     """
 
     GROWN: ClassVar[tuple[str, ...]] = ("cloned", "split_gradient", "split_volume", "added")
@@ -81,7 +83,11 @@ class RefineEvent:
 
     def as_dict(self) -> dict[str, object]:
         """The record for ``events.jsonl``, without unset and infinite values."""
-        return {key: value for key, value in asdict(self).items() if value is not None and math.isfinite(value)}
+        return {
+            key: value
+            for key, value in asdict(self).items()
+            if value is not None and math.isfinite(value)
+        }
 
     @staticmethod
     def count_names() -> tuple[str, ...]:
@@ -90,6 +96,7 @@ class RefineEvent:
         return tuple(name for name in names if name not in ("step", "before", "after"))
 
 
-def sum_events(events: Sequence[Mapping[str, object]]) -> dict[str, int]:
+def sum_events(events: Sequence[Mapping[str, int]]) -> dict[str, int]:
     """The sum of each count over the records of ``events.jsonl``."""
-    return {name: sum(int(event.get(name, 0)) for event in events) for name in RefineEvent.count_names()}  # type: ignore[call-overload]
+    names = RefineEvent.count_names()
+    return {name: sum(int(event.get(name, 0)) for event in events) for name in names}

@@ -16,30 +16,34 @@ from typing import Any
 from gsbench.errors import GsbenchError, InputError
 
 CHUNK = 1 << 20
-# Of a file name. File systems allow 255, but the temporary name of a file that is being written is longer.
+# Of a file name. File systems allow 255, but the temporary name of a file that is being written is
+# longer.
 MAX_NAME_BYTES = 220
 TEMPORARY = re.compile(r"^\..+\.tmp(-\d+)?$")  # name of a file that gsbench is still writing
 FULL = (errno.ENOSPC, errno.EDQUOT)
 BROKEN = (errno.EIO, errno.ELOOP, errno.ESTALE)
 FORBIDDEN = (errno.EROFS, errno.EACCES, errno.EPERM)
-# Libraries' messages without an error number for an incomplete write: numpy's tofile, torch's zip writer, SQLite.
+# Libraries' messages without an error number for an incomplete write: numpy's tofile, torch's zip
+# writer, SQLite.
 FULL_TEXT = re.compile(
-    r"No space left|requested and \d+ written|PytorchStreamWriter failed|unexpected pos|disk is full"
+    r"No space left|requested and \d+ written|PytorchStreamWriter failed|unexpected pos|disk is "
+    r"full"
 )
 NEARLY_NOTHING = 64 * 1024  # free bytes; with less, any failed write counts as a full disk
 
 
 class DiskFullError(GsbenchError):
-    """Raised if the disk of the runs folder is full, so that no trial can continue (exit code 1)."""
+    """Raised if the disk of the runs folder is full, so that no trial can continue (exit code
+    1)."""
 
 
 @contextmanager
 def atomic(path: Path, sync: bool = True) -> Iterator[Path]:
     """Yield a temporary path beside ``path``, and rename it to ``path`` if the block succeeds.
 
-    A reader sees the old file or the new one, never a part. After an error the temporary file is removed. A killed
-    process leaves a hidden file, which `remove_temporaries` removes. With ``sync``, the content is written to the disk
-    before the rename.
+    A reader sees the old file or the new one, never a part. After an error the temporary file is
+    removed. A killed process leaves a hidden file, which `remove_temporaries` removes. With
+    ``sync``, the content is written to the disk before the rename.
     """
     temporary = path.with_name(f".{path.name}.tmp-{os.getpid()}")
     temporary.unlink(missing_ok=True)
@@ -51,7 +55,8 @@ def atomic(path: Path, sync: bool = True) -> Iterator[Path]:
         os.replace(temporary, path)
     finally:
         with suppress(OSError):
-            temporary.unlink(missing_ok=True)  # os.replace does nothing if both names are links to one file
+            # os.replace does nothing if both names are links to one file
+            temporary.unlink(missing_ok=True)
 
 
 def write_json(path: Path, values: Any) -> None:
@@ -75,11 +80,14 @@ def writable_output(out: Path) -> Iterator[None]:
         out.parent.mkdir(parents=True, exist_ok=True)
         yield
     except OSError as error:
-        raise InputError(f"cannot write {out} ({error.strerror or error}); give another --out") from error
+        raise InputError(
+            f"cannot write {out} ({error.strerror or error}); give another --out"
+        ) from error
 
 
 def link_or_copy(source: Path, target: Path) -> None:
-    """Make ``target`` a hard link to ``source``, or a copy where hard links do not work; replaces ``target``."""
+    """Make ``target`` a hard link to ``source``, or a copy where hard links do not work; replaces
+    ``target``."""
     with atomic(target, sync=False) as temporary:
         try:
             os.link(source, temporary)
@@ -88,11 +96,15 @@ def link_or_copy(source: Path, target: Path) -> None:
 
 
 def open_plain(path: Path, flags: int = os.O_RDONLY) -> int:
-    """Open the regular file ``path`` and return its descriptor; a link as the last part is not followed.
+    """Open the regular file ``path`` and return its descriptor; a link as the last part is not
+    followed.
 
-    Raises InputError for a link, a pipe or a device (whose reading may never end), and OSError as `os.open` does.
+    Raises InputError for a link, a pipe or a device (whose reading may never end), and OSError as
+    `os.open` does.
     """
-    flags |= getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+    flags |= (
+        getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+    )
     try:
         descriptor = os.open(path, flags, 0o666)
     except OSError as error:
@@ -106,12 +118,13 @@ def open_plain(path: Path, flags: int = os.O_RDONLY) -> int:
 
 
 def require_no_links(runs: Path, place: Path, below: bool = False) -> None:
-    """Raise InputError if a part of the path from the folder ``runs`` to ``place`` is a link, a pipe or a device.
+    """Raise InputError if a part of the path from the folder ``runs`` to ``place`` is a link, a
+    pipe or a device.
 
     With ``below``, everything in the folder ``place`` is checked too. Missing parts are allowed.
     """
-    # A runs folder from someone else may hold links. Through them, a log would overwrite files outside the folder, and
-    # packing or publishing would include such files.
+    # A runs folder from someone else may hold links. Through them, a log would overwrite files
+    # outside the folder, and packing or publishing would include such files.
     path = runs
     for part in place.relative_to(runs).parts:
         path /= part
@@ -139,12 +152,14 @@ def remove_special_files(folder: Path) -> None:
 
 def _no_plain_file(path: Path) -> InputError:
     return InputError(
-        f"{path} is a link or not a regular file, and gsbench follows no links in a runs folder: remove it"
+        f"{path} is a link or not a regular file, and gsbench follows no links in a runs folder: "
+        "remove it"
     )
 
 
 def require_regular(path: Path) -> None:
-    """Raise InputError for a pipe, a device or a socket, whose reading may never end. A missing file is allowed."""
+    """Raise InputError for a pipe, a device or a socket, whose reading may never end. A missing
+    file is allowed."""
     with suppress(OSError):
         mode = path.stat().st_mode
         if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):
@@ -162,7 +177,8 @@ def sync_to_disk(path: Path) -> None:
 
 
 def remove_temporaries(folder: Path) -> None:
-    """Remove temporary files of killed processes below ``folder``. No process may be writing there."""
+    """Remove temporary files of killed processes below ``folder``. No process may be writing
+    there."""
     for path in folder.rglob(".*"):
         if TEMPORARY.match(path.name) and path.is_file():
             with suppress(OSError):
@@ -183,14 +199,17 @@ def checked_runs_folder(name: str) -> Path:
     if name.strip() == "":
         raise InputError(f"the runs folder has no name: {advice}")
     if not existing.is_dir():
-        raise InputError(f"the runs folder {folder} cannot be made, because {existing} is a file: {advice}")
+        raise InputError(
+            f"the runs folder {folder} cannot be made, because {existing} is a file: {advice}"
+        )
     return folder
 
 
 def make_runs_folder(folder: Path) -> None:
     """Make the runs folder, and check that it can be written to.
 
-    Raises OSError if the disk is full or writing is forbidden (see `storage_errors`), else InputError.
+    Raises OSError if the disk is full or writing is forbidden (see `storage_errors`), else
+    InputError.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -200,13 +219,15 @@ def make_runs_folder(folder: Path) -> None:
         if error.errno in (*FULL, *FORBIDDEN):
             raise
         raise InputError(
-            f"{folder} cannot be the runs folder ({error.strerror}): set runs=FOLDER or GSBENCH_RUNS to another folder"
+            f"{folder} cannot be the runs folder ({error.strerror}): set runs=FOLDER or "
+            "GSBENCH_RUNS to another folder"
         ) from error
 
 
 @contextmanager
 def storage_errors(folder: Path) -> Iterator[None]:
-    """Turn errors of a full or read-only disk within the block into one line that names ``folder``."""
+    """Turn errors of a full or read-only disk within the block into one line that names
+    ``folder``."""
     try:
         yield
     except Exception as error:
@@ -226,16 +247,24 @@ def explain_storage(error: BaseException, folder: Path) -> GsbenchError | None:
         or (isinstance(error, (OSError, RuntimeError)) and _free(folder) < NEARLY_NOTHING)
     ):
         return DiskFullError(
-            f"the disk of {folder} is full: free some space, then give the same command again: it continues"
+            f"the disk of {folder} is full: free some space, then give the same command again: it "
+            "continues"
         )
     faults = {
         errno.EFBIG: "{0} may not grow any more ({1}): raise `ulimit -f`, or set runs=FOLDER",
-        errno.ENOLCK: "the file system of {0} has no locks ({1}), so trials would disturb each other: set runs=FOLDER "
+        errno.ENOLCK: "the file system of {0} has no locks ({1}), so trials would disturb each "
+        "other: set runs=FOLDER "
         "or GSBENCH_RUNS to another file system, or start its lock service",
-        **dict.fromkeys(BROKEN, "{0} cannot be opened ({1}): look at its disk and its links, or set runs=FOLDER"),
-        **dict.fromkeys(FORBIDDEN, "{0} cannot be written to ({1}): set runs=FOLDER or GSBENCH_RUNS"),
+        **dict.fromkeys(
+            BROKEN, "{0} cannot be opened ({1}): look at its disk and its links, or set runs=FOLDER"
+        ),
+        **dict.fromkeys(
+            FORBIDDEN, "{0} cannot be written to ({1}): set runs=FOLDER or GSBENCH_RUNS"
+        ),
     }
-    return InputError(faults[number].format(place, os.strerror(number))) if number in faults else None
+    return (
+        InputError(faults[number].format(place, os.strerror(number))) if number in faults else None
+    )
 
 
 def _free(folder: Path) -> int:
@@ -244,7 +273,8 @@ def _free(folder: Path) -> int:
         usage = shutil.disk_usage(existing)
     except OSError:
         return NEARLY_NOTHING
-    return usage.free if usage.total else NEARLY_NOTHING  # file systems without a size, such as /proc, are never full
+    # file systems without a size, such as /proc, are never full
+    return usage.free if usage.total else NEARLY_NOTHING
 
 
 def file_sha256(path: Path) -> str:

@@ -20,7 +20,8 @@ LOGGER = logging.getLogger("gsbench")
 
 
 class _Printable(logging.Formatter):
-    """Makes log lines `printable`, because they may quote control characters from a file or a program."""
+    """Makes log lines `printable`, because they may quote control characters from a file or a
+    program."""
 
     def format(self, record: logging.LogRecord) -> str:
         return printable(super().format(record))
@@ -56,7 +57,8 @@ def printable_output() -> Iterator[None]:
 
 
 class _CurrentStderrHandler(logging.StreamHandler[TextIO]):
-    """Writes to the current ``sys.stderr``, which a calling program may have redirected since the start."""
+    """Writes to the current ``sys.stderr``, which a calling program may have redirected since the
+    start."""
 
     def emit(self, record: logging.LogRecord) -> None:
         self.stream = sys.stderr
@@ -64,19 +66,27 @@ class _CurrentStderrHandler(logging.StreamHandler[TextIO]):
 
 
 class _RootHandler(logging.Handler):
-    """Passes log lines on to the handlers that somebody else, such as Hydra, gave to the root logger."""
+    """Passes log lines on to the handlers that somebody else, such as Hydra, gave to the root
+    logger."""
 
     def emit(self, record: logging.LogRecord) -> None:
         logging.getLogger().handle(record)
 
 
 def set_up_logging(verbose: bool | str | Sequence[str] = False, through_root: bool = False) -> None:
-    """Show gsbench's log lines of level INFO and above on stderr; ``through_root``: by the root logger's handlers, too.
+    """Show gsbench's log lines of level INFO and above on stderr; ``through_root``: by the root
+    logger's handlers, too.
 
-    If one of these writes to the terminal, gsbench does not. ``verbose`` shows debug lines: True, gsbench's; names of
-    loggers, theirs.
+    If one of these writes to the terminal, gsbench does not. ``verbose`` shows debug lines: True,
+    gsbench's; names of loggers, theirs.
     """
-    names = [verbose] if isinstance(verbose, str) else [] if isinstance(verbose, bool) else list(verbose)
+    names = (
+        [verbose]
+        if isinstance(verbose, str)
+        else []
+        if isinstance(verbose, bool)
+        else list(verbose)
+    )
 
     def shown(record: logging.LogRecord) -> bool:
         named = any(f"{record.name}.".startswith(f"{name}.") for name in names)
@@ -95,7 +105,11 @@ def set_up_logging(verbose: bool | str | Sequence[str] = False, through_root: bo
         handler.addFilter(shown)
     foreign = [] if through_root else [name for name in names if name.split(".")[0] != LOGGER.name]
     for logger in (LOGGER, *map(logging.getLogger, foreign)):
-        kept = [old for old in logger.handlers if not isinstance(old, _CurrentStderrHandler | _RootHandler)]
+        kept = [
+            old
+            for old in logger.handlers
+            if not isinstance(old, _CurrentStderrHandler | _RootHandler)
+        ]
         logger.handlers = [*handlers, *kept]
     LOGGER.setLevel(logging.DEBUG)
     LOGGER.propagate = False
@@ -108,8 +122,11 @@ def _make_printable(record: logging.LogRecord) -> bool:
 
 @contextmanager
 def log_to(path: Path) -> Iterator[None]:
-    """Also write everything that gsbench logs within the block, including tracebacks, to ``path``."""
-    handler = _QuietHandler(os.fdopen(open_plain(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT), "a", encoding="utf-8"))
+    """Also write everything that gsbench logs within the block, including tracebacks, to
+    ``path``."""
+    handler = _QuietHandler(
+        os.fdopen(open_plain(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT), "a", encoding="utf-8")
+    )
     handler.setLevel(logging.DEBUG)
     handler.setFormatter(_Printable("%(asctime)s %(levelname)s %(name)s: %(message)s"))
     LOGGER.addHandler(handler)
@@ -136,7 +153,8 @@ SECONDS_BETWEEN_LINES = 20.0
 class Progress(Protocol):
     """Receives the progress of a ``phase``: ``done`` of ``total``, which is None if unknown.
 
-    Each phase has its own unit (images, pairs, bytes), and may start again at 0. ``note`` is shown unchanged.
+    Each phase has its own unit (images, pairs, bytes), and may start again at 0. ``note`` is shown
+    unchanged.
     """
 
     def __call__(self, phase: str, done: int, total: int | None, note: str = "") -> None: ...
@@ -149,7 +167,8 @@ def no_progress(phase: str, done: int, total: int | None, note: str = "") -> Non
 @contextmanager
 def progress(title: str) -> Iterator[Progress]:
     """Show progress of the work called ``title`` while the block runs."""
-    console = Console(file=getattr(sys.stderr, "raw", sys.stderr))  # raw, since a bar needs control characters
+    # raw, since a bar needs control characters
+    console = Console(file=getattr(sys.stderr, "raw", sys.stderr))
     if not console.is_terminal:
         yield _lines(title)
         return

@@ -1,8 +1,9 @@
-"""Small JSON and YAML files, read with limits because someone else may have written or damaged them.
+"""Small JSON and YAML files, read with limits because someone else may have written or damaged
+them.
 
-Only regular files of at most `MAX_BYTES` are opened, so that a FIFO or a device cannot block the reader. Links are not
-followed; a user's own file is read by its `resolved` path. The content has at most `MAX_DEPTH` levels and only plain
-values.
+Only regular files of at most `MAX_BYTES` are opened, so that a FIFO or a device cannot block the
+reader. Links are not followed; a user's own file is read by its `resolved` path. The content has at
+most `MAX_DEPTH` levels and only plain values.
 """
 
 import codecs
@@ -30,10 +31,12 @@ from gsbench.files import open_plain
 
 log = logging.getLogger(__name__)
 
-MAX_BYTES = 64 << 20  # enough for the plan of 80,000 trials, or a training that logs each of 300,000 iterations
+# enough for the plan of 80,000 trials, or a training that logs each of 300,000 iterations
+MAX_BYTES = 64 << 20
 SPARE = 1 << 16  # bytes that are read at once beyond a file's size
 MAX_YAML_BYTES = 1 << 20  # a configuration has 2 to 10 kB; the parser needs a second for this much
-MAX_DEPTH = 40  # levels of nesting: gsbench's files have up to six, and arguments of a user's class add a few
+# levels of nesting: gsbench's files have up to six, and arguments of a user's class add a few
+MAX_DEPTH = 40
 MAX_WORD = 4000  # characters of an unquoted YAML word, which could be a number
 MAX_VALUES = 100_000  # in a YAML file, whose aliases let a few lines stand for billions of values
 MAX_MESSAGE = 300  # characters of a message about a file
@@ -43,7 +46,8 @@ LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 class DamagedError(InputError):
-    """Raised for a file of gsbench that cannot be read or has wrong content; ``reason`` does not name the file."""
+    """Raised for a file of gsbench that cannot be read or has wrong content; ``reason`` does not
+    name the file."""
 
     def __init__(self, path: Path, reason: str) -> None:
         self.path, self.reason = path, one_line(reason)
@@ -57,7 +61,8 @@ def one_line(text: str) -> str:
 
 
 def read_bytes(path: Path, most: int = MAX_BYTES) -> bytes:
-    """The content of a regular file; raises DamagedError for any other file, FileNotFoundError for a missing one."""
+    """The content of a regular file; raises DamagedError for any other file, FileNotFoundError for
+    a missing one."""
     with _opened(path) as descriptor:
         content = _read_up_to(descriptor, most + 1)
     if len(content) > most:
@@ -73,7 +78,8 @@ def read_tail(path: Path, count: int) -> bytes:
 
 
 def without_byte_order_mark(content: bytes) -> bytes:
-    """The content of a text file without UTF-8's byte order mark; raises InputError for UTF-16 and UTF-32."""
+    """The content of a text file without UTF-8's byte order mark; raises InputError for UTF-16 and
+    UTF-32."""
     if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE, codecs.BOM_UTF32_BE)):
         raise InputError("it is UTF-16 or UTF-32: save it as UTF-8")
     return content.removeprefix(codecs.BOM_UTF8)
@@ -86,9 +92,11 @@ def resolved(path: Path) -> Path:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[int]:
-    """Yield the descriptor of a regular file; errors within the block become errors that name the file."""
+    """Yield the descriptor of a regular file; errors within the block become errors that name the
+    file."""
     try:
-        if not stat.S_ISREG(os.lstat(path).st_mode):  # refuses links too: see `gsbench.files.require_no_links`
+        # refuses links too: see `gsbench.files.require_no_links`
+        if not stat.S_ISREG(os.lstat(path).st_mode):
             raise DamagedError(path, "cannot be read: it is not a regular file")
         descriptor = open_plain(path)
         try:
@@ -100,20 +108,26 @@ def _opened(path: Path) -> Iterator[int]:
     except InputError:
         raise
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name
-        raise DamagedError(path, f"cannot be read ({getattr(error, 'strerror', None) or error})") from None
+        raise DamagedError(
+            path, f"cannot be read ({getattr(error, 'strerror', None) or error})"
+        ) from None
 
 
 def _read_up_to(descriptor: int, most: int) -> bytes:
-    """Read at most ``most`` bytes. One call is enough, except for files such as in ``/proc`` that report no size."""
+    """Read at most ``most`` bytes. One call is enough, except for files such as in ``/proc`` that
+    report no size."""
     content = os.read(descriptor, min(most, os.fstat(descriptor).st_size + 1))
     parts = [content]
-    while (left := most - sum(map(len, parts))) > 0 and (part := os.read(descriptor, min(left, SPARE))):
+    while (left := most - sum(map(len, parts))) > 0 and (
+        part := os.read(descriptor, min(left, SPARE))
+    ):
         parts.append(part)
     return b"".join(parts)
 
 
 def read_json(path: Path) -> Any:
-    """The value in a JSON file; raises as `read_bytes` does, and DamagedError if `fault_of` finds a fault."""
+    """The value in a JSON file; raises as `read_bytes` does, and DamagedError if `fault_of` finds a
+    fault."""
     content = read_bytes(path)
     try:
         value = from_json(content)
@@ -125,9 +139,11 @@ def read_json(path: Path) -> Any:
 
 
 def read_yaml(path: Path) -> Any:
-    """The value in a YAML file; raises as `read_bytes` does, and DamagedError if it is no YAML or has a fault.
+    """The value in a YAML file; raises as `read_bytes` does, and DamagedError if it is no YAML or
+    has a fault.
 
-    Numbers may be infinite, because users write settings in YAML and a class may have an infinite default.
+    Numbers may be infinite, because users write settings in YAML and a class may have an infinite
+    default.
     """
     content = read_bytes(path, MAX_YAML_BYTES)
     try:
@@ -143,7 +159,8 @@ def read_yaml(path: Path) -> Any:
 
 
 class _Loader(LOADER):
-    """A safe loader for which a key that occurs twice in a mapping is an error; YAML would silently drop the first."""
+    """A safe loader for which a key that occurs twice in a mapping is an error; YAML would silently
+    drop the first."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         seen = set()
@@ -158,8 +175,8 @@ class _Loader(LOADER):
 def _danger_in_yaml(text: str) -> str:
     """Name a construct that must not reach the YAML loader, or "".
 
-    These are tags, deep nesting (the loader recurses in C), merge keys (they multiply), and numbers with so many digits
-    that their conversion takes hours.
+    These are tags, deep nesting (the loader recurses in C), merge keys (they multiply), and numbers
+    with so many digits that their conversion takes hours.
     """
     level = 0
     for event in yaml.parse(text, Loader=LOADER):
@@ -171,7 +188,8 @@ def _danger_in_yaml(text: str) -> str:
                 return f"it has more than {MAX_DEPTH} levels"
         elif isinstance(event, yaml.CollectionEndEvent):
             level -= 1
-        elif isinstance(event, yaml.ScalarEvent) and event.implicit[0]:  # an unquoted word, which may become a number
+        # an unquoted word, which may become a number
+        elif isinstance(event, yaml.ScalarEvent) and event.implicit[0]:
             if event.value == "<<":
                 return "it has a merge key"
             if len(event.value) > MAX_WORD:
@@ -182,8 +200,9 @@ def _danger_in_yaml(text: str) -> str:
 def fault_of(value: Any, most: int | None = None, infinite: bool = False) -> str:
     """The reason why ``value`` is not plain, or "" if it is.
 
-    A plain value has keys that are texts or integers, at most `MAX_DEPTH` levels, finite numbers (unless ``infinite``)
-    and at most ``most`` values, where a YAML alias counts each time it is used.
+    A plain value has keys that are texts or integers, at most `MAX_DEPTH` levels, finite numbers
+    (unless ``infinite``) and at most ``most`` values, where a YAML alias counts each time it is
+    used.
     """
     containers: deque[tuple[tuple[Any, ...], Any]] = deque(
         [((), [value])]
@@ -253,7 +272,9 @@ class Record:
         """The JSON object of the file, without optional keys that have their default value."""
         kind: Any = type(self)
         values: dict[str, Any] = adapter(kind).dump_python(self, mode="json")
-        return {field.name: values[field.name] for field in fields(self) if not _is_default(self, field)}
+        return {
+            field.name: values[field.name] for field in fields(self) if not _is_default(self, field)
+        }
 
 
 def _is_default(record: Record, field: Any) -> bool:
@@ -262,7 +283,8 @@ def _is_default(record: Record, field: Any) -> bool:
 
 
 def read_typed(path: Path, kind: type[T]) -> T:
-    """The JSON file as an object of ``kind``; raises as `read_bytes` does, and DamagedError naming the first misfit."""
+    """The JSON file as an object of ``kind``; raises as `read_bytes` does, and DamagedError naming
+    the first misfit."""
     return parse_typed(read_bytes(path), kind, path)
 
 
@@ -275,7 +297,8 @@ def read_if_sound(path: Path, kind: type[T]) -> T | None:
 
 
 def parse_typed(content: bytes, kind: type[T], path: Path) -> T:
-    """Parse the JSON ``content`` of the file ``path`` as an object of ``kind``; raises DamagedError for a misfit.
+    """Parse the JSON ``content`` of the file ``path`` as an object of ``kind``; raises DamagedError
+    for a misfit.
 
     The parser refuses more than 200 levels and integers of more than 4,300 digits.
     """
@@ -289,12 +312,14 @@ def parse_typed(content: bytes, kind: type[T], path: Path) -> T:
 
 @cache
 def adapter(kind: Any) -> TypeAdapter[Any]:
-    """pydantic's reader of a type. Dataclasses have the configuration `STRICT`; other types get it here."""
+    """pydantic's reader of a type. Dataclasses have the configuration `STRICT`; other types get it
+    here."""
     return TypeAdapter(kind) if is_dataclass(kind) else TypeAdapter(kind, config=STRICT)
 
 
 def describe_misfit(error: ValidationError) -> str:
-    """Describe the first fault: ``is damaged: metrics.psnr is '27' (input should be a valid number)``."""
+    """Describe the first fault: ``is damaged: metrics.psnr is '27' (input should be a valid
+    number)``."""
     first: ErrorDetails = error.errors(include_url=False)[0]
     key, kind = ".".join(str(part) for part in first["loc"]), first["type"]
     if kind == "json_invalid":
@@ -303,14 +328,17 @@ def describe_misfit(error: ValidationError) -> str:
         return f"is damaged: it lacks {key!r}"
     if not key:
         return f"is damaged: {first['msg'].removeprefix('Value error, ')}"
-    return f"is damaged: {key} is {reprlib.repr(first['input'])} ({first['msg'].removeprefix('Value error, ').lower()})"
+    return (
+        f"is damaged: {key} is {reprlib.repr(first['input'])} "
+        f"({first['msg'].removeprefix('Value error, ').lower()})"
+    )
 
 
 def iterate_rows(content: bytes, kind: type[T], path: Path) -> Iterator[tuple[str, T]]:
     """Parse the JSON lines of the file ``path``; yields each line with its object of ``kind``.
 
-    A damaged line and the lines after it are left out. There is a warning, except for an incomplete last line, which a
-    killed process leaves.
+    A damaged line and the lines after it are left out. There is a warning, except for an incomplete
+    last line, which a killed process leaves.
     """
     lines = content.splitlines(keepends=True)
     # Parsing all lines at once is faster. Only if that fails are they parsed one by one.
@@ -319,7 +347,10 @@ def iterate_rows(content: bytes, kind: type[T], path: Path) -> Iterator[tuple[st
     except DamagedError:
         rows = []
     if len(rows) == len(lines):  # otherwise a line holds several values
-        yield from ((line.decode("utf-8").rstrip("\r\n"), row) for line, row in zip(lines, rows, strict=True))
+        yield from (
+            (line.decode("utf-8").rstrip("\r\n"), row)
+            for line, row in zip(lines, rows, strict=True)
+        )
         return
     for number, line in enumerate(lines, 1):
         try:

@@ -1,8 +1,9 @@
 """Checking settings, which are dataclasses whose annotations say what is allowed.
 
-The annotation of a field is its rule: a type, bounds (`annotated_types`, or pydantic's types such as ``PositiveInt``),
-or a ``Literal`` of choices. pydantic checks it, and `describe` puts it into words. Numbers must be finite, except a
-default of the class. Rules between fields belong in the ``__post_init__`` of their class.
+The annotation of a field is its rule: a type, bounds (`annotated_types`, or pydantic's types such
+as ``PositiveInt``), or a ``Literal`` of choices. pydantic checks it, and `describe` puts it into
+words. Numbers must be finite, except a default of the class. Rules between fields belong in the
+``__post_init__`` of their class.
 """
 
 import dataclasses
@@ -29,7 +30,8 @@ MAX_NAME_BYTES = 100  # of a name: a folder's name can combine two, and file sys
 
 
 def is_folder_name(value: str) -> bool:
-    """Return whether a text can name a folder on any system, and fits the address of a trial (``x:scene:arm:0``)."""
+    """Return whether a text can name a folder on any system, and fits the address of a trial
+    (``x:scene:arm:0``)."""
     is_plain = value.isprintable() and not set(value) & set('/\\:*?"<>|') and value == value.strip()
     return is_plain and value[:1] not in ("", ".", "-") and len(value.encode()) <= MAX_NAME_BYTES
 
@@ -48,7 +50,8 @@ TargetName = Annotated[
 ]
 MISSING: Any = "???"  # a value that must be given, as Hydra writes it in YAML
 Fraction = Annotated[float, Interval(ge=0, le=1)]
-Threads = Annotated[int, Interval(ge=1, le=4096)]  # a larger number is a mistake, and no system could start them
+# a larger number is a mistake, and no system could start them
+Threads = Annotated[int, Interval(ge=1, le=4096)]
 OpenFraction = Annotated[float, Interval(gt=0, lt=1)]
 
 
@@ -62,11 +65,18 @@ class Switch:
 
 
 CONFIG = ConfigDict(allow_inf_nan=False, arbitrary_types_allowed=True, coerce_numbers_to_str=True)
-PLAIN = {int: "a whole number", float: "a number", bool: "true or false", str: "a text", dict: "a mapping {key: value}"}
+PLAIN = {
+    int: "a whole number",
+    float: "a number",
+    bool: "true or false",
+    str: "a text",
+    dict: "a mapping {key: value}",
+}
 
 
 def check_settings(settings: Any, group: str) -> None:
-    """Check every field of the dataclass object ``settings`` by its annotation, and convert it (``1e3`` to 1000).
+    """Check every field of the dataclass object ``settings`` by its annotation, and convert it
+    (``1e3`` to 1000).
 
     Raises InputError that names ``group`` and the field, the allowed values, and the given value.
     """
@@ -78,8 +88,8 @@ def check_settings(settings: Any, group: str) -> None:
 def check_values(cls: type, values: Mapping[str, Any], group: str) -> dict[str, Any]:
     """``values``, options of the dataclass ``cls``, converted to the types of its annotations.
 
-    Raises InputError for the first unknown or forbidden option. Its message starts with the name of ``group`` and a
-    dot, or with the option for the root group ``""``.
+    Raises InputError for the first unknown or forbidden option. Its message starts with the name of
+    ``group`` and a dot, or with the option for the root group ``""``.
     """
     prefix = f"{group}." if group else ""
     known = {field.name: field for field in option_fields(cls)}
@@ -119,7 +129,9 @@ def describe(hint: Any) -> str:
     if origin is Literal:
         return _one_of([repr(choice) for choice in arguments])
     if origin in (Union, types.UnionType):
-        return _one_of(["null" if choice is type(None) else describe(choice) for choice in arguments])
+        return _one_of(
+            ["null" if choice is type(None) else describe(choice) for choice in arguments]
+        )
     if origin is list:
         return f"a list, each {describe(arguments[0])}"
     if origin is tuple:
@@ -135,17 +147,24 @@ def _converted(value: Any, field: dataclasses.Field[Any], cls: type, key: str) -
         too_large = _has_too_large(result)
         if not too_large and not _has_switch_for_number(value, result):
             return result
-        reason = f": whole numbers lie between -{MAX_INTEGER} and {MAX_INTEGER}" if too_large else ""
+        reason = (
+            f": whole numbers lie between -{MAX_INTEGER} and {MAX_INTEGER}" if too_large else ""
+        )
     except ValidationError as error:
         if value is field.default or (isinstance(value, float) and value == field.default):
             return value  # a class's own default is allowed even if its annotation forbids it
         first = error.errors()[0]
-        reason = f": {first['ctx']['error']}" if first["type"] in ("value_error", "assertion_error") else ""
+        reason = (
+            f": {first['ctx']['error']}"
+            if first["type"] in ("value_error", "assertion_error")
+            else ""
+        )
     raise InputError(f"{key} must be {describe(hint)}, got {_shown(value)}{reason}")
 
 
 def _has_too_large(value: Any) -> bool:
-    """Return whether a value is or contains a whole number that does not fit into 64 bits, as torch and JSON need."""
+    """Return whether a value is or contains a whole number that does not fit into 64 bits, as torch
+    and JSON need."""
     if isinstance(value, Mapping):
         return any(map(_has_too_large, value.values()))
     if isinstance(value, list | tuple):
@@ -173,7 +192,8 @@ def _adapters(cls: type) -> dict[str, tuple[Any, TypeAdapter[Any]]]:
 
 
 def _hint(cls: type, name: str) -> Any:
-    """The annotation of a field with its constraints; Any if it uses a name that only type checkers import."""
+    """The annotation of a field with its constraints; Any if it uses a name that only type checkers
+    import."""
     owner = next(base for base in cls.__mro__ if name in inspect.get_annotations(base))
     holder = types.SimpleNamespace(__annotations__={name: inspect.get_annotations(owner)[name]})
     scope = vars(sys.modules[owner.__module__]) if owner.__module__ in sys.modules else {}
@@ -188,12 +208,18 @@ def _describe_annotated(base: Any, rules: list[Any]) -> str:
     if documentation is not None:
         return str(documentation)
     bounds = {
-        bound: getattr(rule, bound) for rule in rules for bound in ("gt", "ge", "lt", "le") if hasattr(rule, bound)
+        bound: getattr(rule, bound)
+        for rule in rules
+        for bound in ("gt", "ge", "lt", "le")
+        if hasattr(rule, bound)
     }
     low, high = bounds.get("gt", bounds.get("ge")), bounds.get("lt", bounds.get("le"))
     words = describe(base)
     if low is not None and high is not None:
-        return f"{words} in {'(' if 'gt' in bounds else '['}{low}, {high}{')' if 'lt' in bounds else ']'}"
+        return (
+            f"{words} in {'(' if 'gt' in bounds else '['}{low}, "
+            f"{high}{')' if 'lt' in bounds else ']'}"
+        )
     if low is not None:
         return f"{words} {'above' if 'gt' in bounds else 'of at least'} {low}"
     if high is not None:
@@ -211,4 +237,10 @@ def _one_of(words: list[str]) -> str:
 
 
 def _shown(value: Any) -> str:
-    return "null" if value is None else str(value).lower() if isinstance(value, bool) else reprlib.repr(value)
+    return (
+        "null"
+        if value is None
+        else str(value).lower()
+        if isinstance(value, bool)
+        else reprlib.repr(value)
+    )

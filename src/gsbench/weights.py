@@ -1,8 +1,8 @@
 """Finding, downloading and checking the weights of networks.
 
-A file is searched in the folder given by the caller, then in ``$GSBENCH_WEIGHTS`` (both with sub-folders), then in the
-torch hub cache. If it is not found, it is downloaded into that cache. It is always checked before it is read, and no
-code in it is ever unpickled.
+A file is searched in the folder given by the caller, then in ``$GSBENCH_WEIGHTS`` (both with
+sub-folders), then in the torch hub cache. If it is not found, it is downloaded into that cache. It
+is always checked before it is read, and no code in it is ever unpickled.
 """
 
 from __future__ import annotations
@@ -26,20 +26,22 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 WEIGHTS_VARIABLE = "GSBENCH_WEIGHTS"
-ONE_TRY = downloads.RetryPolicy(timeout=10.0, tries=1)  # without a network, the error must come at once
+# without a network, the error must come at once
+ONE_TRY = downloads.RetryPolicy(timeout=10.0, tries=1)
 
 
 class MissingWeightsError(InputError):
-    """Raised for a weights file that is not found and cannot be downloaded, or that is not the expected one."""
+    """Raised for a weights file that is not found and cannot be downloaded, or that is not the
+    expected one."""
 
 
 @dataclass(frozen=True)
 class WeightsFile:
     """One file of weights.
 
-    ``names`` are the accepted file names, of which a download gets the first. ``sha256`` is the checksum in
-    hexadecimal, complete or its first digits, or None if none is published; then only the shapes are checked.
-    ``source`` says where a file without an address comes from.
+    ``names`` are the accepted file names, of which a download gets the first. ``sha256`` is the
+    checksum in hexadecimal, complete or its first digits, or None if none is published; then only
+    the shapes are checked. ``source`` says where a file without an address comes from.
     """
 
     names: tuple[str, ...]
@@ -49,15 +51,18 @@ class WeightsFile:
 
 
 def find_weights(spec: WeightsFile, folder: Path | None = None, download: bool = True) -> Path:
-    """The path of a checked copy of ``spec``, which is downloaded into the torch hub cache if it is not found.
+    """The path of a checked copy of ``spec``, which is downloaded into the torch hub cache if it is
+    not found.
 
-    Raises ``InputError`` if ``folder`` does not exist, and ``MissingWeightsError`` if every file found has a wrong
-    checksum, or if none is found and none can be downloaded.
+    Raises ``InputError`` if ``folder`` does not exist, and ``MissingWeightsError`` if every file
+    found has a wrong checksum, or if none is found and none can be downloaded.
     """
     return find_all_weights([spec], folder, download)[0]
 
 
-def find_all_weights(specs: Sequence[WeightsFile], folder: Path | None = None, download: bool = True) -> list[Path]:
+def find_all_weights(
+    specs: Sequence[WeightsFile], folder: Path | None = None, download: bool = True
+) -> list[Path]:
     """Find several files as `find_weights` does; one error names all that are missing."""
     folders = _search_folders(folder)
     paths = {spec: _find_local(spec, folders) for spec in specs}
@@ -82,41 +87,55 @@ def find_all_weights(specs: Sequence[WeightsFile], folder: Path | None = None, d
         sources = ", ".join(spec.url or spec.source for spec in still_missing)
         places = ", ".join(str(place) for place, _ in folders)
         raise MissingWeightsError(
-            f"weights not found: {names} (looked in {places}; {reasons[0]}): get them from {sources}, put them into a "
+            f"weights not found: {names} (looked in {places}; {reasons[0]}): get them from "
+            f"{sources}, put them into a "
             f"folder and set {WEIGHTS_VARIABLE} to it"
         )
     return [path for spec in specs if (path := paths[spec]) is not None]
 
 
 def digests_of_unpinned(specs: Sequence[WeightsFile], folder: Path | None = None) -> list[str]:
-    """The sha256 of files of ``specs`` without a published checksum that the user put into a folder.
+    """The sha256 of files of ``specs`` without a published checksum that the user put into a
+    folder.
 
-    Such a file can be any file of the right shapes. Files in the torch hub cache were downloaded from the address.
+    Such a file can be any file of the right shapes. Files in the torch hub cache were downloaded
+    from the address.
     """
-    users = [(place, sub_folders) for place, sub_folders in _search_folders(folder) if place != hub_cache()]
+    users = [
+        (place, sub_folders)
+        for place, sub_folders in _search_folders(folder)
+        if place != hub_cache()
+    ]
     paths = [_find_local(spec, users) for spec in specs if spec.sha256 is None]
     return [file_sha256(path) for path in paths if path is not None]
 
 
 def _find_local(spec: WeightsFile, folders: Sequence[tuple[Path, bool]]) -> Path | None:
-    """The first file with the right checksum; raises ``MissingWeightsError`` if all files found have a wrong one."""
+    """The first file with the right checksum; raises ``MissingWeightsError`` if all files found
+    have a wrong one."""
     faults = []
     for folder, sub_folders in folders:
         for path in _candidates(folder, spec.names, sub_folders):
             if spec.sha256 is None or (sha256 := file_sha256(path)).startswith(spec.sha256):
                 return path
-            faults.append(f"weights file {path} has sha256 {sha256[:16]}…, expected {spec.sha256[:16]}…")
+            faults.append(
+                f"weights file {path} has sha256 {sha256[:16]}…, expected {spec.sha256[:16]}…"
+            )
     if faults:
         origin = spec.url or spec.source
-        raise MissingWeightsError(f"{faults[0]}: wrong or truncated; replace it with the file from {origin}")
+        raise MissingWeightsError(
+            f"{faults[0]}: wrong or truncated; replace it with the file from {origin}"
+        )
     return None
 
 
 def load_state(path: Path, entry: str | None = None) -> dict[str, Tensor]:
-    """The tensors in ``path`` (.safetensors, or a PyTorch file read with ``weights_only``), on the CPU, by name.
+    """The tensors in ``path`` (.safetensors, or a PyTorch file read with ``weights_only``), on the
+    CPU, by name.
 
-    ``entry`` is the key of the tensors in a PyTorch file that holds more. Raises ``MissingWeightsError`` if the file is
-    truncated, is not a weights file, or holds anything but tensors.
+    ``entry`` is the key of the tensors in a PyTorch file that holds more. Raises
+    ``MissingWeightsError`` if the file is truncated, is not a weights file, or holds anything but
+    tensors.
     """
     import torch
 
@@ -127,8 +146,11 @@ def load_state(path: Path, entry: str | None = None) -> dict[str, Tensor]:
             return load_file(path, device="cpu")
         state = torch.load(path, map_location="cpu", weights_only=True)
     except ModuleNotFoundError as error:
-        raise InputError(f"weights file {path} needs the package safetensors: pip install safetensors") from error
-    except Exception as error:  # the two readers and pickle raise a dozen kinds of errors on a damaged or foreign file
+        raise InputError(
+            f"weights file {path} needs the package safetensors: pip install safetensors"
+        ) from error
+    # the two readers and pickle raise a dozen kinds of errors on a damaged or foreign file
+    except Exception as error:
         raise _unreadable(path, str(error).partition("\n")[0] or type(error).__name__) from error
     if not isinstance(state, Mapping):
         raise _unreadable(path, f"it holds a {type(state).__name__}, not tensors by name")
@@ -142,7 +164,8 @@ def load_state(path: Path, entry: str | None = None) -> dict[str, Tensor]:
 
 
 def hub_cache() -> Path:
-    """The folder of torch.hub's downloaded checkpoints, below ``$TORCH_HOME``, else ``$XDG_CACHE_HOME``."""
+    """The folder of torch.hub's downloaded checkpoints, below ``$TORCH_HOME``, else
+    ``$XDG_CACHE_HOME``."""
     cache = Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")) / "torch"
     return Path(os.environ.get("TORCH_HOME", cache)).expanduser() / "hub" / "checkpoints"
 
@@ -152,7 +175,9 @@ def _search_folders(folder: Path | None) -> list[tuple[Path, bool]]:
     folders: list[tuple[Path, bool]] = []
     if folder is not None:
         if not folder.is_dir():
-            raise InputError(f"weights folder {folder} does not exist: give a folder, or leave it empty")
+            raise InputError(
+                f"weights folder {folder} does not exist: give a folder, or leave it empty"
+            )
         folders.append((folder, True))
     configured = os.environ.get(WEIGHTS_VARIABLE)
     if configured:
@@ -163,13 +188,18 @@ def _search_folders(folder: Path | None) -> list[tuple[Path, bool]]:
 
 def _candidates(folder: Path, names: tuple[str, ...], sub_folders: bool) -> list[Path]:
     direct = [folder / name for name in names]
-    below = [path for name in names for path in sorted(folder.rglob(name))] if sub_folders and folder.is_dir() else []
+    below = (
+        [path for name in names for path in sorted(folder.rglob(name))]
+        if sub_folders and folder.is_dir()
+        else []
+    )
     files = [path for path in direct + below if path.is_file()]
     return list(dict.fromkeys(files))
 
 
 def _download(spec: WeightsFile, folder: Path) -> Path:
-    """Download ``spec`` into ``folder``. The file appears under its name only after it is complete and checked."""
+    """Download ``spec`` into ``folder``. The file appears under its name only after it is complete
+    and checked."""
     assert spec.url is not None
     folder.mkdir(parents=True, exist_ok=True)
     target = folder / spec.names[0]
@@ -177,17 +207,28 @@ def _download(spec: WeightsFile, folder: Path) -> Path:
 
         def advance(done: int, total: int | None) -> None:
             if done:
-                report(target.name, done, total, f"{readable_bytes(done)} of {readable_bytes(total)}")
+                report(
+                    target.name, done, total, f"{readable_bytes(done)} of {readable_bytes(total)}"
+                )
             else:
-                log.info("downloading %s (%s) from %s to %s", target.name, readable_bytes(total), spec.url, folder)
+                log.info(
+                    "downloading %s (%s) from %s to %s",
+                    target.name,
+                    readable_bytes(total),
+                    spec.url,
+                    folder,
+                )
 
         sha256 = downloads.download(spec.url, temporary, ONE_TRY, advance)
         if not sha256.startswith(spec.sha256 or ""):
             raise MissingWeightsError(
-                f"the download of {target.name} from {spec.url} is damaged: try again (its sha256 is {sha256[:16]}…)"
+                f"the download of {target.name} from {spec.url} is damaged: try again (its sha256 "
+                f"is {sha256[:16]}…)"
             )
     return target
 
 
 def _unreadable(path: Path, why: str) -> MissingWeightsError:
-    return MissingWeightsError(f"weights file {path} cannot be read as plain tensors ({why}): replace it")
+    return MissingWeightsError(
+        f"weights file {path} cannot be read as plain tensors ({why}): replace it"
+    )

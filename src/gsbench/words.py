@@ -1,4 +1,5 @@
-"""Text for people: readable numbers, lists of names, suggestions for wrong words, and safe output."""
+"""Text for people: readable numbers, lists of names, suggestions for wrong words, and safe
+output."""
 
 import difflib
 import re
@@ -6,13 +7,15 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path, PurePath
 
 MAX_NAMED = 3  # names that a message lists; further ones are only counted
-# Characters that a terminal acts on instead of showing: control characters except line feed and tab, line separators,
-# marks that change the direction of writing (UAX #9), and surrogates, which file names may contain.
+# Characters that a terminal acts on instead of showing: control characters except line feed and
+# tab, line separators, marks that change the direction of writing (UAX #9), and surrogates, which
+# file names may contain.
 CONTROL_CHARACTERS = re.compile(
     "[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]"
 )
 
-# A path within a sentence that starts at the root or a home folder, up to a blank, a quote, a bracket or punctuation.
+# A path within a sentence that starts at the root or a home folder, up to a blank, a quote, a
+# bracket or punctuation.
 PATH_IN_TEXT = re.compile(r"""(?<![^\s=(['"`])(?:~[\w.-]*)?/[^\s,;:'"`)\]]+""")
 
 
@@ -33,7 +36,8 @@ def readable_time(seconds: float) -> str:
 
 
 def signed(value: float, spec: str) -> str:
-    """A number with its sign, formatted by ``spec`` (``.2f``, ``.1%``) with a minus sign: +0.50, −3.0%."""
+    """A number with its sign, formatted by ``spec`` (``.2f``, ``.1%``) with a minus sign: +0.50,
+    −3.0%."""
     return true_minus(f"{value:+{spec}}")
 
 
@@ -45,7 +49,9 @@ def true_minus(number: str) -> str:
 def did_you_mean(word: str, choices: Iterable[str]) -> str:
     """'; did you mean X?' if a choice is similar to ``word``, else ''."""
     choices = list(choices)
-    near = difflib.get_close_matches(word, choices, n=1) or difflib.get_close_matches(word.lower(), choices, n=1)
+    near = difflib.get_close_matches(word, choices, n=1) or difflib.get_close_matches(
+        word.lower(), choices, n=1
+    )
     return f"; did you mean {near[0]}?" if near else ""
 
 
@@ -63,14 +69,15 @@ def without_folders(text: str) -> str:
     """The text with each absolute path replaced by its last part.
 
     Examples:
-        >>> without_folders("weights not found (looked in /home/me/weights, ~/.cache/torch; no /): see https://a.org/b")
-        'weights not found (looked in weights, torch; no /): see https://a.org/b'
+        >>> without_folders("no weights (looked in /home/me/weights, ~/.cache/torch; no /): see https://a.org/b")
+        'no weights (looked in weights, torch; no /): see https://a.org/b'
     """
     return PATH_IN_TEXT.sub(lambda match: PurePath(match[0]).name, text)
 
 
 def is_path(value: str) -> bool:
-    """Return whether a text can be a path: not empty, without control characters or an unknown ``~user``."""
+    """Return whether a text can be a path: not empty, without control characters or an unknown
+    ``~user``."""
     try:
         return value.strip() != "" and value.isprintable() and bool(Path(value).expanduser())
     except RuntimeError:
@@ -78,7 +85,8 @@ def is_path(value: str) -> bool:
 
 
 def printable(text: str) -> str:
-    """``text`` with its control characters escaped, so that a terminal shows them instead of acting on them.
+    """``text`` with its control characters escaped, so that a terminal shows them instead of acting
+    on them.
 
     Examples:
         >>> printable("red \\x1b[31m")

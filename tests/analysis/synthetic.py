@@ -18,15 +18,16 @@ from scipy.ndimage import gaussian_filter
 
 METRICS = ("psnr", "ssim", "lpips_vgg_raw", "flip")
 BASE = {"psnr": 26.0, "ssim": 0.80, "lpips_vgg_raw": 0.25, "flip": 0.10}
-SPREAD = {"psnr": 1.0, "ssim": 0.03, "lpips_vgg_raw": 0.03, "flip": 0.01}  # a noise of 1 in units of the metric
+# a noise of 1 in units of the metric
+SPREAD = {"psnr": 1.0, "ssim": 0.03, "lpips_vgg_raw": 0.03, "flip": 0.01}
 
 
 @dataclass
 class Plan:
     """What to make up. ``effect`` is the true difference of "volumetric" from "adc" in each metric.
 
-    Noises are in units of ``SPREAD``: of a scene (shared by the arms), of the effect in a scene, of a trial, of a view
-    (shared by the arms) and of a view in a trial.
+    Noises are in units of ``SPREAD``: of a scene (shared by the arms), of the effect in a scene, of
+    a trial, of a view (shared by the arms) and of a view in a trial.
     """
 
     experiment: str = "exp"
@@ -42,7 +43,9 @@ class Plan:
     view_noise: float = 1.0
     residual_noise: float = 0.1
     gaussians: dict[str, int] = field(default_factory=lambda: {"adc": 20_000, "volumetric": 26_000})
-    unavailable: dict[str, str] = field(default_factory=lambda: {"lpips_alex": "weights file alexnet.pth not found"})
+    unavailable: dict[str, str] = field(
+        default_factory=lambda: {"lpips_alex": "weights file alexnet.pth not found"}
+    )
     random_seed: int = 0
     pictures: bool = False  # also renders, ground truth and point clouds
 
@@ -62,7 +65,10 @@ def write_runs(runs: Path, plan: Plan) -> list[Path]:
                     for m in METRICS:
                         treated = densify == "volumetric"
                         noise = (
-                            scene_level[m] + treated * scene_effect[m] + view_level[m] + rng.normal(0, plan.trial_noise)
+                            scene_level[m]
+                            + treated * scene_effect[m]
+                            + view_level[m]
+                            + rng.normal(0, plan.trial_noise)
                         )
                         noise = noise + rng.normal(0, plan.residual_noise, plan.views)
                         views[m] = BASE[m] + treated * plan.effect.get(m, 0.0) + SPREAD[m] * noise
@@ -100,9 +106,18 @@ def trial_data(
         "scene_extent": 4.2,
         "seconds": {"init": 5.0, "train": gaussians / 400 + seed, "evaluate": 2.0},
         "peak_memory_mb": 900,
-        "events": {"cloned": 500, "split_gradient": 300, "split_volume": 100 if densify == "volumetric" else 0},
+        "events": {
+            "cloned": 500,
+            "split_gradient": 300,
+            "split_volume": 100 if densify == "volumetric" else 0,
+        },
         "init_report": {"registered": 48, "images": 48},
-        "hashes": {"config": "c0ffee00", "data": f"data-{scene}", "init": f"init-{scene}-{init}", "train": f"t{seed}"},
+        "hashes": {
+            "config": "c0ffee00",
+            "data": f"data-{scene}",
+            "init": f"init-{scene}-{init}",
+            "train": f"t{seed}",
+        },
         "versions": {"gsbench": "0.1.0", "torch": "2.13.0", "pycolmap": "4.2.1"},
     }
 
@@ -113,16 +128,24 @@ def trial_folder(runs: Path, data: dict[str, Any], config_hash: str = "c0ffee00"
 
 
 def write_trial(
-    runs: Path, data: dict[str, Any], views: dict[str, np.ndarray], config_hash: str = "c0ffee00", **settings: Any
+    runs: Path,
+    data: dict[str, Any],
+    views: dict[str, np.ndarray],
+    config_hash: str = "c0ffee00",
+    **settings: Any,
 ) -> Path:
-    """Write one trial folder: results, per-view metrics, events, curves and a configuration with ``settings``."""
+    """Write one trial folder: results, per-view metrics, events, curves and a configuration with
+    ``settings``."""
     path = trial_folder(runs, data, config_hash)
     path.mkdir(parents=True)
     names = [f"view{k:03d}" for k in range(len(next(iter(views.values()))))]
     with (path / "per_view.csv").open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(["view", *views])
-        writer.writerows([name, *(repr(float(values[k])) for values in views.values())] for k, name in enumerate(names))
+        writer.writerows(
+            [name, *(repr(float(values[k])) for values in views.values())]
+            for k, name in enumerate(names)
+        )
     config = {"name": data["experiment"], "seed": data["seed"], "scene": {"name": data["scene"]}}
     config["init"] = {"name": data["init"]}
     config |= {
@@ -147,14 +170,19 @@ def write_arms(
     experiment: str = "exp",
     **settings: Any,
 ) -> list[Path]:
-    """Trials of arms with the densifier's settings given for each, and ``group__key`` for all; results are noise."""
+    """Trials of arms with the densifier's settings given for each, and ``group__key`` for all;
+    results are noise."""
     rng = np.random.default_rng(0)
     paths = []
     for (name, densify), scene, seed in itertools.product(arms.items(), scenes, seeds):
         views = {m: BASE[m] + SPREAD[m] * rng.normal(0, 0.1, 3) for m in METRICS}
         data = trial_data(Plan(experiment=experiment), scene, "sfm", name, seed, views)
         # a hash of its own for each arm, as different settings have
-        paths.append(write_trial(runs, data, views, sha256(repr(densify).encode()).hexdigest()[:8], **settings))
+        paths.append(
+            write_trial(
+                runs, data, views, sha256(repr(densify).encode()).hexdigest()[:8], **settings
+            )
+        )
         config = json.loads((paths[-1] / "config.yaml").read_text())
         config["densify"] = {"name": name, **densify}
         (paths[-1] / "config.yaml").write_text(json.dumps(config))
@@ -166,7 +194,8 @@ TEXTURED = slice(80, 160)  # columns of the ground truth that hold grass; the ot
 
 
 def write_pictures(path: Path, data: dict[str, Any], views: int) -> None:
-    """Ground truth that is smooth on the left and grassy on the right; "adc" blurs the grass more than "volumetric".
+    """Ground truth that is smooth on the left and grassy on the right; "adc" blurs the grass more
+    than "volumetric".
 
     In the upper left corner "volumetric" is off by 20 levels, where "adc" is right.
     """
@@ -190,12 +219,15 @@ def write_pictures(path: Path, data: dict[str, Any], views: int) -> None:
 
 
 def write_point_cloud(path: Path, data: dict[str, Any]) -> None:
-    """A PLY with log-normal scales, smaller for "volumetric"; and histograms logged during its training."""
+    """A PLY with log-normal scales, smaller for "volumetric"; and histograms logged during its
+    training."""
     rng = np.random.default_rng(data["seed"])
     fields = ["x", "y", "z", "opacity", *(f"scale_{k}" for k in range(3))]
     vertices = np.zeros(2000, dtype=[(name, "f4") for name in fields])
     for axis in range(3):
-        vertices[f"scale_{axis}"] = rng.normal(-4.0 if data["densify"] == "adc" else -4.5, 1.0, 2000)
+        vertices[f"scale_{axis}"] = rng.normal(
+            -4.0 if data["densify"] == "adc" else -4.5, 1.0, 2000
+        )
     PlyData([PlyElement.describe(vertices, "vertex")]).write(path / "point_cloud.ply")
     edges = np.linspace(-18, 3, 85)
     histograms = []
@@ -222,7 +254,10 @@ def curves(data: dict[str, Any]) -> list[dict[str, float]]:
             "num_gaussians": int(3000 + (final - 3000) * part),
             "seconds": data["seconds"]["train"] * part,
         }
-        rows.append(row | {"psnr": data["metrics"]["psnr"] - 6 * (1 - part) ** 2, "loss": 0.3 * (1.2 - part)})
+        rows.append(
+            row
+            | {"psnr": data["metrics"]["psnr"] - 6 * (1 - part) ** 2, "loss": 0.3 * (1.2 - part)}
+        )
     return rows
 
 

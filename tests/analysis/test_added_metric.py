@@ -1,4 +1,5 @@
-"""A metric of one's own that is added to an experiment with trials: what these lack counts as unset."""
+"""A metric of one's own that is added to an experiment with trials: what these lack counts as
+unset."""
 
 from __future__ import annotations
 
@@ -31,7 +32,9 @@ def test_tables_show_both_and_choose_either(runs: Path) -> None:
     table = build_table(experiment)
     assert table.row_headings == ("scene", "init", "densify", KEY)
     shown = {(row.labels[2], row.labels[3]) for row in table.rows if row.labels[0] == "garden"}
-    assert shown == {(arm, value) for arm in ("adc", "volumetric") for value in ("None", "mine.Mae")}
+    assert shown == {
+        (arm, value) for arm in ("adc", "volumetric") for value in ("None", "mine.Mae")
+    }
     assert len(select_trials(experiment.trials, {KEY: "mine.Mae"})) == 4
     assert len(select_trials(experiment.trials, {KEY: "None"})) == 4
 

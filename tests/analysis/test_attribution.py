@@ -34,19 +34,30 @@ from tests.analysis.synthetic import write_arms
 from tests.conftest import ROOT
 
 SCHEDULE = {"train.densify_start": 500, "train.densify_stop": 15_000, "train.mcmc_stop": 25_000}
-SCHEDULE |= {"train.densify_interval": 100, "train.opacity_reset_interval": 3000, "train.iterations": 30_000}
+SCHEDULE |= {
+    "train.densify_interval": 100,
+    "train.opacity_reset_interval": 3000,
+    "train.iterations": 30_000,
+}
 
 
 def config(name: str, **changes: Any) -> dict[str, Any]:
     """A shipped densifier as a trial records it."""
-    own = {f"densify.{key}": SCHEDULE.get(str(v).strip("${}"), v) for key, v in shipped_arms()[name].items()}
+    own = {
+        f"densify.{key}": SCHEDULE.get(str(v).strip("${}"), v)
+        for key, v in shipped_arms()[name].items()
+    }
     return SCHEDULE | own | {f"densify.{key}": v for key, v in changes.items()}
 
 
 def densifier(name: str, **changes: Any) -> dict[str, Any]:
     """The same as the settings of the group alone."""
     prefix = "densify."
-    return {key.removeprefix(prefix): v for key, v in config(name, **changes).items() if key.startswith(prefix)}
+    return {
+        key.removeprefix(prefix): v
+        for key, v in config(name, **changes).items()
+        if key.startswith(prefix)
+    }
 
 
 def trials_of(runs: Path, arms: dict[str, dict[str, Any]], **settings: Any) -> list[TrialResult]:
@@ -72,7 +83,10 @@ def test_a_sentence_names_six_ingredients_and_counts_the_rest() -> None:
 
 
 def test_settings_of_the_first_configuration_come_first() -> None:
-    one, other = {"densify._target_": "t", "densify.a": 1}, {"densify._target_": "t", "densify.b": 2}
+    one, other = (
+        {"densify._target_": "t", "densify.a": 1},
+        {"densify._target_": "t", "densify.b": 2},
+    )
     assert ingredients(one, other) == ("a", "b")
     assert ingredients(other, one) == ("b", "a")
 
@@ -87,7 +101,9 @@ def test_settings_of_the_first_configuration_come_first() -> None:
         ("adc", "adc", ()),
     ],
 )
-def test_arms_of_gsbench_differ_in_what_their_files_say(first: str, second: str, expected: tuple[str, ...]) -> None:
+def test_arms_of_gsbench_differ_in_what_their_files_say(
+    first: str, second: str, expected: tuple[str, ...]
+) -> None:
     assert ingredients(config(first), config(second)) == expected
 
 
@@ -96,15 +112,38 @@ def test_every_shipped_class_says_in_what_it_departs_from_adc() -> None:
 
 
 def test_settings_that_only_name_or_place_a_trial_are_no_ingredient() -> None:
-    other = config("adc") | {"densify.name": "adc-2", "eval.primary": "psnr", "eval.lpips": [], "train.log_every": 1}
-    assert ingredients(config("adc"), other | {"seed": 4, "threads": 2, "launch.name": "slurm"}) == ()
+    other = config("adc") | {
+        "densify.name": "adc-2",
+        "eval.primary": "psnr",
+        "eval.lpips": [],
+        "train.log_every": 1,
+    }
+    assert (
+        ingredients(config("adc"), other | {"seed": 4, "threads": 2, "launch.name": "slurm"}) == ()
+    )
 
 
 def test_changes_outside_the_densifier_are_ingredients() -> None:
-    other = config("adc", stop=9000) | {"train.opacity": 0.05, "train.scale": 0.1, "scene.max_size": 160}
-    assert set(ingredients(config("adc"), other)) == {"schedule", "learning rates", "scene.max_size"}
-    sfm = config("adc") | {"init._target_": "gsbench.init.Sfm", "init.max_num_features": 1, "init.poses": "own"}
-    dim = config("adc") | {"init._target_": "gsbench.init.Dim", "init.extractor": "aliked", "init.poses": "shared"}
+    other = config("adc", stop=9000) | {
+        "train.opacity": 0.05,
+        "train.scale": 0.1,
+        "scene.max_size": 160,
+    }
+    assert set(ingredients(config("adc"), other)) == {
+        "schedule",
+        "learning rates",
+        "scene.max_size",
+    }
+    sfm = config("adc") | {
+        "init._target_": "gsbench.init.Sfm",
+        "init.max_num_features": 1,
+        "init.poses": "own",
+    }
+    dim = config("adc") | {
+        "init._target_": "gsbench.init.Dim",
+        "init.extractor": "aliked",
+        "init.poses": "shared",
+    }
     assert set(ingredients(sfm, dim)) == {"initial cloud", "cameras"}
 
 
@@ -112,8 +151,14 @@ def test_a_class_of_ones_own_is_one_ingredient_and_its_settings_belong_to_it() -
     """And of two versions of one class with settings of its own, each setting is one."""
     own = config("adc") | {"densify._target_": "mine.Patient", "densify.patience": 3}
     assert ingredients(config("adc"), own) == ("rule mine.Patient",)
-    assert ingredients(config("adc"), own | {"densify.interval": 50}) == ("rule mine.Patient", "schedule")
-    assert ingredients(own, own | {"densify.patience": 4, "densify.options.depth": 1}) == ("patience", "options.depth")
+    assert ingredients(config("adc"), own | {"densify.interval": 50}) == (
+        "rule mine.Patient",
+        "schedule",
+    )
+    assert ingredients(own, own | {"densify.patience": 4, "densify.options.depth": 1}) == (
+        "patience",
+        "options.depth",
+    )
     assert ingredients(config("longaxis"), own)[0] == "rule mine.Patient"
 
 
@@ -123,7 +168,10 @@ def test_a_mixed_comparison_is_said(tmp_path: Path) -> None:
         "sfm-longaxis differs from sfm-adc by split, gradient and threshold."
     )
     page = build_report(load_experiment(tmp_path, "exp"))
-    assert "longaxis differs from sfm-adc by split, gradient and threshold" in page.split("</strong>")[0]
+    assert (
+        "longaxis differs from sfm-adc by split, gradient and threshold"
+        in page.split("</strong>")[0]
+    )
     notes = build_table(load_experiment(tmp_path, "exp")).notes
     assert sentence(trials, "adc", "longaxis") in notes
 
@@ -131,7 +179,9 @@ def test_a_mixed_comparison_is_said(tmp_path: Path) -> None:
 def test_a_comparison_of_one_ingredient_is_not_commented(tmp_path: Path) -> None:
     trials = trials_of(tmp_path, {"adc": densifier("adc"), "volumetric": densifier("volumetric")})
     assert sentence(trials, "adc", "volumetric") == ""
-    assert not any("differs from" in note for note in build_table(load_experiment(tmp_path, "exp")).notes)
+    assert not any(
+        "differs from" in note for note in build_table(load_experiment(tmp_path, "exp")).notes
+    )
 
 
 def test_what_a_command_changed_in_all_arms_is_no_difference(tmp_path: Path) -> None:
@@ -146,7 +196,9 @@ def test_trials_without_a_record_are_said_to_have_none(tmp_path: Path) -> None:
     for path in write_arms(tmp_path, {"adc": densifier("adc"), "longaxis": densifier("longaxis")}):
         if "longaxis" in path.parent.name:
             (path / "config.yaml").unlink()
-    assert sentence(list(load_experiment(tmp_path, "exp").trials), "adc", "longaxis").endswith(f"by {NO_RECORD}.")
+    assert sentence(list(load_experiment(tmp_path, "exp").trials), "adc", "longaxis").endswith(
+        f"by {NO_RECORD}."
+    )
 
 
 def test_what_another_program_did_is_many_ingredients_at_once(tmp_path: Path) -> None:
@@ -173,7 +225,9 @@ def test_what_was_trained_elsewhere_is_not_known(tmp_path: Path) -> None:
 def test_points_of_a_search_are_not_held_against_each_other(tmp_path: Path) -> None:
     trials_of(tmp_path, {"adc": densifier("adc"), "longaxis": densifier("longaxis")})
     (tmp_path / "exp" / "tuning.json").write_text("{}")
-    assert not any("differs from" in note for note in build_table(load_experiment(tmp_path, "exp")).notes)
+    assert not any(
+        "differs from" in note for note in build_table(load_experiment(tmp_path, "exp")).notes
+    )
 
 
 # --- controls
@@ -181,12 +235,18 @@ def test_points_of_a_search_are_not_held_against_each_other(tmp_path: Path) -> N
 
 def test_controls_are_held_against_their_arms(tmp_path: Path) -> None:
     arms = {name: densifier(name) for name in ("adc", "absgrad", "longaxis")}
-    trials = trials_of(tmp_path, arms, eval__controls={"longaxis": "absgrad", "mcmc": "adc", "adc": "adc"})
+    trials = trials_of(
+        tmp_path, arms, eval__controls={"longaxis": "absgrad", "mcmc": "adc", "adc": "adc"}
+    )
     pairs = choose_pairs(sorted({trial.arm for trial in trials}), controls=controls_of(trials))
     against = [(first.densify, second.densify) for first, second in pairs]
     assert against == [("adc", "absgrad"), ("adc", "longaxis"), ("absgrad", "longaxis")]
     assert "sfm-longaxis against sfm-absgrad" in build_report(load_experiment(tmp_path, "exp"))
-    varied = [Arm("sfm", name, (("cap", str(cap)),)) for name in ("absgrad", "adc", "longaxis") for cap in (1, 2)]
+    varied = [
+        Arm("sfm", name, (("cap", str(cap)),))
+        for name in ("absgrad", "adc", "longaxis")
+        for cap in (1, 2)
+    ]
     assert choose_pairs(varied, controls={"longaxis": "absgrad"})[-2:] == [
         (varied[0], varied[4]),
         (varied[1], varied[5]),
@@ -194,8 +254,13 @@ def test_controls_are_held_against_their_arms(tmp_path: Path) -> None:
 
 
 def test_naming_a_control_makes_no_other_trial() -> None:
-    with_control = {"eval": {"lpips": [], "controls": {"longaxis": "absgrad"}}, "densify": {"name": "adc"}}
-    assert config_hash(with_control) == config_hash({"eval": {"lpips": []}, "densify": {"name": "adc"}})
+    with_control = {
+        "eval": {"lpips": [], "controls": {"longaxis": "absgrad"}},
+        "densify": {"name": "adc"},
+    }
+    assert config_hash(with_control) == config_hash(
+        {"eval": {"lpips": []}, "densify": {"name": "adc"}}
+    )
 
 
 def test_experiments_list_the_control_of_every_mixed_arm() -> None:
@@ -204,13 +269,20 @@ def test_experiments_list_the_control_of_every_mixed_arm() -> None:
     folders = (ROOT / "conf" / "experiment", ROOT / "findings" / "experiment")
     for file in sorted(file for folder in folders for file in folder.glob("*.yaml")):
         content = yaml.safe_load(file.read_text(encoding="utf-8"))
-        arms = str(content.get("hydra", {}).get("sweeper", {}).get("params", {}).get("densify", "")).split(",")
+        arms = str(
+            content.get("hydra", {}).get("sweeper", {}).get("params", {}).get("densify", "")
+        ).split(",")
         controls = content.get("eval", {}).get("controls", {})
         assert set(controls) | set(controls.values()) <= set(arms)
         for arm in (one for one in arms if one in shipped_arms() and "adc" in arms):
             mixed = ingredients(config("adc"), config(arm))
-            alone = [one for one in arms if one != arm and len(found := ingredients(config(one), config(arm))) == 1
-                     and found[0] in mixed]  # fmt: skip
+            alone = [
+                one
+                for one in arms
+                if one != arm
+                and len(found := ingredients(config(one), config(arm))) == 1
+                and found[0] in mixed
+            ]
             if len(mixed) > 1 and alone:
                 checked += 1
                 assert controls.get(arm) in alone, f"{file.name}: {alone} isolate what {arm} does"
@@ -229,7 +301,9 @@ def test_the_pair_that_stands_for_two_arms_is_as_alike_as_there_is() -> None:
         generator.shuffle(trials)
         one, other = ([trial for trial in trials if trial.arm == arm] for arm in arms)
         pairs = itertools.product(one, other)
-        expected = min(pairs, key=lambda pair: (pair[0].scene != pair[1].scene, pair[0].seed != pair[1].seed))
+        expected = min(
+            pairs, key=lambda pair: (pair[0].scene != pair[1].scene, pair[0].seed != pair[1].seed)
+        )
         found = representatives(trials, *arms)  # type: ignore[arg-type]
         assert found[0] is expected[0]
         assert found[1] is expected[1]

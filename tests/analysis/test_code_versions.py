@@ -21,7 +21,10 @@ MINE = {"densify___target_": "mine.Patient"}
 
 
 def code(digest: str | None = None, **stages: int) -> dict[str, Any]:
-    return {"sources": {} if digest is None else {"mine.Patient": digest}, "stages": STAGES | stages}
+    return {
+        "sources": {} if digest is None else {"mine.Patient": digest},
+        "stages": STAGES | stages,
+    }
 
 
 def finished_at(path: Path, seconds: float) -> Path:
@@ -71,7 +74,10 @@ def test_a_class_that_only_one_arm_has_is_no_difference(tmp_path: Path) -> None:
 def test_a_moved_scene_is_no_other_version(tmp_path: Path) -> None:
     one_trial(tmp_path, 0, "aaaaaaaa", MINE | {"scene__path": "/here"}, psnr=27.0, _code=code(NEW))
     one_trial(tmp_path, 1, "bbbbbbbb", MINE | {"scene__path": "/there"}, psnr=28.0, _code=code(NEW))
-    assert build_table(load_experiment(tmp_path, "exp"), metrics=["psnr"]).rows[0].entries[0].text == "27.50 ± 0.71"
+    assert (
+        build_table(load_experiment(tmp_path, "exp"), metrics=["psnr"]).rows[0].entries[0].text
+        == "27.50 ± 0.71"
+    )
 
 
 def of_gsbench(**rooms: str) -> dict[str, Any]:
@@ -79,11 +85,18 @@ def of_gsbench(**rooms: str) -> dict[str, Any]:
 
 
 def test_two_states_of_a_room_of_gsbench_are_refused(tmp_path: Path) -> None:
-    one_trial(tmp_path, 0, psnr=27.0, _code=of_gsbench(train="released", eval="a" * 16, scene="b" * 16))
-    one_trial(tmp_path, 1, psnr=27.0, _code=of_gsbench(train="c" * 16, eval="d" * 16, scene="b" * 16))
+    one_trial(
+        tmp_path, 0, psnr=27.0, _code=of_gsbench(train="released", eval="a" * 16, scene="b" * 16)
+    )
+    one_trial(
+        tmp_path, 1, psnr=27.0, _code=of_gsbench(train="c" * 16, eval="d" * 16, scene="b" * 16)
+    )
     with pytest.raises(InputError) as refused:
         build_table(load_experiment(tmp_path, "exp"))
-    for part in ("different versions of gsbench's train and 1 more room: released (", "cccccccc (garden seed 1; "):
+    for part in (
+        "different versions of gsbench's train and 1 more room: released (",
+        "cccccccc (garden seed 1; ",
+    ):
         assert part in str(refused.value)
 
 
@@ -118,24 +131,31 @@ def superseded(runs: Path, present: dict[str, str] | None = None) -> dict[str, s
 def test_without_the_file_the_version_that_finished_last_is_the_present_one(tmp_path: Path) -> None:
     finished_at(one_trial(tmp_path, 0, "aaaaaaaa", MINE, psnr=1.0, _code=code(OLD)), 1000)
     finished_at(one_trial(tmp_path, 1, "bbbbbbbb", MINE, psnr=1.0, _code=code(NEW)), 2000)
-    assert superseded(tmp_path) == {"seed0": "mine.Patient was 11111111, later trials have 22222222"}
+    assert superseded(tmp_path) == {
+        "seed0": "mine.Patient was 11111111, later trials have 22222222"
+    }
 
 
 def test_the_file_decides_which_version_is_the_present_one(tmp_path: Path) -> None:
     finished_at(one_trial(tmp_path, 0, "aaaaaaaa", MINE, psnr=1.0, _code=code(OLD)), 1000)
     finished_at(one_trial(tmp_path, 1, "bbbbbbbb", MINE, psnr=1.0, _code=code(NEW)), 2000)
-    assert superseded(tmp_path, {"mine.Patient": OLD}) == {"seed1": "mine.Patient was 22222222, it is now 11111111"}
+    assert superseded(tmp_path, {"mine.Patient": OLD}) == {
+        "seed1": "mine.Patient was 22222222, it is now 11111111"
+    }
     assert superseded(tmp_path, {"mine.Patient": "3" * 64}).keys() == {"seed0", "seed1"}
 
 
 def test_stages_are_superseded_by_later_trials(tmp_path: Path) -> None:
     finished_at(one_trial(tmp_path, 0, psnr=1.0, _code=code()), 1000)
     finished_at(one_trial(tmp_path, 1, psnr=1.0, _code=code(train=2)), 2000)
-    finished_at(one_trial(tmp_path, 2, psnr=1.0), 500)  # entered from elsewhere: no code of ours made it
+    # entered from elsewhere: no code of ours made it
+    finished_at(one_trial(tmp_path, 2, psnr=1.0), 500)
     assert superseded(tmp_path) == {"seed0": "stage train was 1, later trials have 2"}
 
 
 def test_trials_of_an_edited_gsbench_are_superseded(tmp_path: Path) -> None:
     finished_at(one_trial(tmp_path, 0, psnr=1.0, _code=of_gsbench(train="a" * 16)), 1000)
     finished_at(one_trial(tmp_path, 1, psnr=1.0, _code=of_gsbench(train="b" * 16)), 2000)
-    assert superseded(tmp_path) == {"seed0": "gsbench's train was aaaaaaaa, later trials have bbbbbbbb"}
+    assert superseded(tmp_path) == {
+        "seed0": "gsbench's train was aaaaaaaa, later trials have bbbbbbbb"
+    }

@@ -1,4 +1,5 @@
-"""A verdict whose metric was fixed before: what is adjusted for what, and what is said of late declarations."""
+"""A verdict whose metric was fixed before: what is adjusted for what, and what is said of late
+declarations."""
 
 from __future__ import annotations
 
@@ -36,7 +37,9 @@ CLEAR = {"lpips_vgg_raw": -0.05}
 
 
 def declare(runs: Path, *records: tuple[str, str], experiment: str = "exp") -> None:
-    entries = [Declaration(time=moment, questions=(open_question(metric),)) for metric, moment in records]
+    entries = [
+        Declaration(time=moment, questions=(open_question(metric),)) for metric, moment in records
+    ]
     (runs / experiment / "declared.jsonl").write_text(record_text(entries))
 
 
@@ -66,21 +69,32 @@ def test_a_verdict_in_words_has_its_numbers(tmp_path: Path) -> None:
         assert verdict.interval is not None
         assert verdict.p is not None
         p = "below 0.001" if verdict.p < 0.001 else f"{verdict.p:.3f}"
-        numbers = f"{verdict.shown(verdict.mean or 0.0)} (interval {verdict.shown_interval(verdict.interval)}, p {p}"
+        numbers = (
+            f"{verdict.shown(verdict.mean or 0.0)} (interval "
+            f"{verdict.shown_interval(verdict.interval)}, p {p}"
+        )
         assert f"on these scenes: {numbers}{adjusted})" in in_words(verdict)
     assert (p_text(0.001), p_text(0.0009), p_text(0.0126)) == ("0.001", "below 0.001", "0.013")
     assert families([one]) == [
         "The declared metric is not adjusted: it is one test.",
-        "All other metrics are secondary and do not decide the verdict; Holm adjusts them for 3 tests.",
+        "All other metrics are secondary and do not decide the verdict; Holm adjusts them for 3 "
+        "tests.",
     ]
 
 
 # --- families
 
 
-def test_of_one_pair_the_declared_metric_is_tested_as_it_is_and_the_others_by_holm(tmp_path: Path) -> None:
+def test_of_one_pair_the_declared_metric_is_tested_as_it_is_and_the_others_by_holm(
+    tmp_path: Path,
+) -> None:
     (one,) = judged(declared_experiment(tmp_path, ("flip", EARLY), effect=CLEAR))
-    assert [verdict.quantity.key for verdict in one.verdicts] == ["flip", "psnr", "ssim", "lpips_vgg_raw"]
+    assert [verdict.quantity.key for verdict in one.verdicts] == [
+        "flip",
+        "psnr",
+        "ssim",
+        "lpips_vgg_raw",
+    ]
     assert [one.role(verdict) for verdict in one.verdicts] == ["declared", *["secondary"] * 3]
     first, *others = one.verdicts
     assert first.family == 1
@@ -104,7 +118,9 @@ def alone(verdict: Verdict) -> float:
 
 def test_with_several_arms_the_declared_metric_is_adjusted_for_their_number(tmp_path: Path) -> None:
     arms = ("adc", "volumetric", "absgrad", "mcmc")
-    found = judged(declared_experiment(tmp_path, ("lpips_vgg_raw", EARLY), effect=CLEAR, densifiers=arms))
+    found = judged(
+        declared_experiment(tmp_path, ("lpips_vgg_raw", EARLY), effect=CLEAR, densifiers=arms)
+    )
     firsts = [one.verdicts[0] for one in found]
     assert [verdict.family for verdict in firsts] == [3, 3, 3]
     least = min(firsts, key=alone)
@@ -129,19 +145,31 @@ def test_a_verdict_that_only_a_single_test_would_give_is_none_in_a_family() -> N
 
 
 def test_the_report_says_what_was_declared_and_what_is_secondary(tmp_path: Path) -> None:
-    page = build_report(declared_experiment(tmp_path, ("lpips_vgg_raw", EARLY), effect=CLEAR, views=3, random_seed=1))
-    assert "LPIPS VGG raw was declared beforehand (eval.primary, 2020-01-01 00:00 UTC), before any of the 12" in page
+    page = build_report(
+        declared_experiment(
+            tmp_path, ("lpips_vgg_raw", EARLY), effect=CLEAR, views=3, random_seed=1
+        )
+    )
+    assert (
+        "LPIPS VGG raw was declared beforehand (eval.primary, 2020-01-01 00:00 UTC), before any "
+        "of the 12" in page
+    )
     assert "on these scenes: better in LPIPS VGG raw, the metric declared beforehand." in page
     assert "Secondary, adjusted for their number: undecided in" in page
     assert "Interval and p are adjusted" in page
     assert "No metric was declared" not in page
 
 
-def test_where_nothing_was_declared_that_is_said_and_all_metrics_are_one_family(tmp_path: Path) -> None:
+def test_where_nothing_was_declared_that_is_said_and_all_metrics_are_one_family(
+    tmp_path: Path,
+) -> None:
     write_runs(tmp_path, Plan(effect=CLEAR, views=3))
     experiment = load_experiment(tmp_path, "exp")
     page = build_report(experiment)
-    assert "No metric was declared beforehand (eval.primary): all metrics of all pairs of arms are one family" in page
+    assert (
+        "No metric was declared beforehand (eval.primary): all metrics of all pairs of arms are "
+        "one family" in page
+    )
     assert "4 tests adjusted by Holm" in page
     (one,) = judged(experiment)
     assert {(one.role(v), v.family) for v in one.verdicts} == {("", 4)}
@@ -151,25 +179,32 @@ def test_where_nothing_was_declared_that_is_said_and_all_metrics_are_one_family(
     assert not any("declared" in note for note in build_table(experiment).notes)
 
 
-def test_tables_carry_the_verdict_on_the_declared_metric_whichever_trials_they_show(tmp_path: Path) -> None:
+def test_tables_carry_the_verdict_on_the_declared_metric_whichever_trials_they_show(
+    tmp_path: Path,
+) -> None:
     experiment = declared_experiment(tmp_path, ("lpips_vgg_raw", EARLY), effect=CLEAR)
     whole = [note for note in build_table(experiment).notes if note.startswith("Verdict")]
     assert len(whole) == 1
     assert whole[0].startswith(
         "Verdict, sfm-volumetric against sfm-adc: better in LPIPS VGG raw on these scenes: −0.05"
     )
-    part = build_table(experiment, [trial for trial in experiment.trials if trial.scene == "garden"])
+    part = build_table(
+        experiment, [trial for trial in experiment.trials if trial.scene == "garden"]
+    )
     assert [note for note in part.notes if note.startswith("Verdict")] == whole
 
 
-def test_a_declared_metric_without_weights_is_undecided_and_no_other_takes_its_place(tmp_path: Path) -> None:
+def test_a_declared_metric_without_weights_is_undecided_and_no_other_takes_its_place(
+    tmp_path: Path,
+) -> None:
     experiment = declared_experiment(tmp_path, ("lpips_alex", EARLY), effect=CLEAR)
     (one,) = judged(experiment)
     assert "lpips_alex" not in [verdict.quantity.key for verdict in one.verdicts]
     assert {one.role(verdict) for verdict in one.verdicts} == {"secondary"}
     assert one.notes == ("LPIPS Alex: weights file alexnet.pth not found",)
     assert families([one]) == [
-        "All other metrics are secondary and do not decide the verdict; Holm adjusts them for 4 tests."
+        "All other metrics are secondary and do not decide the verdict; Holm adjusts them for 4 "
+        "tests."
     ]
     reason = "the declared metric LPIPS Alex has no value (weights file alexnet.pth not found)"
     assert f"no verdict, since {reason}" in build_report(experiment)
@@ -207,11 +242,17 @@ def test_a_declaration_that_took_the_place_of_another_is_said(tmp_path: Path) ->
     found = active_declaration(experiment.folder, experiment.trials)
     assert found is not None
     assert found.metric == "flip"
-    assert any("Declared before it: psnr (2020-01-01 00:00 UTC)." in line for line in found.sentences("FLIP"))
+    assert any(
+        "Declared before it: psnr (2020-01-01 00:00 UTC)." in line
+        for line in found.sentences("FLIP")
+    )
 
 
-def test_what_was_measured_before_counts_also_where_results_were_written_later(tmp_path: Path) -> None:
-    """The store gives an experiment of another name the same numbers within seconds: ``measured`` is when they came."""
+def test_what_was_measured_before_counts_also_where_results_were_written_later(
+    tmp_path: Path,
+) -> None:
+    """The store gives an experiment of another name the same numbers within seconds: ``measured``
+    is when they came."""
     paths = write_runs(tmp_path, Plan())
     declare(tmp_path, ("psnr", "2030-06-01T00:00:00Z"))
     after = calendar.timegm(time.strptime("2030-06-02T00:00:00Z", STAMP))
@@ -231,7 +272,9 @@ def test_what_was_measured_before_counts_also_where_results_were_written_later(t
 def test_trials_remember_a_declaration_whose_record_is_gone(tmp_path: Path) -> None:
     path = write_runs(tmp_path, Plan())[0]
     data = json.loads((path / "results.json").read_text())
-    (path / "results.json").write_text(json.dumps(data | {"declared": {"metric": "psnr", "time": EARLY}}))
+    (path / "results.json").write_text(
+        json.dumps(data | {"declared": {"metric": "psnr", "time": EARLY}})
+    )
     experiment = load_experiment(tmp_path, "exp")
     repeated = [trial.record.declared for trial in experiment.trials]
     assert [one.primary for one in read_declarations(experiment.folder, repeated)] == ["psnr"]
@@ -241,14 +284,25 @@ def test_trials_remember_a_declaration_whose_record_is_gone(tmp_path: Path) -> N
 # --- which trials were declared with it
 
 
-def declare_trials(runs: Path, *records: tuple[str, dict[str, list[int]]], metric: str = "lpips_vgg_raw") -> None:
+def declare_trials(
+    runs: Path, *records: tuple[str, dict[str, list[int]]], metric: str = "lpips_vgg_raw"
+) -> None:
     asked = (open_question(metric),)
-    entries = [Declaration(time=moment, questions=asked).to_json() | {"trials": trials} for moment, trials in records]
-    (runs / "exp" / "declared.jsonl").write_text("".join(json.dumps(entry) + "\n" for entry in entries))
+    entries = [
+        Declaration(time=moment, questions=asked).to_json() | {"trials": trials}
+        for moment, trials in records
+    ]
+    (runs / "exp" / "declared.jsonl").write_text(
+        "".join(json.dumps(entry) + "\n" for entry in entries)
+    )
 
 
-def planned(seeds: list[int], arms: tuple[str, ...] = ("adc", "volumetric")) -> dict[str, list[int]]:
-    return {f"{scene}/sfm-{arm}/c0ffee00": seeds for scene in ("courtyard", "garden") for arm in arms}
+def planned(
+    seeds: list[int], arms: tuple[str, ...] = ("adc", "volumetric")
+) -> dict[str, list[int]]:
+    return {
+        f"{scene}/sfm-{arm}/c0ffee00": seeds for scene in ("courtyard", "garden") for arm in arms
+    }
 
 
 def test_declared_trials_keep_the_metrics_place(tmp_path: Path) -> None:
@@ -259,7 +313,8 @@ def test_declared_trials_keep_the_metrics_place(tmp_path: Path) -> None:
     assert found.beforehand
     assert len(found.sentences("LPIPS")) == 1
     declare_trials(tmp_path, (EARLY, planned([0])), ("2020-01-02T00:00:00Z", planned([0, 1, 2])))
-    found = active_declaration(experiment.folder, experiment.trials)  # added while no result was there
+    # added while no result was there
+    found = active_declaration(experiment.folder, experiment.trials)
     assert found is not None
     assert found.beforehand
     assert found.declaration.when == "2020-01-01 00:00 UTC"
@@ -313,16 +368,22 @@ def test_declared_trials_that_are_missing_are_said(tmp_path: Path) -> None:
     found = active_declaration(experiment.folder, experiment.trials)
     assert found is not None
     assert found.beforehand
-    assert any("4 of the 16 declared trials are still missing" in line for line in found.sentences("LPIPS"))
+    assert any(
+        "4 of the 16 declared trials are still missing" in line for line in found.sentences("LPIPS")
+    )
 
 
-def test_a_record_that_was_deleted_and_written_anew_does_not_hide_what_was_added(tmp_path: Path) -> None:
+def test_a_record_that_was_deleted_and_written_anew_does_not_hide_what_was_added(
+    tmp_path: Path,
+) -> None:
     """The trials repeat that the metric was declared, and not with which trials."""
     for path in write_runs(tmp_path, Plan(effect=CLEAR)):
         data = json.loads((path / "results.json").read_text())
         measured = EARLY if path.name.endswith(("seed0", "seed1")) else "2021-01-01T00:00:00Z"
         declared = {"metric": "lpips_vgg_raw", "time": "2019-01-01T00:00:00Z"}
-        (path / "results.json").write_text(json.dumps(data | {"measured": measured, "declared": declared}))
+        (path / "results.json").write_text(
+            json.dumps(data | {"measured": measured, "declared": declared})
+        )
     declare_trials(tmp_path, ("2020-06-01T00:00:00Z", planned([0, 1, 2])))
     experiment = load_experiment(tmp_path, "exp")
     found = active_declaration(experiment.folder, experiment.trials)
@@ -339,15 +400,25 @@ def test_records_without_trials_and_damaged_ones_are_read(tmp_path: Path) -> Non
     assert found.beforehand
     for trials in ({"a": [0]}, {"a/b/c/d": [0]}, {"a/b/c": 3}, {"a/b/d": ["x"]}):
         declare_trials(tmp_path, (EARLY, trials), metric="psnr")  # type: ignore[arg-type]
-        assert active_declaration(experiment.folder, experiment.trials) is None  # a damaged line declares nothing
+        # a damaged line declares nothing
+        assert active_declaration(experiment.folder, experiment.trials) is None
 
 
 def test_every_declaration_is_a_line_of_one_kind_and_reads_back(tmp_path: Path) -> None:
     arms = Arm("sfm", "adc"), Arm("sfm", "volumetric", (("densify.max_gaussians", "30000"),))
     keys = ("garden/sfm-adc/3fa9c1d2", "garden/sfm-volumetric/aaaaaaaa")
-    asked = Question(metric="psnr", least=0.1, baseline=arms[0], arm=arms[1], scenes={"garden": keys}, seeds=(0, 1, 2))
+    asked = Question(
+        metric="psnr",
+        least=0.1,
+        baseline=arms[0],
+        arm=arms[1],
+        scenes={"garden": keys},
+        seeds=(0, 1, 2),
+    )
     one = Declaration(time=EARLY, questions=(asked,), looks=(2, 3))
-    two = Declaration(time=LATE, questions=(Question(metric="flip", sign=0),), trials={keys[0]: (0, 1)})
+    two = Declaration(
+        time=LATE, questions=(Question(metric="flip", sign=0),), trials={keys[0]: (0, 1)}
+    )
     (tmp_path / "declared.jsonl").write_text(record_text([two, one]))
     assert read_declarations(tmp_path) == [one, two]
     assert one.planned == dict.fromkeys(keys, (0, 1, 2))
@@ -358,11 +429,18 @@ def test_every_declaration_is_a_line_of_one_kind_and_reads_back(tmp_path: Path) 
 def test_a_sweep_in_looks_has_one_verdict_and_it_is_that_of_the_looks(tmp_path: Path) -> None:
     experiment = declared_experiment(tmp_path, effect=CLEAR)
     scenes = {
-        scene: (f"{scene}/sfm-adc/c0ffee00", f"{scene}/sfm-volumetric/c0ffee00") for scene in ("courtyard", "garden")
+        scene: (f"{scene}/sfm-adc/c0ffee00", f"{scene}/sfm-volumetric/c0ffee00")
+        for scene in ("courtyard", "garden")
     }
     arms = Arm("sfm", "adc"), Arm("sfm", "volumetric")
     asked = Question(
-        metric="lpips_vgg_raw", sign=-1, least=0.005, baseline=arms[0], arm=arms[1], scenes=scenes, seeds=(0, 1, 2)
+        metric="lpips_vgg_raw",
+        sign=-1,
+        least=0.005,
+        baseline=arms[0],
+        arm=arms[1],
+        scenes=scenes,
+        seeds=(0, 1, 2),
     )
     declared = Declaration(time=EARLY, questions=(asked,), looks=(2, 3))
     (tmp_path / "exp" / "declared.jsonl").write_text(record_text([declared]))

@@ -1,4 +1,5 @@
-"""The fairness sheet: generated from records and files, and nothing that was recorded is missing from it."""
+"""The fairness sheet: generated from records and files, and nothing that was recorded is missing
+from it."""
 
 from __future__ import annotations
 
@@ -26,7 +27,9 @@ LEFT, RIGHT = Arm("sfm", "adc"), Arm("sfm", "longaxis")
 
 
 def sheet(runs: Path, second: str = "longaxis", first: str = "adc") -> Table:
-    return fairness_table(with_variants(load_experiment(runs, "exp").trials), Arm("sfm", first), Arm("sfm", second))
+    return fairness_table(
+        with_variants(load_experiment(runs, "exp").trials), Arm("sfm", first), Arm("sfm", second)
+    )
 
 
 def shown(table: Table) -> dict[str, tuple[str, str, str]]:
@@ -45,12 +48,28 @@ def paths(tmp_path: Path) -> list[Path]:
     return write_arms(tmp_path, {name: densifier(name) for name in ("adc", "longaxis")})
 
 
-def test_settings_schedules_and_what_was_measured_stand_side_by_side(tmp_path: Path, paths: list[Path]) -> None:
-    change(paths, "longaxis", train_views=40, num_init_points=9000, num_gaussians=31_000, seconds={"train": 80.0})
-    change(paths, "longaxis", versions={"gsbench": "0.2.0"}, hashes={"data": "data-courtyard", "cloud": "abcdef"})
+def test_settings_schedules_and_what_was_measured_stand_side_by_side(
+    tmp_path: Path, paths: list[Path]
+) -> None:
+    change(
+        paths,
+        "longaxis",
+        train_views=40,
+        num_init_points=9000,
+        num_gaussians=31_000,
+        seconds={"train": 80.0},
+    )
+    change(
+        paths,
+        "longaxis",
+        versions={"gsbench": "0.2.0"},
+        hashes={"data": "data-courtyard", "cloud": "abcdef"},
+    )
     for path in paths:
         if path.parent.name == "sfm-longaxis":
-            (path / "events.jsonl").write_text("".join(json.dumps({"step": 100 * k}) + "\n" for k in range(1, 24)))
+            (path / "events.jsonl").write_text(
+                "".join(json.dumps({"step": 100 * k}) + "\n" for k in range(1, 24))
+            )
     rows = shown(sheet(tmp_path))
     assert rows["views for training"] == ("42", "40", UNLIKE)
     assert rows["initial points"] == ("3,000", "9,000", UNLIKE)
@@ -67,7 +86,13 @@ def test_settings_schedules_and_what_was_measured_stand_side_by_side(tmp_path: P
 
 def test_only_trials_that_are_compared_count(tmp_path: Path, paths: list[Path]) -> None:
     """Seed 2 of the baseline has no partner, so its count is not part of the comparison."""
-    shutil.rmtree(next(path for path in paths if path.parent.name == "sfm-longaxis" and path.name.endswith("seed2")))
+    shutil.rmtree(
+        next(
+            path
+            for path in paths
+            if path.parent.name == "sfm-longaxis" and path.name.endswith("seed2")
+        )
+    )
     table = sheet(tmp_path)
     assert shown(table)["Gaussians in the end"][0] == "20,000 to 20,010, mean 20,005"
     assert "Compared: 2 pairs of trials of one scene and seed." in table.notes
@@ -82,7 +107,12 @@ def test_arms_without_a_common_seed_have_a_sheet_of_all_their_trials(tmp_path: P
 
 
 def test_long_values_are_cut() -> None:
-    assert [_shown("x" * 60), _shown("x" * 61), _shown(3), _shown(None)] == ["x" * 60, "x" * 59 + "…", "3", "null"]
+    assert [_shown("x" * 60), _shown("x" * 61), _shown(3), _shown(None)] == [
+        "x" * 60,
+        "x" * 59 + "…",
+        "3",
+        "null",
+    ]
 
 
 def test_the_notes_say_the_ingredients_and_the_tuning(tmp_path: Path, paths: list[Path]) -> None:
@@ -94,11 +124,18 @@ def test_the_notes_say_the_ingredients_and_the_tuning(tmp_path: Path, paths: lis
 def test_an_arm_of_ones_own_has_its_class_and_version(tmp_path: Path) -> None:
     own = {"_target_": "largest.SplitLargest", "start": 50, "share": 0.1}
     found = write_arms(tmp_path, {"adc": densifier("adc"), "largest": own})
-    change(found, "largest", code={"sources": {"largest.SplitLargest": "3fa9c1d2aaaaaaaaaaaa"}, "stages": {}})
+    change(
+        found,
+        "largest",
+        code={"sources": {"largest.SplitLargest": "3fa9c1d2aaaaaaaaaaaa"}, "stages": {}},
+    )
     table = sheet(tmp_path, "largest")
     assert shown(table)["densify.share"] == ("–", "0.1", UNLIKE)
     assert "largest.SplitLargest 3fa9c1d2" in shown(table)["code"][1]
-    assert table.notes[0] == "sfm-largest differs from sfm-adc by rule largest.SplitLargest and schedule."
+    assert (
+        table.notes[0]
+        == "sfm-largest differs from sfm-adc by rule largest.SplitLargest and schedule."
+    )
 
 
 def test_trials_without_any_record_still_have_a_sheet(tmp_path: Path, paths: list[Path]) -> None:
@@ -117,26 +154,45 @@ def test_trials_without_any_record_still_have_a_sheet(tmp_path: Path, paths: lis
 
 
 def test_values_that_were_tried_here_are_said(tmp_path: Path) -> None:
-    arms = {f"volumetric-{v}": densifier("volumetric", volume_threshold=v) for v in (0.01, 0.03, 0.1)}
+    arms = {
+        f"volumetric-{v}": densifier("volumetric", volume_threshold=v) for v in (0.01, 0.03, 0.1)
+    }
     write_arms(tmp_path, {"adc": densifier("adc"), **arms, "absgrad": densifier("absgrad")})
     notes = sheet(tmp_path, "volumetric-0.01").notes
     two = tmp_path / "two"
     write_arms(two, {"adc": densifier("adc"), **dict([*arms.items()][:2])})
-    assert any("sfm-volumetric-0.01: 2 choices of its settings" in note for note in sheet(two, "volumetric-0.01").notes)
+    assert any(
+        "sfm-volumetric-0.01: 2 choices of its settings" in note
+        for note in sheet(two, "volumetric-0.01").notes
+    )
     (line,) = [note for note in notes if "sfm-volumetric-0.01: 3 choices of its settings" in note]
-    assert "They differ in densify.volume_threshold, and all were measured on the test views" in line
+    assert (
+        "They differ in densify.volume_threshold, and all were measured on the test views" in line
+    )
 
 
 def test_a_search_that_proposed_the_settings_is_named(tmp_path: Path) -> None:
-    write_arms(tmp_path, {"adc": densifier("adc"), "volumetric": densifier("volumetric", volume_threshold=0.06841)})
+    write_arms(
+        tmp_path,
+        {"adc": densifier("adc"), "volumetric": densifier("volumetric", volume_threshold=0.06841)},
+    )
     points = [
         {"value": value, "settings": {"densify.volume_threshold": threshold}}
         for value, threshold in ((27.6, 0.1), (27.5, 0.06841))
     ]
     record = {
-        "sweep": "vth", "arm": "sfm-volumetric", "metric": "psnr", "direction": 1, "wanted": 2, "seeds": [100],
-        "scenes": ["courtyard"], "ranges": {}, "log": [], "as_it_is": False, "points": points,
-    }  # fmt: skip
+        "sweep": "vth",
+        "arm": "sfm-volumetric",
+        "metric": "psnr",
+        "direction": 1,
+        "wanted": 2,
+        "seeds": [100],
+        "scenes": ["courtyard"],
+        "ranges": {},
+        "log": [],
+        "as_it_is": False,
+        "points": points,
+    }
     (tmp_path / "vth").mkdir()
     (tmp_path / "vth" / "tuning.json").write_text(json.dumps(record))
     for name, content in (("other", '{"points": [3, {"settings": []}]}'), ("broken", "{")):
@@ -147,12 +203,15 @@ def test_a_search_that_proposed_the_settings_is_named(tmp_path: Path) -> None:
         return [note for note in sheet(tmp_path, "volumetric").notes if note.startswith("Tuning.")]
 
     (line,) = tuning()
-    assert "densify.volume_threshold=0.1 is the best of 2 points by psnr of validation views" in line
+    assert (
+        "densify.volume_threshold=0.1 is the best of 2 points by psnr of validation views" in line
+    )
     assert line.endswith("Tried: 0.1 (27.6), 0.06841 (27.5). These trials have other values.")
     (tmp_path / "vth" / "tuning.json").write_text(json.dumps(record | {"points": points[1:]}))
     unequal, line = tuning()
     assert unequal == (
-        "Tuning. They were not tuned alike: sfm-adc none and sfm-volumetric 1 point of 1 seed on validation views."
+        "Tuning. They were not tuned alike: sfm-adc none and sfm-volumetric 1 point of 1 seed on "
+        "validation views."
     )
     assert "These trials have other values" not in line
     nothing = [point | {"value": None} for point in points]
@@ -163,10 +222,14 @@ def test_a_search_that_proposed_the_settings_is_named(tmp_path: Path) -> None:
 # --- where it stands
 
 
-def test_the_sheet_stands_before_the_verdicts_numbers_in_the_report(tmp_path: Path, paths: list[Path]) -> None:
+def test_the_sheet_stands_before_the_verdicts_numbers_in_the_report(
+    tmp_path: Path, paths: list[Path]
+) -> None:
     page = build_report(load_experiment(tmp_path, "exp"))
     assert (
-        page.index('<h2 id="h-verdict"') < page.index("Fairness sheet: sfm-longaxis") < page.index("seeds to resolve")
+        page.index('<h2 id="h-verdict"')
+        < page.index("Fairness sheet: sfm-longaxis")
+        < page.index("seeds to resolve")
     )
     assert page.count("<caption>Fairness sheet") == 1
 
@@ -178,7 +241,13 @@ def test_the_verb_writes_a_sheet_for_each_pair_in_every_format(
     assert "### Fairness sheet: sfm-longaxis against sfm-adc" in capsys.readouterr().out
     for format_name, suffix in (("latex", "tex"), ("csv", "csv"), ("html", "html")):
         out = tmp_path / "out"
-        assert tables(["exp", "--layout", "fairness", "--format", format_name, "--out", str(out)], tmp_path) == 0
+        assert (
+            tables(
+                ["exp", "--layout", "fairness", "--format", format_name, "--out", str(out)],
+                tmp_path,
+            )
+            == 0
+        )
         assert (out / f"exp-fairness-sfm-longaxis-sfm-adc.{suffix}").stat().st_size > 500
     one = tmp_path / "one"
     write_arms(one, {"adc": densifier("adc")})
@@ -196,8 +265,12 @@ def test_the_latex_has_columns_that_wrap(tmp_path: Path, paths: list[Path]) -> N
     assert text.count("{") - text.count("\\{") == text.count("}") - text.count("\\}")
 
 
-@pytest.mark.skipif(shutil.which("pdflatex") is None, reason="pdflatex with booktabs is not installed")
+@pytest.mark.skipif(
+    shutil.which("pdflatex") is None, reason="pdflatex with booktabs is not installed"
+)
 def test_the_latex_compiles(tmp_path: Path, paths: list[Path]) -> None:
     document = f"\\documentclass{{article}}\\usepackage{{booktabs,array}}\\begin{{document}}{to_latex(sheet(tmp_path))}"
     (tmp_path / "a.tex").write_text(document + "\\end{document}")
-    subprocess.run(["pdflatex", "-halt-on-error", "a.tex"], cwd=tmp_path, check=True, capture_output=True)
+    subprocess.run(
+        ["pdflatex", "-halt-on-error", "a.tex"], cwd=tmp_path, check=True, capture_output=True
+    )

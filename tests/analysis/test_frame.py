@@ -28,7 +28,16 @@ def test_a_row_is_a_trial_as_its_file_says(make_experiment: Make) -> None:
     for (_, row), trial in zip(frame.iterrows(), experiment.trials, strict=True):
         data = json.loads((trial.path / "results.json").read_text())
         assert row["folder"] == str(trial.path)
-        for key in ("experiment", "scene", "init", "densify", "seed", "raster", "protocol", "num_gaussians"):
+        for key in (
+            "experiment",
+            "scene",
+            "init",
+            "densify",
+            "seed",
+            "raster",
+            "protocol",
+            "num_gaussians",
+        ):
             assert row[key] == data[key]
         assert {key: row[key] for key in data["metrics"]} == data["metrics"]
         assert (row["width"], row["height"]) == (400, 300)
@@ -41,8 +50,12 @@ def test_a_row_is_a_trial_as_its_file_says(make_experiment: Make) -> None:
 def test_groups_of_the_frame_are_the_cells_of_the_table(make_experiment: Make) -> None:
     experiment = make_experiment()
     means = to_frame(experiment).groupby(["scene", "densify"])["psnr"].agg(["mean", "std"])
-    values = [t.metrics["psnr"] for t in experiment.trials if (t.scene, t.densify) == ("garden", "adc")]
-    assert means.loc[("garden", "adc"), "mean"] == pytest.approx(statistics.fmean(values), abs=1e-12)
+    values = [
+        t.metrics["psnr"] for t in experiment.trials if (t.scene, t.densify) == ("garden", "adc")
+    ]
+    assert means.loc[("garden", "adc"), "mean"] == pytest.approx(
+        statistics.fmean(values), abs=1e-12
+    )
     assert means.loc[("garden", "adc"), "std"] == pytest.approx(statistics.stdev(values), abs=1e-12)
 
 
@@ -66,7 +79,13 @@ def test_the_csv_of_trials_reads_back_as_the_frame(
     assert again.columns.tolist() == frame.columns.tolist()
     for name in ("psnr", "flip", "seconds_train"):
         np.testing.assert_array_equal(again[name], frame[name])
-    assert tables(["exp", "--format", "trials", "--where", "seed=1", "--out", str(tmp_path / "out")], tmp_path) == 0
+    assert (
+        tables(
+            ["exp", "--format", "trials", "--where", "seed=1", "--out", str(tmp_path / "out")],
+            tmp_path,
+        )
+        == 0
+    )
     assert len(pd.read_csv(tmp_path / "out" / "exp-trials.csv")) == 4
     with pytest.raises(InputError, match="takes no --metrics"):
         tables(["exp", "--format", "trials", "--metrics", "psnr"], tmp_path)

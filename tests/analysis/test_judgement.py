@@ -1,4 +1,5 @@
-"""`pair` and `judge` on trials in files: what is paired, what is named, what each outcome rests on."""
+"""`pair` and `judge` on trials in files: what is paired, what is named, what each outcome rests
+on."""
 
 from __future__ import annotations
 
@@ -42,10 +43,14 @@ def test_pairs_share_scene_and_seed(make_experiment: Callable[..., Experiment]) 
 def test_what_has_no_partner_is_named_and_scenes_keep_the_seeds_that_all_have(
     make_experiment: Callable[..., Experiment],
 ) -> None:
-    trials = [t for t in make_experiment().trials if (t.scene, t.densify, t.seed) != ("garden", "adc", 1)]
+    trials = [
+        t for t in make_experiment().trials if (t.scene, t.densify, t.seed) != ("garden", "adc", 1)
+    ]
     found = pair(trials, PSNR)
     assert "garden: seed 1 has no partner" in found.left_out
-    assert "2 seeds of each scene count, since garden has no more (others up to 3)" in found.left_out
+    assert (
+        "2 seeds of each scene count, since garden has no more (others up to 3)" in found.left_out
+    )
     assert found.differences.shape == (2, 2)
     assert len(found.trials) == 8
 
@@ -58,7 +63,9 @@ def test_of_planned_seeds_none_beyond_the_first_that_is_missing_counts(
     assert pair(kept, named(trials)).seeds == 1
 
 
-def test_arms_under_different_conditions_are_not_compared(make_experiment: Callable[..., Experiment]) -> None:
+def test_arms_under_different_conditions_are_not_compared(
+    make_experiment: Callable[..., Experiment],
+) -> None:
     trials = make_experiment().trials
     for trial in trials:
         if trial.densify == "adc":
@@ -69,14 +76,18 @@ def test_arms_under_different_conditions_are_not_compared(make_experiment: Calla
     assert found.left_out == (f"courtyard: {reason}", f"garden: {reason}")
 
 
-def test_a_seed_that_an_arm_has_twice_is_not_compared(make_experiment: Callable[..., Experiment]) -> None:
+def test_a_seed_that_an_arm_has_twice_is_not_compared(
+    make_experiment: Callable[..., Experiment],
+) -> None:
     trials = make_experiment(scenes=("garden",)).trials
     found = pair([*trials, trials[0]], PSNR)
     assert not found.rows
     assert "scene=garden sfm-adc has seed 0 twice" in found.left_out[0]
 
 
-def test_budgets_may_differ_if_the_question_names_its_trials(make_experiment: Callable[..., Experiment]) -> None:
+def test_budgets_may_differ_if_the_question_names_its_trials(
+    make_experiment: Callable[..., Experiment],
+) -> None:
     trials = make_experiment().trials
     for trial in trials:
         if trial.densify == "adc":
@@ -90,13 +101,19 @@ def test_ratios_are_taken_of_logarithms(make_experiment: Callable[..., Experimen
     question = replace(named(trials), metric="gaussians", relative=True, least=0.1)
     (verdict,) = judge(trials, Declaration(time=EARLY, questions=(question,)))
     counts = {(t.scene, t.densify, t.seed): t.record.num_gaussians or 0 for t in trials}
-    ratios = [counts[s, "volumetric", k] / counts[s, "adc", k] for s in ("courtyard", "garden") for k in range(3)]
+    ratios = [
+        counts[s, "volumetric", k] / counts[s, "adc", k]
+        for s in ("courtyard", "garden")
+        for k in range(3)
+    ]
     assert verdict.mean == pytest.approx(np.mean(np.log(ratios)))
     assert verdict.shown(np.log(1.284)) == "+28.4 %"
 
 
 @pytest.mark.parametrize("densify", ["adc", "volumetric"])
-def test_of_nothing_no_ratio_is_taken(make_experiment: Callable[..., Experiment], densify: str) -> None:
+def test_of_nothing_no_ratio_is_taken(
+    make_experiment: Callable[..., Experiment], densify: str
+) -> None:
     trials = make_experiment(scenes=("garden",)).trials
     for trial in trials:
         if (trial.densify, trial.seed) == (densify, 1):
@@ -108,7 +125,9 @@ def test_of_nothing_no_ratio_is_taken(make_experiment: Callable[..., Experiment]
     assert "garden seed 1: PSNR (dB) is 0, and a ratio needs numbers above 0" in found.left_out
 
 
-def test_a_look_waits_for_every_scene_and_stops_where_it_is_decided(make_experiment: Callable[..., Experiment]) -> None:
+def test_a_look_waits_for_every_scene_and_stops_where_it_is_decided(
+    make_experiment: Callable[..., Experiment],
+) -> None:
     trials = make_experiment(effect={"psnr": 3.0}).trials
     declared = Declaration(time=EARLY, questions=(named(trials),), looks=(2, 3))
     (whole,) = judge(trials, declared)
@@ -126,11 +145,15 @@ def test_trials_that_were_measured_before_the_question_cost_it_its_place(
     make_experiment: Callable[..., Experiment],
 ) -> None:
     trials = make_experiment(effect={"psnr": 3.0}).trials
-    one, late = (judge(trials, Declaration(time=t, questions=(named(trials),), looks=(3,)))[0] for t in (EARLY, LATE))
+    one, late = (
+        judge(trials, Declaration(time=t, questions=(named(trials),), looks=(3,)))[0]
+        for t in (EARLY, LATE)
+    )
     assert (one.late, late.late) == (0, 12)
     assert one.answer is not None
     assert late.answer is not None
-    assert late.answer.level == pytest.approx(one.answer.level / 4)  # psnr, ssim, flip and one LPIPS
+    # psnr, ssim, flip and one LPIPS
+    assert late.answer.level == pytest.approx(one.answer.level / 4)
 
 
 @pytest.mark.parametrize("seeds", [1, 2, 3])
@@ -144,12 +167,17 @@ def test_a_scene_has_the_mean_and_the_deviation_of_its_differences(
     assert verdict.deviation == (pytest.approx(spread) if seeds > 1 else None)
     values = {(trial.scene, trial.densify, trial.seed): trial.metrics["psnr"] for trial in trials}
     for found in verdict.scenes:
-        own = [values[found.scene, "volumetric", seed] - values[found.scene, "adc", seed] for seed in range(seeds)]
+        own = [
+            values[found.scene, "volumetric", seed] - values[found.scene, "adc", seed]
+            for seed in range(seeds)
+        ]
         assert found.seeds == seeds
         assert found.mean == pytest.approx(statistics.mean(own))
 
 
-def test_arms_that_never_differ_cannot_be_tested(make_experiment: Callable[..., Experiment]) -> None:
+def test_arms_that_never_differ_cannot_be_tested(
+    make_experiment: Callable[..., Experiment],
+) -> None:
     trials = make_experiment().trials
     for trial in trials:
         object.__setattr__(trial.record, "metrics", {"psnr": 20.0})
@@ -172,15 +200,23 @@ def test_a_training_that_failed_is_found() -> None:
     found = find_outlying(rows(good, [[20.5, 20.6, 10.0, 20.4], [20.5, 20.4, 20.6, 20.5]]))
     assert [trial.path for trial in found] == [Path("0/b2")]
     assert find_outlying(rows(good, good)) == []
-    assert find_outlying(rows([[20.0, 30.0]], [[20.0, 20.1]])) == []  # of two nobody knows which one failed
+    # of two nobody knows which one failed
+    assert find_outlying(rows([[20.0, 30.0]], [[20.0, 20.1]])) == []
 
 
-def test_a_verdict_that_hangs_on_one_training_is_undecided(make_experiment: Callable[..., Experiment]) -> None:
+def test_a_verdict_that_hangs_on_one_training_is_undecided(
+    make_experiment: Callable[..., Experiment],
+) -> None:
     """Without the training that failed the mean has the other sign."""
     trials = make_experiment(scenes=("a", "b", "c"), seeds=range(6)).trials
-    values = {"adc": [20.0, 20.01, 19.99, 20.0, 20.01, 19.99], "volumetric": [20.02, 20.0, 20.01, 20.02, 20.0, 20.01]}
+    values = {
+        "adc": [20.0, 20.01, 19.99, 20.0, 20.01, 19.99],
+        "volumetric": [20.02, 20.0, 20.01, 20.02, 20.0, 20.01],
+    }
     for trial in trials:
-        value = values[trial.densify][trial.seed] - (5.0 if trial.densify == "volumetric" and trial.seed == 5 else 0.0)
+        value = values[trial.densify][trial.seed] - (
+            5.0 if trial.densify == "volumetric" and trial.seed == 5 else 0.0
+        )
         object.__setattr__(trial.record, "metrics", {"psnr": value})
     (verdict,) = judge(trials, Declaration(time=EARLY, questions=(replace(PSNR, least=None),)))
     assert {trial.seed for trial in verdict.outlying} == {5}
@@ -209,11 +245,15 @@ def test_scenes_of_all_questions_are_one_family_and_a_single_scene_has_the_quest
     make_experiment: Callable[..., Experiment],
 ) -> None:
     trials = make_experiment(scenes=("a", "b", "c"), effect={"psnr": 0.5}).trials
-    questions = [named(tuple(t for t in trials if t.scene in scenes)) for scenes in (("a",), ("b", "c"))]
+    questions = [
+        named(tuple(t for t in trials if t.scene in scenes)) for scenes in (("a",), ("b", "c"))
+    ]
     single, several = judge(trials, Declaration(time=EARLY, questions=tuple(questions)))
     assert [scene.interval for scene in single.scenes] == [single.interval]
     expected = answer_family([row[None] for row in several.pairs.differences])
-    assert [(scene.interval, scene.p) for scene in several.scenes] == [(one.interval, one.p) for one in expected]
+    assert [(scene.interval, scene.p) for scene in several.scenes] == [
+        (one.interval, one.p) for one in expected
+    ]
 
 
 # --- which arms are held against which
@@ -229,7 +269,9 @@ def test_comparisons_worth_making() -> None:
 
 
 def test_variants_are_held_against_the_baselines_own() -> None:
-    arms = [Arm("sfm", name, (("cap", str(cap)),)) for name in ("adc", "volumetric") for cap in (1, 2)]
+    arms = [
+        Arm("sfm", name, (("cap", str(cap)),)) for name in ("adc", "volumetric") for cap in (1, 2)
+    ]
     assert choose_pairs(arms) == [(arms[0], arms[2]), (arms[1], arms[3])]
     arms = [ADC, *(Arm("sfm", "volumetric", (("threshold", str(k)),)) for k in (1, 2))]
     assert choose_pairs(arms) == [(arms[0], arms[1]), (arms[0], arms[2])]

@@ -1,4 +1,5 @@
-"""Notes on what trials have in common, word for word, for made-up trials whose numbers are known."""
+"""Notes on what trials have in common, word for word, for made-up trials whose numbers are
+known."""
 
 from __future__ import annotations
 
@@ -34,7 +35,8 @@ def with_record(trial: TrialResult, **values: object) -> TrialResult:
         ({"garden": (100, 60)}, "40 % fewer"),
         ({"garden": (100, 200), "stump": (300, 200)}, ""),  # as many in all
         ({"garden": (100, 100), "stump": (300, 400)}, "25 % more"),
-        ({"garden": (100, 150), "stump": (0, 400)}, "50 % more"),  # over the scenes where all counts are known
+        # over the scenes where all counts are known
+        ({"garden": (100, 150), "stump": (0, 400)}, "50 % more"),
         ({"garden": (1000, 1010)}, ""),
         ({"garden": (1000, 979)}, "2 % fewer"),
     ],
@@ -43,19 +45,28 @@ def test_unlike_counts_are_said_over_the_scenes_that_both_have(
     tmp_path: Path, counts: dict[str, tuple[int, int]], said: str
 ) -> None:
     made = trials_of(tmp_path, scenes=list(counts))
-    trials = [with_record(trial, num_gaussians=counts[trial.scene][trial.densify == "volumetric"]) for trial in made]
+    trials = [
+        with_record(trial, num_gaussians=counts[trial.scene][trial.densify == "volumetric"])
+        for trial in made
+    ]
     sentence = counts_sentence(trials, ADC, VOLUMETRIC)
     expected = f"sfm-volumetric has {said} Gaussians than sfm-adc, {COMPARED}" if said else ""
     assert sentence == expected
     assert counts_sentence(trials, ADC, Arm("sfm", "mcmc")) == ""
 
 
-def test_ways_of_holding_views_out_are_said_with_their_scenes_where_there_are_several(tmp_path: Path) -> None:
+def test_ways_of_holding_views_out_are_said_with_their_scenes_where_there_are_several(
+    tmp_path: Path,
+) -> None:
     made = trials_of(tmp_path, seeds=(0, 1))
-    alike = [with_record(trial, held_out="every 8th image", test_views=6, train_views=42) for trial in made]
+    alike = [
+        with_record(trial, held_out="every 8th image", test_views=6, train_views=42)
+        for trial in made
+    ]
     assert held_out_notes(alike) == ["Held out: every 8th image; 6 of 48 views."]
     unlike = [
-        with_record(trial, held_out="by lists", test_views=5) if trial.scene == "garden" else trial for trial in alike
+        with_record(trial, held_out="by lists", test_views=5) if trial.scene == "garden" else trial
+        for trial in alike
     ]
     assert held_out_notes(unlike) == [
         "Held out, garden: by lists; 5 of 47 views.",
@@ -67,7 +78,9 @@ def test_ways_of_holding_views_out_are_said_with_their_scenes_where_there_are_se
 
 
 def test_whose_views_made_the_points_is_said_once_for_each_initialiser(tmp_path: Path) -> None:
-    for path in write_runs(tmp_path, Plan(inits=("sfm", "dim", "random"), seeds=(0,), scenes=("garden",))):
+    for path in write_runs(
+        tmp_path, Plan(inits=("sfm", "dim", "random"), seeds=(0,), scenes=("garden",))
+    ):
         config = json.loads((path / "config.yaml").read_text())
         config["init"] |= {"sfm": {"points_from": "all"}, "dim": {"points_from": "train"}}.get(
             config["init"]["name"], {}
@@ -79,18 +92,27 @@ def test_whose_views_made_the_points_is_said_once_for_each_initialiser(tmp_path:
         "Initial points of sfm: from all views, test views included (init.points_from=all).",
     ]
     observed = [with_record(trial, init_report={"mean_track_length": 3.1}) for trial in made]
-    assert "Initial points of random: from all views, test views included (init.points_from=all)." in points_notes(
-        observed
+    assert (
+        "Initial points of random: from all views, test views included (init.points_from=all)."
+        in points_notes(observed)
     )
     assert points_notes([trial for trial in made if trial.init == "random"]) == []
 
 
-@pytest.mark.parametrize(("lost", "rest"), [(1, ""), (3, ""), (4, " and 1 more"), (5, " and 2 more")])
-def test_of_what_is_left_out_three_are_named_and_all_are_counted(tmp_path: Path, lost: int, rest: str) -> None:
+@pytest.mark.parametrize(
+    ("lost", "rest"), [(1, ""), (3, ""), (4, " and 1 more"), (5, " and 2 more")]
+)
+def test_of_what_is_left_out_three_are_named_and_all_are_counted(
+    tmp_path: Path, lost: int, rest: str
+) -> None:
     paths = write_runs(tmp_path, Plan())
     for path in paths[:lost]:
         (path / "results.json").unlink()
-    (note,) = [note for note in build_table(load_experiment(tmp_path, "exp")).notes if note.startswith("Left out")]
+    (note,) = [
+        note
+        for note in build_table(load_experiment(tmp_path, "exp")).notes
+        if note.startswith("Left out")
+    ]
     assert note.startswith(f"Left out ({lost}): exp/courtyard/")
     assert note.count("unfinished") == min(lost, 3)
     assert note.endswith(f"{rest}.")

@@ -14,7 +14,13 @@ from gsbench.verbs.results import explain_cell
 from tests.analysis.test_tables import one_trial
 
 Make = Callable[..., Experiment]
-XEON = {"cpu": "Xeon", "architecture": "x86_64", "kernels": "skylake-avx512", "torch": "AVX512", "device": "cpu"}
+XEON = {
+    "cpu": "Xeon",
+    "architecture": "x86_64",
+    "kernels": "skylake-avx512",
+    "torch": "AVX512",
+    "device": "cpu",
+}
 RYZEN = XEON | {"cpu": "Ryzen", "kernels": "znver3", "torch": "AVX2"}
 A, B = "a" * 64, "b" * 64
 
@@ -32,7 +38,10 @@ def test_trials_of_several_machines_are_averaged_and_the_table_says_so(tmp_path:
         one_trial(tmp_path, seed, psnr=27.0, _machine=machine)
     (note,) = (note for note in notes_of(tmp_path) if "machine" in note)
     assert "2 kinds of machine" in note
-    kinds = "Xeon (skylake-avx512, torch AVX512): 2 trials; Ryzen (znver3, torch AVX2): 1 trial; not recorded: 1."
+    kinds = (
+        "Xeon (skylake-avx512, torch AVX512): 2 trials; Ryzen (znver3, torch AVX2): 1 trial; "
+        "not recorded: 1."
+    )
     assert kinds in note
     assert "2 kinds of machine" in build_report(load_experiment(tmp_path, "exp"))
     assert "machine   Ryzen (znver3, torch AVX2)" in explain_cell("exp:garden:psnr:adc", tmp_path)
@@ -56,6 +65,8 @@ def test_one_initialiser_that_gave_two_clouds_is_noted(tmp_path: Path) -> None:
 def test_compared_arms_with_unlike_clouds_are_marked_in_their_sheet(tmp_path: Path) -> None:
     for densify, cloud in (("adc", A), ("volumetric", B)):
         one_trial(tmp_path, 0, psnr=27.0, _densify=densify, _hashes=hashes(cloud))
-    sheet = fairness_table(load_experiment(tmp_path, "exp").trials, Arm("sfm", "adc"), Arm("sfm", "volumetric"))
+    sheet = fairness_table(
+        load_experiment(tmp_path, "exp").trials, Arm("sfm", "adc"), Arm("sfm", "volumetric")
+    )
     (row,) = [row for row in sheet.rows if row.labels == ("initial cloud (hash)",)]
     assert [entry.text for entry in row.entries] == [A[:12], B[:12], "≠"]

@@ -42,20 +42,28 @@ def cell(mean: float, std: float | None = None, count: int = 3) -> Cell:
 def test_the_data_are_those_of_the_printed_tables(shared: Path) -> None:
     """Every number of the tables in the paper's text, row by row, with its printed digits."""
     paper, text = load_paper(), (shared / "paper.md").read_text()
-    rows = [[c.strip().strip("*") for c in line.strip("|").split("|")] for line in text.splitlines() if "|" in line]
+    rows = [
+        [c.strip().strip("*") for c in line.strip("|").split("|")]
+        for line in text.splitlines()
+        if "|" in line
+    ]
     name = {"Tree-hill": "treehill", "Dr.Johnson": "drjohnson"}
     table1 = [row for row in rows if len(row) == 12 and re.fullmatch(r"[\d.]+", row[1])]
     assert len(table1) == 13
     for row in table1:
         scene = name.get(row[-1], row[-1].lower())
-        keys = [(scene, "dim", arm, q) for q in QUANTITIES["table1"] for arm in ("adc", "volumetric")]
+        keys = [
+            (scene, "dim", arm, q) for q in QUANTITIES["table1"] for arm in ("adc", "volumetric")
+        ]
         assert [paper.tables["table1"][key].text for key in keys] == row[1:11]
     table2 = [row for row in rows if len(row) == 5 and re.fullmatch(r"[\d.]+", row[1])]
     assert len(table2) == 12
     for row in table2:
         scene = name.get(row[0], row[0].lower())
         arms = (("sfm", "adc"), ("dim", "adc"), ("sfm", "volumetric"), ("dim", "volumetric"))
-        assert [paper.tables["table2"][scene, init, arm, "lpips_vgg_raw"].text for init, arm in arms] == row[1:]
+        assert [
+            paper.tables["table2"][scene, init, arm, "lpips_vgg_raw"].text for init, arm in arms
+        ] == row[1:]
 
 
 def test_what_the_paper_contradicts_follows_from_its_numbers() -> None:
@@ -64,26 +72,43 @@ def test_what_the_paper_contradicts_follows_from_its_numbers() -> None:
     text = "\n".join(paper.contradictions)
 
     def pairs(quantity: str) -> list[tuple[float, float]]:
-        keys = [[(scene, "dim", arm, quantity) for arm in ("adc", "volumetric")] for scene in paper.scenes("table1")]
+        keys = [
+            [(scene, "dim", arm, quantity) for arm in ("adc", "volumetric")]
+            for scene in paper.scenes("table1")
+        ]
         return [(table1[one].value, table1[other].value) for one, other in keys]
 
     for name, quantity in (("Gaussians", "gaussians_millions"), ("Training time", "train_minutes")):
         costs = np.array(pairs(quantity))
-        totals, ratios = costs[:, 1].sum() / costs[:, 0].sum() - 1, (costs[:, 1] / costs[:, 0]).mean() - 1
-        assert f"{name}: {totals:+.1%} as a ratio of totals, {ratios:+.1%} as the mean of scenes" in text
+        totals, ratios = (
+            costs[:, 1].sum() / costs[:, 0].sum() - 1,
+            (costs[:, 1] / costs[:, 0]).mean() - 1,
+        )
+        assert (
+            f"{name}: {totals:+.1%} as a ratio of totals, {ratios:+.1%} as the mean of scenes"
+            in text
+        )
         assert name != "Gaussians" or f"{totals:.2%}".replace("%", " %") in text
-    for name, quantity, digits in (("SSIM", "ssim", 4), ("PSNR", "psnr", 3), ("LPIPS", "lpips_vgg_raw", 4)):
+    for name, quantity, digits in (
+        ("SSIM", "ssim", 4),
+        ("PSNR", "psnr", 3),
+        ("LPIPS", "lpips_vgg_raw", 4),
+    ):
         found = np.array(pairs(quantity))
         one, other = found.mean(axis=0)
         gains = (found[:, 1] - found[:, 0]) * (-1 if name == "LPIPS" else 1)
         counts = (
-            f"better in {(gains > 0).sum()}, equal as printed in {(gains == 0).sum()}, worse in {(gains < 0).sum()}"
+            f"better in {(gains > 0).sum()}, equal as printed in {(gains == 0).sum()}, worse "
+            f"in {(gains < 0).sum()}"
         )
         assert (
-            f"{name}: mean of 13 scenes {one:.{digits}f} (3DGS), {other:.{digits}f} (ours); ours is {counts}." in text
+            f"{name}: mean of 13 scenes {one:.{digits}f} (3DGS), {other:.{digits}f} (ours); ours "
+            f"is {counts}." in text
         )
     for key, printed in table2.items():
-        if key in table1 and (printed.range[0] > table1[key].range[1] or printed.range[1] < table1[key].range[0]):
+        if key in table1 and (
+            printed.range[0] > table1[key].range[1] or printed.range[1] < table1[key].range[0]
+        ):
             name = {"adc": "3DGS", "volumetric": "Ours"}[key[2]]
             assert f"{key[0]} {name} {table1[key].text}/{printed.text}" in text
     assert set(paper.scenes("table1")) - set(paper.scenes("table2")) == {"train"}
@@ -103,7 +128,8 @@ def test_a_printed_number_stands_for_its_rounding_range() -> None:
         (cell(0.130, 0.0021), INTERVAL),  # 0.130 - 4.303 * 0.0021 / sqrt(3) = 0.12478
         (cell(0.110, 0.0021), INTERVAL),
         (cell(0.200, 0.001), DIFFERS),
-        (cell(0.130, 0.00055, 2), DIFFERS),  # 12.706 for two trials: 0.130 - 12.706 * 0.00055 / sqrt(2) = 0.12506
+        # 12.706 for two trials: 0.130 - 12.706 * 0.00055 / sqrt(2) = 0.12506
+        (cell(0.130, 0.00055, 2), DIFFERS),
         (cell(0.130, 0.00056, 2), INTERVAL),
     ],
 )
@@ -111,7 +137,9 @@ def test_agreement(measured: Cell, expected: str) -> None:
     assert agreement(measured, PrintedNumber("0.12")) == expected
 
 
-def test_table1_has_the_papers_rows_and_marks_what_was_not_run(make_experiment: Callable[..., Experiment]) -> None:
+def test_table1_has_the_papers_rows_and_marks_what_was_not_run(
+    make_experiment: Callable[..., Experiment],
+) -> None:
     experiment = make_experiment(experiment="table1", inits=("dim",), scenes=("garden", "bonsai"))
     measured, difference = paper_tables(experiment, "table1")
     assert [row.labels[0] for row in measured.rows[:-1]] == load_paper().scenes("table1")
@@ -119,19 +147,32 @@ def test_table1_has_the_papers_rows_and_marks_what_was_not_run(make_experiment: 
     by_scene = {row.labels[0]: row for row in measured.rows}
     assert by_scene["stump"].entries[0].text == "— (0/3)"
     arms = ("adc", "volumetric")
-    assert {row.labels for row in difference.rows} == {(s, "dim", a) for s in ("garden", "bonsai") for a in arms}
+    assert {row.labels for row in difference.rows} == {
+        (s, "dim", a) for s in ("garden", "bonsai") for a in arms
+    }
     psnr = by_scene["garden"].entries[2].cell
-    shown = next(row for row in difference.rows if row.labels == ("garden", "dim", "adc")).entries[3].text
+    shown = (
+        next(row for row in difference.rows if row.labels == ("garden", "dim", "adc"))
+        .entries[3]
+        .text
+    )
     assert shown.split()[0].replace("−", "-") == f"{psnr.mean - 27.06:+.2f}"
 
 
 def test_scenes_that_the_paper_lacks_come_last(make_experiment: Callable[..., Experiment]) -> None:
-    experiment = make_experiment(experiment="table1", inits=("dim",), scenes=("courtyard", "garden"))
+    experiment = make_experiment(
+        experiment="table1", inits=("dim",), scenes=("courtyard", "garden")
+    )
     measured, _ = paper_tables(experiment, "table1")
-    assert [row.labels[0] for row in measured.rows[:-1]] == [*load_paper().scenes("table1"), "courtyard"]
+    assert [row.labels[0] for row in measured.rows[:-1]] == [
+        *load_paper().scenes("table1"),
+        "courtyard",
+    ]
 
 
-def test_table1_names_a_stand_in_for_the_papers_initialiser(make_experiment: Callable[..., Experiment]) -> None:
+def test_table1_names_a_stand_in_for_the_papers_initialiser(
+    make_experiment: Callable[..., Experiment],
+) -> None:
     experiment = make_experiment(experiment="table1", inits=("sfm",), scenes=("garden",))
     _, difference = paper_tables(experiment, "table1")
     assert any("from sfm replace the paper's DIM" in note for note in difference.notes)
@@ -140,17 +181,26 @@ def test_table1_names_a_stand_in_for_the_papers_initialiser(make_experiment: Cal
 def test_table2_has_the_papers_columns(make_experiment: Callable[..., Experiment]) -> None:
     experiment = make_experiment(experiment="table2", inits=("dim", "sfm"), scenes=("garden",))
     measured, _ = paper_tables(experiment, "table2")
-    assert [c.heading for c in measured.columns] == ["SfM + 3DGS", "DIM + 3DGS", "SfM + Ours", "DIM + Ours"]
+    assert [c.heading for c in measured.columns] == [
+        "SfM + 3DGS",
+        "DIM + 3DGS",
+        "SfM + Ours",
+        "DIM + Ours",
+    ]
 
 
-def test_another_lpips_is_not_compared_with_the_papers(make_experiment: Callable[..., Experiment]) -> None:
+def test_another_lpips_is_not_compared_with_the_papers(
+    make_experiment: Callable[..., Experiment],
+) -> None:
     experiment = make_experiment(experiment="table1", inits=("dim",), scenes=("garden",))
     _, difference = paper_tables(experiment, "table1", metrics=["psnr", "flip"])
     assert [column.group for column in difference.columns] == ["PSNR (dB)", "PSNR (dB)"]
     assert any("no such number: flip" in note for note in difference.notes)
 
 
-def test_an_experiment_without_the_papers_arms_is_refused(make_experiment: Callable[..., Experiment]) -> None:
+def test_an_experiment_without_the_papers_arms_is_refused(
+    make_experiment: Callable[..., Experiment],
+) -> None:
     experiment = make_experiment(densifiers=("none",), scenes=("garden",))
     with pytest.raises(InputError, match="no trial for table2"):
         paper_tables(experiment, "table2")
@@ -165,13 +215,21 @@ def test_the_verb_prints_and_writes(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert "### Table 1, measured" in out
     assert "### Table 1, difference" in out
     assert tables(["table1", "--format", "latex", "--out", str(tmp_path / "out")], runs) == 0
-    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["table1-difference.tex", "table1.tex"]
-    assert tables(["table1", "--rows", "scene,densify", "--metrics", "psnr", "--format", "csv"], runs) == 0
+    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == [
+        "table1-difference.tex",
+        "table1.tex",
+    ]
+    assert (
+        tables(["table1", "--rows", "scene,densify", "--metrics", "psnr", "--format", "csv"], runs)
+        == 0
+    )
     assert tables(["paper"], runs) == 0
     assert "ratio of totals" in capsys.readouterr().out
 
 
-def test_the_verb_names_bad_options_and_left_out_trials(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_verb_names_bad_options_and_left_out_trials(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     path = write_runs(tmp_path, Plan())[0]
     (path / "results.json").write_text("{")
     with pytest.raises(InputError, match="no trial has iterations=7"):
@@ -187,17 +245,22 @@ def test_the_verb_names_bad_options_and_left_out_trials(tmp_path: Path, capsys: 
 def test_below_the_differences_stands_what_the_paper_says_of_its_setup(
     make_experiment: Callable[..., Experiment],
 ) -> None:
-    _, difference = paper_tables(make_experiment(experiment="table1", inits=("dim",), scenes=("garden",)), "table1")
+    _, difference = paper_tables(
+        make_experiment(experiment="table1", inits=("dim",), scenes=("garden",)), "table1"
+    )
     for written in (to_markdown(difference), to_html_page(difference), to_latex(difference)):
         assert "The paper on hardware: it trained on one NVIDIA RTX 2080." in written
 
 
-def test_the_papers_own_set_up_has_the_papers_layout(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_papers_own_set_up_has_the_papers_layout(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     write_runs(tmp_path, Plan(experiment="table1_own", inits=("dim_paper",), scenes=("garden",)))
     assert tables(["table1_own"], tmp_path) == 0
     out = capsys.readouterr().out
     assert "### Table 1, measured (experiment table1_own)" in out
-    assert "replace the paper's DIM" not in out  # image matching by the settings of the paper's time is the paper's DIM
+    # image matching by the settings of the paper's time is the paper's DIM
+    assert "replace the paper's DIM" not in out
     assert "| garden | dim_paper | adc |" in out
     assert tables(["table1_own", "--paper", "3dgs"], tmp_path) == 0
     assert "The paper on poses: it takes the cameras that come" in capsys.readouterr().out
@@ -226,15 +289,20 @@ def test_scenes_and_methods_are_called_as_gsbench_calls_them(name: str) -> None:
     assert (conf_dir() / "densify" / f"{paper.densify}.yaml").is_file()
 
 
-def test_ours_stand_beside_the_printed_numbers(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_ours_stand_beside_the_printed_numbers(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     for seed, psnr in enumerate((27.41, 27.41, 27.41)):
         one_trial(tmp_path, seed, psnr=psnr, ssim=0.9, lpips_vgg_raw=0.2)
     one_trial(tmp_path, 0, psnr=1.0, _scene="nowhere")
     table = published_table(load_experiment(tmp_path, "exp").trials, "3dgs")
-    assert texts(table) == [["garden", "sfm", "adc", "27.410", "+0.000 =", "0.868", "+0.032 ≠", "0.103", "+0.097 ≠"]]
+    assert texts(table) == [
+        ["garden", "sfm", "adc", "27.410", "+0.000 =", "0.868", "+0.032 ≠", "0.103", "+0.097 ≠"]
+    ]
     assert any(note.startswith("Read from github.com/nerfbaselines") for note in table.notes)
     assert (
-        "Of 3 cells 1 are within rounding (=), 0 within our 95% t interval of the mean (≈), 2 differ" in table.notes[0]
+        "Of 3 cells 1 are within rounding (=), 0 within our 95% t interval of the mean (≈), 2 "
+        "differ" in table.notes[0]
     )
     assert tables(["exp", "--paper", "3dgs"], tmp_path) == 0
     assert "### Difference from 3dgs" in capsys.readouterr().out
@@ -246,7 +314,10 @@ def test_what_cannot_be_compared_is_said(tmp_path: Path) -> None:
         published_table(load_experiment(tmp_path, "exp").trials, "3dgs-mcmc")
     one_trial(tmp_path, 0, psnr=1.0)
     one_trial(tmp_path, 1, psnr=1.0, _iterations=7)
-    with pytest.raises(InputError, match=r"scene=garden init=sfm densify=adc would average trials that differ in iter"):
+    with pytest.raises(
+        InputError,
+        match=r"scene=garden init=sfm densify=adc would average trials that differ in iter",
+    ):
         published_table(load_experiment(tmp_path, "exp").trials, "3dgs")
     with pytest.raises(InputError, match=r"no published numbers '3dsg'.*did you mean 3dgs"):
         load_published("3dsg")

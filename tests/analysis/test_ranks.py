@@ -1,4 +1,5 @@
-"""Arms ranked over scenes: the published critical values, Friedman's test, groups, and what is left out."""
+"""Arms ranked over scenes: the published critical values, Friedman's test, groups, and what is left
+out."""
 
 from __future__ import annotations
 
@@ -26,17 +27,24 @@ Make = Callable[..., Experiment]
 
 @pytest.fixture
 def seven(make_experiment: Make) -> Experiment:
-    return make_experiment(scenes=SCENES, densifiers=ARMS, effect={"psnr": 2.0, "lpips_vgg_raw": -0.1})
+    return make_experiment(
+        scenes=SCENES, densifiers=ARMS, effect={"psnr": 2.0, "lpips_vgg_raw": -0.1}
+    )
 
 
-@pytest.mark.parametrize(("arms", "q"), [(2, 1.960), (3, 2.343), (4, 2.569), (5, 2.728), (6, 2.850), (10, 3.164)])
+@pytest.mark.parametrize(
+    ("arms", "q"), [(2, 1.960), (3, 2.343), (4, 2.569), (5, 2.728), (6, 2.850), (10, 3.164)]
+)
 def test_the_critical_values_are_those_of_demsar(arms: int, q: float) -> None:
     """Demšar 2006, table 5a."""
-    assert critical_difference(arms, 14) == pytest.approx(q * np.sqrt(arms * (arms + 1) / (6 * 14)), rel=5e-4)
+    assert critical_difference(arms, 14) == pytest.approx(
+        q * np.sqrt(arms * (arms + 1) / (6 * 14)), rel=5e-4
+    )
 
 
 def test_the_example_of_demsar() -> None:
-    """Demšar 2006, section 3.2.2: four classifiers on 14 data sets have the critical difference 1.25."""
+    """Demšar 2006, section 3.2.2: four classifiers on 14 data sets have the critical difference
+    1.25."""
     assert critical_difference(4, 14) == pytest.approx(1.25, abs=0.005)
 
 
@@ -46,7 +54,10 @@ def test_the_best_arm_has_rank_one(seven: Experiment, metric: str) -> None:
     assert ranking is not None
     assert (ranking.arms[0], ranking.ranks[0]) == (Arm("sfm", "volumetric"), 1.0)
     means = {
-        arm: [np.mean([t.metrics[metric] for t in seven.trials if (t.scene, t.densify) == (s, arm)]) for s in SCENES]
+        arm: [
+            np.mean([t.metrics[metric] for t in seven.trials if (t.scene, t.densify) == (s, arm)])
+            for s in SCENES
+        ]
         for arm in ARMS
     }
     assert ranking.p == pytest.approx(stats.friedmanchisquare(*means.values()).pvalue)
@@ -55,11 +66,20 @@ def test_the_best_arm_has_rank_one(seven: Experiment, metric: str) -> None:
 
 def test_groups_are_the_largest_that_do_not_differ() -> None:
     made = Ranking(
-        quantity("psnr", []), tuple(Arm("sfm", c) for c in "abcde"), (1.0, 1.8, 2.7, 4.0, 5.5), SCENES, 1.2, 0.01
+        quantity("psnr", []),
+        tuple(Arm("sfm", c) for c in "abcde"),
+        (1.0, 1.8, 2.7, 4.0, 5.5),
+        SCENES,
+        1.2,
+        0.01,
     )
     assert made.groups == [(0, 1), (1, 2)]
-    assert Ranking(made.quantity, made.arms, (1.0, 1.1, 1.2, 1.3, 5.0), SCENES, 1.2, 0.01).groups == [(0, 3)]
-    assert Ranking(made.quantity, made.arms, (1.0, 2.0, 3.0, 4.0, 5.0), SCENES, 0.9, 0.01).groups == []
+    assert Ranking(
+        made.quantity, made.arms, (1.0, 1.1, 1.2, 1.3, 5.0), SCENES, 1.2, 0.01
+    ).groups == [(0, 3)]
+    assert (
+        Ranking(made.quantity, made.arms, (1.0, 2.0, 3.0, 4.0, 5.0), SCENES, 0.9, 0.01).groups == []
+    )
 
 
 @pytest.mark.parametrize(
@@ -84,7 +104,12 @@ def test_a_scene_that_lacks_an_arm_is_left_out(seven: Experiment) -> None:
 
 def test_equal_arms_do_not_differ(make_experiment: Make) -> None:
     experiment = make_experiment(
-        scenes=SCENES, densifiers=ARMS, trial_noise=0.0, residual_noise=0.0, effect_noise=0.0, scene_noise=0.0
+        scenes=SCENES,
+        densifiers=ARMS,
+        trial_noise=0.0,
+        residual_noise=0.0,
+        effect_noise=0.0,
+        scene_noise=0.0,
     )
     ranking = rank_arms(experiment.trials, quantity("psnr", experiment.trials))
     assert ranking is not None

@@ -1,4 +1,5 @@
-"""The report: it stands alone, says the verdict first, needs neither mouse nor eyes, and shows the right places."""
+"""The report: it stands alone, says the verdict first, needs neither mouse nor eyes, and shows the
+right places."""
 
 from __future__ import annotations
 
@@ -43,7 +44,8 @@ ADC, VOLUMETRIC = Arm("sfm", "adc"), Arm("sfm", "volumetric")
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two scenes with pictures, in which "volumetric" has a clearly better LPIPS and nothing else differs."""
+    """Two scenes with pictures, in which "volumetric" has a clearly better LPIPS and nothing else
+    differs."""
     folder = tmp_path_factory.mktemp("runs")
     write_runs(folder, Plan(effect={"lpips_vgg_raw": -0.05}, views=3, pictures=True, random_seed=1))
     return folder
@@ -64,7 +66,9 @@ def test_a_picture_that_arms_share_is_shown_once(tmp_path: Path) -> None:
         arm = path.parent.name
         (path / "figures").mkdir()
         for name, shade in [("initial_cloud", 90), ("ellipsoids", 10 if arm == "sfm-adc" else 200)]:
-            Image.fromarray(np.full((4, 4, 3), shade, np.uint8)).save(path / "figures" / f"{name}.png")
+            Image.fromarray(np.full((4, 4, 3), shade, np.uint8)).save(
+                path / "figures" / f"{name}.png"
+            )
     captions = [caption for caption, _ in trial_figures(load_experiment(tmp_path, "exp").trials)]
     assert captions == [
         "ellipsoids: garden, sfm-adc, seed 0",
@@ -103,7 +107,9 @@ def test_the_page_is_well_formed_and_needs_nothing_else(page: str) -> None:
     elements = Elements(page)
     assert elements.open == []
     for tag, attribute in (("img", "src"), ("link", "href"), ("script", "src"), ("iframe", "src")):
-        assert all((attrs.get(attribute) or "data:").startswith("data:") for attrs in elements.all(tag))
+        assert all(
+            (attrs.get(attribute) or "data:").startswith("data:") for attrs in elements.all(tag)
+        )
     assert not re.search(r"url\(|@import|https?://|fetch\(|XMLHttp", page)
 
 
@@ -114,7 +120,11 @@ def test_it_can_be_read_without_eyes_and_used_without_a_mouse(page: str) -> None
     pictures = [attrs for attrs in elements.all("svg") if attrs.get("aria-hidden") != "true"]
     assert len(pictures) > 8
     assert all(attrs.get("role") == "img" and attrs.get("aria-label") for attrs in pictures)
-    assert all(attrs.get("tabindex") == "0" for attrs in elements.all("div") if attrs.get("class") == "scroll")
+    assert all(
+        attrs.get("tabindex") == "0"
+        for attrs in elements.all("div")
+        if attrs.get("class") == "scroll"
+    )
     anchors = {attrs["href"].removeprefix("#") for attrs in elements.all("a")}
     assert anchors <= {attrs.get("id") for _, attrs in elements.found}
     ids = [attrs["id"] for _, attrs in elements.found if "id" in attrs]
@@ -134,7 +144,10 @@ def test_what_a_verdict_does_not_say_stands_beside_it(page: str) -> None:
     """The arms have other counts, and equal trials other times."""
     headline = re.search(r'<div class="verdict"><p><strong>([^<]*)</strong>', page)
     assert headline is not None
-    assert re.search(r"has \d+ % more Gaussians than sfm-adc, so this does not compare at equal counts", headline[1])
+    assert re.search(
+        r"has \d+ % more Gaussians than sfm-adc, so this does not compare at equal counts",
+        headline[1],
+    )
     times = re.search(r"Training time [^<]*; times of equal trials differ by up to (\d+)%", page)
     assert times is not None
     assert times[1] == "4"  # adc takes 50, 51 and 52 s, volumetric 65 to 67 s
@@ -159,15 +172,21 @@ def test_texture_energy_is_the_squared_gradient() -> None:
 def test_whole_views_are_the_worst_the_median_and_the_best(experiment: Experiment) -> None:
     """Of a scene with three views, each picked by another gain."""
     trials = [trial for trial in experiment.trials if trial.scene == "garden"]
-    first, second = (next(t.path for t in trials if (t.arm, t.seed) == (arm, 0)) for arm in (ADC, VOLUMETRIC))
+    first, second = (
+        next(t.path for t in trials if (t.arm, t.seed) == (arm, 0)) for arm in (ADC, VOLUMETRIC)
+    )
     folders = (first / "renders", second / "renders", first / "ground_truth")
     gains = {}
     for view in ("view000", "view001", "view002"):
-        one, other, truth = (np.asarray(Image.open(folder / f"{view}.png")).astype(float) for folder in folders)
+        one, other, truth = (
+            np.asarray(Image.open(folder / f"{view}.png")).astype(float) for folder in folders
+        )
         gains[view] = np.abs(one - truth).mean() - np.abs(other - truth).mean()
     views, faults = choose_views(pair_trials(trials, ADC, VOLUMETRIC))
     assert [view.view for view in views] == sorted(gains, key=lambda view: gains[view])
-    assert [view.first_error - view.second_error for view in views] == pytest.approx(sorted(gains.values()))
+    assert [view.first_error - view.second_error for view in views] == pytest.approx(
+        sorted(gains.values())
+    )
     assert all(view.truth.startswith("data:image/jpeg;base64,") for view in views)
     assert faults == []
     both, _ = choose_views(pair_trials(experiment.trials, ADC, VOLUMETRIC))
@@ -179,8 +198,12 @@ def test_of_one_or_two_views_each_is_shown_once(tmp_path: Path) -> None:
         (1, ["the only view"]),
         (2, ["the view with the least gain", "the view with the largest gain"]),
     ):
-        write_runs(tmp_path / str(count), Plan(scenes=("a",), seeds=(0,), views=count, pictures=True))
-        views, _ = choose_views(pair_trials(load_experiment(tmp_path / str(count), "exp").trials, ADC, VOLUMETRIC))
+        write_runs(
+            tmp_path / str(count), Plan(scenes=("a",), seeds=(0,), views=count, pictures=True)
+        )
+        views, _ = choose_views(
+            pair_trials(load_experiment(tmp_path / str(count), "exp").trials, ADC, VOLUMETRIC)
+        )
         assert [view.which for view in views] == named
         assert sorted(view.view for view in views) == [f"view00{k}" for k in range(count)]
 
@@ -204,7 +227,9 @@ def test_volumes_are_those_of_the_ellipsoids(experiment: Experiment) -> None:
     assert found == pytest.approx(np.log10(volumes), abs=1e-6)
     shares = histogram(np.append(found, -np.inf))
     assert sum(share for _, share in shares) == pytest.approx(1)
-    assert sum(share for volume, share in shares if volume > 1e-4) == pytest.approx(np.mean(found >= -4))
+    assert sum(share for volume, share in shares if volume > 1e-4) == pytest.approx(
+        np.mean(found >= -4)
+    )
 
 
 def test_logged_histograms_are_shares_of_all_trials_together() -> None:
@@ -217,7 +242,10 @@ def test_logged_histograms_are_shares_of_all_trials_together() -> None:
             Histogram(step=8, log10_edges=edges, counts=[0, 5, 0]),
         ],
     ]
-    trials = [SimpleNamespace(folder=SimpleNamespace(curves=lambda name, kind, own=own: own)) for own in rows]
+    trials = [
+        SimpleNamespace(folder=SimpleNamespace(curves=lambda name, kind, own=own: own))
+        for own in rows
+    ]
     found = _logged_histograms(trials)  # type: ignore[arg-type]
     assert list(found) == [4, 8]
     assert np.array(found[4]) == pytest.approx(np.array([[10**-3.5, 0.25], [10**-0.5, 0.75]]))
@@ -225,30 +253,45 @@ def test_logged_histograms_are_shares_of_all_trials_together() -> None:
 
 
 def test_the_share_above_the_threshold_is_said(experiment: Experiment, page: str) -> None:
-    found = [10 ** log10_volumes(t.path / "point_cloud.ply") for t in experiment.trials if t.densify == "adc"]
+    found = [
+        10 ** log10_volumes(t.path / "point_cloud.ply")
+        for t in experiment.trials
+        if t.densify == "adc"
+    ]
     assert f"sfm-adc: {np.mean(np.concatenate(found) > 0.03):.2%} of volumes exceed 0.03." in page
 
 
 def test_growth_and_pruning_by_cause_are_a_table(page: str) -> None:
-    events = page.split("<caption>Gaussians by cause, mean of a trial</caption>")[1].split("</table>")[0]
+    events = page.split("<caption>Gaussians by cause, mean of a trial</caption>")[1].split(
+        "</table>"
+    )[0]
     assert '<th scope="row">split volume</th><td>0</td><td>100</td>' in events
 
 
 def test_a_truncated_point_cloud_is_refused(tmp_path: Path, experiment: Experiment) -> None:
     content = (experiment.trials[0].path / "point_cloud.ply").read_bytes()
     (tmp_path / "half.ply").write_bytes(content[: len(content) // 2])
-    with pytest.raises(InputError, match=r"half\.ply is not a readable 3DGS PLY .*early end-of-file"):
+    with pytest.raises(
+        InputError, match=r"half\.ply is not a readable 3DGS PLY .*early end-of-file"
+    ):
         log10_volumes(tmp_path / "half.ply")
 
 
 def test_mean_curves_use_common_steps() -> None:
-    assert mean_by_step([[(1, 2.0), (2, 4.0), (3, 9.0)], [(2, 6.0), (1, 0.0)], []]) == [(1, 1.0), (2, 5.0)]
+    assert mean_by_step([[(1, 2.0), (2, 4.0), (3, 9.0)], [(2, 6.0), (1, 0.0)], []]) == [
+        (1, 1.0),
+        (2, 5.0),
+    ]
 
 
 CHARTS = {
-    "lines": lambda title: line_chart(title, [("a", [(1, 1), (10, 5)]), ("b", [(2, 3)])], "x", "y", log=True),
+    "lines": lambda title: line_chart(
+        title, [("a", [(1, 1), (10, 5)]), ("b", [(2, 3)])], "x", "y", log=True
+    ),
     "flat": lambda title: line_chart(title, [("a", [(5, 1), (5, 1)])], "x", "y", marker=5),
-    "forest": lambda title: forest_plot(title, [ForestRow("s", 0.1, Interval(-0.1, 0.3)), ForestRow("t", 0.2)], "d", 1),
+    "forest": lambda title: forest_plot(
+        title, [ForestRow("s", 0.1, Interval(-0.1, 0.3)), ForestRow("t", 0.2)], "d", 1
+    ),
 }
 
 
@@ -258,7 +301,14 @@ def test_charts_are_well_formed_and_stay_inside(chart: str) -> None:
     svg = next(element for element in figure if element.tag == "svg")
     _, _, width, height = map(float, svg.attrib["viewBox"].split())
     for element in svg.iter():
-        for name, limit in (("x", width), ("cx", width), ("x1", width), ("y", height), ("cy", height), ("y1", height)):
+        for name, limit in (
+            ("x", width),
+            ("cx", width),
+            ("x1", width),
+            ("y", height),
+            ("cy", height),
+            ("y1", height),
+        ):
             if name in element.attrib:
                 assert 0 <= float(element.attrib[name]) <= limit
     assert svg.attrib["aria-label"].startswith("<&>")
@@ -266,7 +316,10 @@ def test_charts_are_well_formed_and_stay_inside(chart: str) -> None:
 
 def test_a_line_chart_puts_values_where_they_belong() -> None:
     figure = ElementTree.fromstring(line_chart("t", [("a", [(0, 0), (5, 10), (10, 0)])], "x", "y"))
-    points = [tuple(map(float, p.split(","))) for p in next(figure.iter("polyline")).attrib["points"].split()]
+    points = [
+        tuple(map(float, p.split(",")))
+        for p in next(figure.iter("polyline")).attrib["points"].split()
+    ]
     (x0, y0), (x1, y1), (x2, y2) = points
     assert x1 - x0 == pytest.approx(x2 - x1, abs=0.2)
     assert y0 == y2 > y1  # up is smaller in SVG
@@ -281,35 +334,48 @@ def test_charts_have_their_margins() -> None:
     figure = ElementTree.fromstring(forest_plot("t", rows, "difference", 1))
     assert next(figure.iter("svg")).attrib["viewBox"] == "0 0 380 108"
     places = [(float(dot.attrib["cx"]), float(dot.attrib["cy"])) for dot in figure.iter("circle")]
-    assert places == [(pytest.approx(247 - 115 / 1.08, abs=0.05), 25), (pytest.approx(247 + 115 / 1.08, abs=0.05), 51)]
+    assert places == [
+        (pytest.approx(247 - 115 / 1.08, abs=0.05), 25),
+        (pytest.approx(247 + 115 / 1.08, abs=0.05), 51),
+    ]
 
 
 def test_each_line_has_a_colour_and_dashes_of_its_own() -> None:
-    figure = ElementTree.fromstring(line_chart("t", [(str(k), [(0, k), (1, k)]) for k in range(7)], "x", "y"))
-    strokes = [(line.attrib["stroke"], line.attrib["stroke-dasharray"]) for line in figure.iter("polyline")]
+    figure = ElementTree.fromstring(
+        line_chart("t", [(str(k), [(0, k), (1, k)]) for k in range(7)], "x", "y")
+    )
+    strokes = [
+        (line.attrib["stroke"], line.attrib["stroke-dasharray"]) for line in figure.iter("polyline")
+    ]
     assert len(set(strokes)) == 6
     assert strokes[6] == strokes[0]
 
 
 @pytest.mark.parametrize("log", [False, True])
 @pytest.mark.parametrize(
-    "values", [(2, 5), (3, 3), (0.3, 40), (1e-9, 1e9), (0.011, 0.012), (7000, 30000), (99.5, 101), (1, 1e6)]
+    "values",
+    [(2, 5), (3, 3), (0.3, 40), (1e-9, 1e9), (0.011, 0.012), (7000, 30000), (99.5, 101), (1, 1e6)],
 )
 def test_an_axis_has_round_ticks_within_its_range(values: tuple[float, float], log: bool) -> None:
-    """Its range goes a little beyond the values; on a logarithmic one of no two decades, ends and middle are named."""
+    """Its range goes a little beyond the values; on a logarithmic one of no two decades, ends and
+    middle are named."""
     axis = Axis(values, log, 100.0, 300.0)
     places = [axis.to_px(tick) for tick in axis.ticks]
     assert 2 <= len(places) <= 12
     assert places == sorted(set(places))
     assert 100 - 1e-9 <= places[0] < places[-1] <= 300 + 1e-9
     ends = sorted(axis.to_px(value) for value in values)
-    assert ends == pytest.approx([200, 200] if values[0] == values[1] else [100 + 200 / 27, 300 - 200 / 27])
+    assert ends == pytest.approx(
+        [200, 200] if values[0] == values[1] else [100 + 200 / 27, 300 - 200 / 27]
+    )
     assert len({axis.label(tick) for tick in axis.ticks}) == len(places)
     decades = [math.log10(tick) for tick in axis.ticks] if log else []
     if not log:
         step = axis.ticks[1] - axis.ticks[0]
         assert np.diff(axis.ticks) == pytest.approx(step)
-        assert [tick / step for tick in axis.ticks] == pytest.approx([round(tick / step) for tick in axis.ticks])
+        assert [tick / step for tick in axis.ticks] == pytest.approx(
+            [round(tick / step) for tick in axis.ticks]
+        )
     elif decades != [round(decade) for decade in decades]:
         assert places == pytest.approx([100, 200, 300])
 
@@ -320,12 +386,19 @@ def test_an_axis_has_round_ticks_within_its_range(values: tuple[float, float], l
         ((2, 5), False, [2, 3, 4, 5], ["2", "3", "4", "5"]),
         ((0, 10), False, [0, 2.5, 5, 7.5, 10], ["0.0", "2.5", "5.0", "7.5", "10.0"]),
         ((-3, 3), False, [-2, 0, 2], ["−2", "0", "2"]),
-        ((7000, 30000), False, [10000, 15000, 20000, 25000, 30000], ["10k", "15k", "20k", "25k", "30k"]),
+        (
+            (7000, 30000),
+            False,
+            [10000, 15000, 20000, 25000, 30000],
+            ["10k", "15k", "20k", "25k", "30k"],
+        ),
         ((0.3, 40), True, [1, 10], ["1", "10"]),
         ((1, 1e6), True, [1, 100, 1e4, 1e6], ["1", "100", "10k", "1M"]),
     ],
 )
-def test_ticks_of_an_axis(values: tuple[float, float], log: bool, ticks: list[float], labels: list[str]) -> None:
+def test_ticks_of_an_axis(
+    values: tuple[float, float], log: bool, ticks: list[float], labels: list[str]
+) -> None:
     axis = Axis(values, log, 0.0, 100.0)
     assert axis.ticks == pytest.approx(ticks)
     assert [axis.label(tick) for tick in axis.ticks] == labels
@@ -333,9 +406,20 @@ def test_ticks_of_an_axis(values: tuple[float, float], log: bool, ticks: list[fl
 
 @pytest.mark.parametrize(
     ("value", "text"),
-    [(0, "0"), (1e-4, "0.0001"), (9e-5, "9e−05"), (-0.0234, "−0.0234"), (999.4, "999"), (1000, "1000"), (9999, "9999"),
-     (1e4, "10k"), (26_100, "26.1k"), (1e6, "1M"), (-2.5e6, "−2.5M")],
-)  # fmt: skip
+    [
+        (0, "0"),
+        (1e-4, "0.0001"),
+        (9e-5, "9e−05"),
+        (-0.0234, "−0.0234"),
+        (999.4, "999"),
+        (1000, "1000"),
+        (9999, "9999"),
+        (1e4, "10k"),
+        (26_100, "26.1k"),
+        (1e6, "1M"),
+        (-2.5e6, "−2.5M"),
+    ],
+)
 def test_a_short_number_has_three_digits(value: float, text: str) -> None:
     assert short_number(value) == text
 
@@ -367,7 +451,9 @@ def test_the_threshold_of_a_chart_is_the_one_that_all_arms_have_in_scene_units(
 ) -> None:
     write_arms(tmp_path, {"adc": {}, "volumetric": settings}, seeds=(0,))
     assert _threshold(load_experiment(tmp_path, "exp").trials) == expected
-    write_arms(tmp_path / "b", {"mcmc": {"volume_threshold": 0.05}, "volumetric": settings}, seeds=(0,))
+    write_arms(
+        tmp_path / "b", {"mcmc": {"volume_threshold": 0.05}, "volumetric": settings}, seeds=(0,)
+    )
     own = 0.05 if expected is None and "auto" not in settings.values() else None
     assert _threshold(load_experiment(tmp_path / "b", "exp").trials) == own
 
@@ -378,7 +464,9 @@ def test_nothing_to_draw_is_an_empty_string() -> None:
     assert forest_plot("t", [], "x", 1) == ""
 
 
-def test_the_verb_writes_the_file(runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_verb_writes_the_file(
+    runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert report(["exp", "--out", str(tmp_path / "sub" / "r.html")], runs) == 0
     assert (tmp_path / "sub" / "r.html").read_text().startswith("<!doctype html>")
     assert str(tmp_path / "sub" / "r.html") in capsys.readouterr().out
@@ -398,14 +486,20 @@ def test_a_report_on_a_table_of_the_paper_has_its_numbers_beside(tmp_path: Path)
     write_runs(tmp_path, Plan(experiment="table1", inits=("dim",), scenes=("garden",)))
     page = build_report(load_experiment(tmp_path, "table1"))
     assert "Table 1, difference from the printed values" in page
-    assert "What the paper&#39;s own numbers say" in page or "What the paper's own numbers say" in page
+    assert (
+        "What the paper&#39;s own numbers say" in page or "What the paper's own numbers say" in page
+    )
 
 
 def test_costs_stand_under_the_verdict(page: str) -> None:
-    """20,010 and 26,010 Gaussians on the average, 51.025 and 66.025 s; seeds 0 to 2 add as many seconds."""
+    """20,010 and 26,010 Gaussians on the average, 51.025 and 66.025 s; seeds 0 to 2 add as many
+    seconds."""
     costs = page.split('aria-label="Cost">')[1].split("</ul>")[0]
     assert "<li>Gaussians +30.0% as a ratio of totals, +30.0% as the mean of 2 scenes</li>" in costs
-    assert "<li>Training time +29.4% as a ratio of totals, +29.4% as the mean of 2 scenes; times of equal" in costs
+    assert (
+        "<li>Training time +29.4% as a ratio of totals, +29.4% as the mean of 2 scenes; times of "
+        "equal" in costs
+    )
     assert "trials differ by up to 4%</li>" in costs
     assert "mean of scenes</text>" in page
 
@@ -430,7 +524,9 @@ def test_swept_settings_become_arms_of_their_own(tmp_path: Path) -> None:
         plan = Plan(gaussians={"adc": cap, "volumetric": cap}, scenes=("garden",))
         for path in write_runs(tmp_path / str(cap), plan):
             target = (
-                tmp_path / path.relative_to(tmp_path / str(cap)).parent / f"{config_hash}-{path.name.split('-')[1]}"
+                tmp_path
+                / path.relative_to(tmp_path / str(cap)).parent
+                / f"{config_hash}-{path.name.split('-')[1]}"
             )
             target.parent.mkdir(parents=True, exist_ok=True)
             text = (
@@ -459,8 +555,8 @@ def test_scenes_that_disagree_are_named_under_a_verdict_on_their_mean(tmp_path: 
     assert "too small to matter in PSNR" in headline(judged)
     line = next(line for line in by_scene_lines(judged.verdicts) if line.startswith("PSNR"))
     assert (
-        line
-        == "PSNR (dB) by scene: better on courtyard, worse on garden: the scenes disagree, so their mean says little"
+        line == "PSNR (dB) by scene: better on courtyard, worse on garden: the scenes disagree, so "
+        "their mean says little"
     )
     assert line in build_report(load_experiment(tmp_path, "exp"))
 
@@ -476,9 +572,18 @@ def test_points_of_a_search_are_not_held_against_each_other(tmp_path: Path) -> N
     assert "Verdicts, " in build_report(load_experiment(tmp_path, "exp"))
     points = [{"value": 27.5, "settings": {"densify.volume_threshold": 0.6841}}]
     record = {
-        "sweep": "vth", "arm": "sfm-volumetric", "metric": "psnr", "direction": 1, "wanted": 2, "seeds": [100],
-        "scenes": ["courtyard"], "ranges": {}, "log": [], "as_it_is": False, "points": points,
-    }  # fmt: skip
+        "sweep": "vth",
+        "arm": "sfm-volumetric",
+        "metric": "psnr",
+        "direction": 1,
+        "wanted": 2,
+        "seeds": [100],
+        "scenes": ["courtyard"],
+        "ranges": {},
+        "log": [],
+        "as_it_is": False,
+        "points": points,
+    }
     (tmp_path / "exp" / "tuning.json").write_text(json.dumps(record))
     page = build_report(load_experiment(tmp_path, "exp"))
     assert "Verdicts, " not in page
@@ -489,5 +594,7 @@ def test_points_of_a_search_are_not_held_against_each_other(tmp_path: Path) -> N
 def test_a_forest_has_a_scale_whatever_its_range() -> None:
     """A range of -.09 to .09 had zero as its one tick."""
     for reach in (0.0886, 0.09, 0.11, 1.0, 3.3, 940.0):
-        chart = forest_plot("t", [ForestRow("a", 0.1 * reach, Interval(-reach, reach))], "difference", 1)
+        chart = forest_plot(
+            "t", [ForestRow("a", 0.1 * reach, Interval(-reach, reach))], "difference", 1
+        )
         assert chart.count('class="grid"') >= 2, reach

@@ -34,7 +34,9 @@ def test_trials_are_in_the_order_of_seeds_then_of_configurations(tmp_path: Path)
         write_arms(tmp_path, {"adc": {"cap": cap}}, seeds=(1, 0))
     trials = load_experiment(tmp_path, "exp").trials
     assert [trial.seed for trial in trials] == [0, 0, 1, 1]
-    assert [trial.config_hash for trial in trials] == sorted({trial.config_hash for trial in trials}) * 2
+    assert [trial.config_hash for trial in trials] == sorted(
+        {trial.config_hash for trial in trials}
+    ) * 2
 
 
 def test_hydra_and_report_files_beside_the_trials_do_not_disturb(tmp_path: Path) -> None:
@@ -46,21 +48,36 @@ def test_hydra_and_report_files_beside_the_trials_do_not_disturb(tmp_path: Path)
 
 
 DAMAGES = {
-    "half a file": (lambda path: (path / "results.json").write_text('{"status": "comp'), "not JSON"),
+    "half a file": (
+        lambda path: (path / "results.json").write_text('{"status": "comp'),
+        "not JSON",
+    ),
     "binary": (lambda path: (path / "results.json").write_bytes(b"\xff\xfe\x00"), "not JSON"),
     "a list": (lambda path: (path / "results.json").write_text("[]"), "should be an object"),
     "nan": (lambda path: rewrite(path, metrics={"psnr": float("nan")}), "metrics.psnr is nan"),
-    "text for a number": (lambda path: rewrite(path, metrics={"psnr": "27"}), "metrics.psnr is '27'"),
+    "text for a number": (
+        lambda path: rewrite(path, metrics={"psnr": "27"}),
+        "metrics.psnr is '27'",
+    ),
     "no seconds": (lambda path: rewrite(path, seconds=None), "seconds is None"),
     "no count": (lambda path: rewrite(path, num_gaussians=None), "num_gaussians"),
     "no protocol": (lambda path: rewrite(path, protocol=None), "protocol is None"),
     "still running": (lambda path: rewrite(path, status="running"), "unfinished"),
-    "another scene": (lambda path: rewrite(path, scene="kitchen"), "foreign, its results.json is of scene 'kitchen'"),
+    "another scene": (
+        lambda path: rewrite(path, scene="kitchen"),
+        "foreign, its results.json is of scene 'kitchen'",
+    ),
     "another experiment": (lambda path: rewrite(path, experiment="other"), "of experiment 'other'"),
     "another arm": (lambda path: rewrite(path, densify="none"), "of arm 'sfm-none'"),
     "another seed": (lambda path: rewrite(path, seed=7), "of seed '7'"),
-    "a copy under another name": (lambda path: path.rename(path.with_name("copy of run")), "not named"),
-    "nothing yet": (lambda path: (path / "results.json").unlink(), "unfinished, no results.json yet"),
+    "a copy under another name": (
+        lambda path: path.rename(path.with_name("copy of run")),
+        "not named",
+    ),
+    "nothing yet": (
+        lambda path: (path / "results.json").unlink(),
+        "unfinished, no results.json yet",
+    ),
 }
 
 

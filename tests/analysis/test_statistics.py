@@ -1,4 +1,5 @@
-"""The statistics and planning against scipy, textbooks, hand-counted cases, and simulated sweeps."""
+"""The statistics and planning against scipy, textbooks, hand-counted cases, and simulated
+sweeps."""
 
 from __future__ import annotations
 
@@ -42,7 +43,8 @@ def test_the_test_of_one_scene_is_the_paired_t_test() -> None:
 
 
 def test_scenes_weigh_alike_and_each_has_a_variance_of_its_own() -> None:
-    """By hand: variances 1 and 9 of three pairs each; Satterthwaite's 2 (1 + 9)^2 / (1 + 81) degrees, halved."""
+    """By hand: variances 1 and 9 of three pairs each; Satterthwaite's 2 (1 + 9)^2 / (1 + 81)
+    degrees, halved."""
     rows = np.array([[1.0, 2.0, 3.0], [1.0, 4.0, 7.0]])
     found = t_test(rows)
     assert found is not None
@@ -54,7 +56,10 @@ def test_scenes_weigh_alike_and_each_has_a_variance_of_its_own() -> None:
 def test_the_error_is_that_of_welch() -> None:
     rng = np.random.default_rng(0)
     one, other = rng.normal(0, 1, 5), rng.normal(0, 4, 5)
-    found, welch = t_test(np.stack([one, other])), scipy.stats.ttest_ind(one, -other, equal_var=False)
+    found, welch = (
+        t_test(np.stack([one, other])),
+        scipy.stats.ttest_ind(one, -other, equal_var=False),
+    )
     assert found is not None
     assert found.mean / found.error == pytest.approx(welch.statistic)
     assert found.degrees == pytest.approx(max(4.0, welch.df / 2))
@@ -74,7 +79,9 @@ def test_two_pairs_suffice_for_a_test() -> None:
         assert found.p == pytest.approx(scipy.stats.ttest_1samp([0.1, 0.3], 0).pvalue)
 
 
-@pytest.mark.parametrize(("low", "high", "known"), [(0, 1, False), (-1, 0, False), (-1, 1, False), (0.1, 1, True)])
+@pytest.mark.parametrize(
+    ("low", "high", "known"), [(0, 1, False), (-1, 0, False), (-1, 1, False), (0.1, 1, True)]
+)
 def test_an_interval_that_ends_at_zero_holds_it(low: float, high: float, known: bool) -> None:
     assert Interval(low, high).excludes_zero() == Interval(-high, -low).excludes_zero() == known
 
@@ -95,17 +102,26 @@ def test_holm_is_step_down_and_monotone() -> None:
     assert adjusted == pytest.approx([0.06, 0.04, 0.06, 0.06])
     assert holm_factors([0.0, 0.02, 0.0]) == [3, 1, 2]
     untested, tested = answer_family([np.array([[0.3]]), np.array([[0.3, 0.1, 0.25, 0.4]])])
-    assert (untested.mean, untested.test, tested.rate, tested.equal_rate) == (0.3, None, ALPHA, ALPHA)
+    assert (untested.mean, untested.test, tested.rate, tested.equal_rate) == (
+        0.3,
+        None,
+        ALPHA,
+        ALPHA,
+    )
 
 
 @pytest.mark.parametrize("seed", range(10))
 def test_an_interval_leaves_zero_out_exactly_where_p_is_below_5_percent(seed: int) -> None:
     rng = np.random.default_rng(seed)
     size, scenes, seeds = (int(n) for n in rng.integers((1, 1, 2), (25, 9, 5)))
-    for one in answer_family([rng.normal(rng.normal(0, 0.2), 0.1, (scenes, seeds)) for _ in range(size)]):
+    for one in answer_family(
+        [rng.normal(rng.normal(0, 0.2), 0.1, (scenes, seeds)) for _ in range(size)]
+    ):
         assert one.p is not None
         assert one.interval is not None
-        assert (one.p < ALPHA) == one.interval.excludes_zero() == (one.outcome(1, None) != "undecided")
+        assert (
+            (one.p < ALPHA) == one.interval.excludes_zero() == (one.outcome(1, None) != "undecided")
+        )
 
 
 @pytest.mark.parametrize(
@@ -123,12 +139,15 @@ def test_an_interval_leaves_zero_out_exactly_where_p_is_below_5_percent(seed: in
         ((0.1, 2.0), 0, "undecided"),
     ],
 )
-def test_the_interval_alone_makes_the_outcome(interval: tuple[float, float], sign: int, expected: str) -> None:
+def test_the_interval_alone_makes_the_outcome(
+    interval: tuple[float, float], sign: int, expected: str
+) -> None:
     assert outcome_of(Interval(*interval), sign, 0.5) == expected
 
 
 def test_what_is_too_small_is_told_at_an_equal_part_of_the_error_rate() -> None:
-    """A member whose sign is sure at Holm's rate, and whose size is so only at a member's equal part."""
+    """A member whose sign is sure at Holm's rate, and whose size is so only at a member's equal
+    part."""
     clear, other = np.array([[0.30, 0.31, 0.29]]), np.array([[0.0, 5.0, -4.0]])
     one = answer_family([clear, other])[0]
     assert (one.rate, one.equal_rate) == (pytest.approx(ALPHA / 2), ALPHA / 2)
@@ -158,16 +177,23 @@ def test_scenes_like_these_are_asked_by_the_sign_test() -> None:
     assert (nothing.helped, nothing.beyond, nothing.p) == (0, 6, 1.0)
     none_helped = judge_like_these(-np.ones(6), 1, None)
     assert none_helped is not None
-    assert (none_helped.share.low, none_helped.beyond, none_helped.outcome) == (0.0, None, "refuted")
+    assert (none_helped.share.low, none_helped.beyond, none_helped.outcome) == (
+        0.0,
+        None,
+        "refuted",
+    )
     assert none_helped.share.high == pytest.approx(scipy.stats.binomtest(0, 6).proportion_ci().high)
     assert none_helped.p == pytest.approx(scipy.stats.binomtest(0, 6).pvalue)
 
 
 def test_the_interval_of_the_median_is_exact() -> None:
-    """Of eight values the outermost hold the median but for 2 / 2^8; of six 5 % is reached, 1 % not."""
+    """Of eight values the outermost hold the median but for 2 / 2^8; of six 5 % is reached, 1 %
+    not."""
     values = np.arange(8.0)
     assert median_interval(values, 0.05) == Interval(0.0, 7.0)
-    assert median_interval(values, 0.3) == Interval(2.0, 5.0) or median_interval(values, 0.3) == Interval(1.0, 6.0)
+    assert median_interval(values, 0.3) == Interval(2.0, 5.0) or median_interval(
+        values, 0.3
+    ) == Interval(1.0, 6.0)
     assert median_interval(values[:6], 0.05) == Interval(0.0, 5.0)
     assert median_interval(values[:6], 0.01) is None
 
@@ -186,8 +212,11 @@ def test_the_statement_agrees_with_the_sign_test_at_every_level() -> None:
 
 
 @pytest.mark.parametrize("scenes", [1, 3, 8])
-def test_no_look_may_use_more_than_its_share_and_where_the_looks_would_err_too_often_the_last_less(scenes: int) -> None:
-    """The cautious degrees of freedom of a few scenes leave each look its whole share; one scene has its exact ones."""
+def test_no_look_may_use_more_than_its_share_and_where_the_looks_would_err_too_often_the_last_less(
+    scenes: int,
+) -> None:
+    """The cautious degrees of freedom of a few scenes leave each look its whole share; one scene
+    has its exact ones."""
     looks = (2, 3, 4)
     levels = look_levels(scenes, looks, 0.05)
     shares = [0.05 * (seeds / 4) ** 1.5 for seeds in looks]
@@ -201,7 +230,8 @@ def test_no_look_may_use_more_than_its_share_and_where_the_looks_would_err_too_o
     ]
     assert np.mean(false) < 0.05 + 3 * (0.05 * 0.95 / len(sweeps)) ** 0.5
     assert look_levels(3, (4,), 0.05) == (0.05,)
-    assert look_levels(1, (2, 3), 1e-6)[0] == 0.0  # too little to spend for any of the simulated sequences
+    # too little to spend for any of the simulated sequences
+    assert look_levels(1, (2, 3), 1e-6)[0] == 0.0
     assert plan_looks(2) == (2,)
     assert plan_looks(4) == (2, 3, 4)
     assert plan_looks(12) == tuple(range(2, 13))
@@ -316,7 +346,8 @@ def test_designs_that_are_needed_just_suffice(like_these: bool) -> None:
 
 
 def test_seeds_do_not_replace_scenes() -> None:
-    """Where scenes differ by more than the effect, no number of seeds speaks of scenes like these."""
+    """Where scenes differ by more than the effect, no number of seeds speaks of scenes like
+    these."""
     scattered = Components(between=5.0, within=0.1, scenes=4, trials=12)
     assert designs_needed(0.5, scattered, like_these=True) == []
     assert designs_needed(0.5, scattered, like_these=False)[0] == Design(1, 3)

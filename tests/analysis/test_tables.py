@@ -16,9 +16,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gsbench.analysis.quantities import Change, asked_quantity, choose_quantities, quantity, relative_change
+from gsbench.analysis.quantities import (
+    Change,
+    asked_quantity,
+    choose_quantities,
+    quantity,
+    relative_change,
+)
 from gsbench.analysis.results import Experiment, load_experiment
-from gsbench.analysis.table_formats import Table, escape_latex, to_csv, to_html_page, to_latex, to_markdown
+from gsbench.analysis.table_formats import (
+    Table,
+    escape_latex,
+    to_csv,
+    to_html_page,
+    to_latex,
+    to_markdown,
+)
 from gsbench.analysis.tables import build_table, with_agreement
 from gsbench.errors import InputError
 from tests.analysis.synthetic import Plan, trial_data, write_runs, write_trial
@@ -27,9 +40,14 @@ Make = Callable[..., Experiment]
 
 
 def one_trial(
-    runs: Path, seed: int, config_hash: str = "c0ffee00", settings: dict | None = None, **values: object
+    runs: Path,
+    seed: int,
+    config_hash: str = "c0ffee00",
+    settings: dict | None = None,
+    **values: object,
 ) -> Path:
-    """A trial of one scene with metrics given in ``values`` (psnr=…), or other keys of results.json (_iterations=…)."""
+    """A trial of one scene with metrics given in ``values`` (psnr=…), or other keys of results.json
+    (_iterations=…)."""
     metrics = {key: value for key, value in values.items() if not key.startswith("_")}
     plan = Plan()
     views = {key: np.array([value]) for key, value in metrics.items()}
@@ -41,7 +59,10 @@ def one_trial(
 
 
 def texts(table: Table) -> list[list[str]]:
-    return [[*row.labels, *(f"*{e.text}*" if e.bold else e.text for e in row.entries)] for row in table.rows]
+    return [
+        [*row.labels, *(f"*{e.text}*" if e.bold else e.text for e in row.entries)]
+        for row in table.rows
+    ]
 
 
 def test_a_cell_is_mean_and_sample_deviation_over_trials(tmp_path: Path) -> None:
@@ -53,10 +74,18 @@ def test_a_cell_is_mean_and_sample_deviation_over_trials(tmp_path: Path) -> None
 
 
 def test_the_best_is_bold_and_ties_after_rounding_are_both_best(tmp_path: Path) -> None:
-    for densify, psnr, flip in (("adc", 27.001, 0.1), ("none", 26.0, 0.3), ("volumetric", 26.996, 0.05)):
+    for densify, psnr, flip in (
+        ("adc", 27.001, 0.1),
+        ("none", 26.0, 0.3),
+        ("volumetric", 26.996, 0.05),
+    ):
         one_trial(tmp_path, 0, _densify=densify, psnr=psnr, flip=flip)
     table = build_table(load_experiment(tmp_path, "exp"), metrics=["psnr", "flip", "gaussians"])
-    assert [row[3:5] for row in texts(table)] == [["*27.00*", "0.100"], ["26.00", "0.300"], ["*27.00*", "*0.050*"]]
+    assert [row[3:5] for row in texts(table)] == [
+        ["*27.00*", "0.100"],
+        ["26.00", "0.300"],
+        ["*27.00*", "*0.050*"],
+    ]
     assert not any(row.entries[2].bold for row in table.rows)  # a count is a cost, not a merit
 
 
@@ -70,7 +99,9 @@ def test_no_mean_is_shown_where_no_scene_has_every_arm(tmp_path: Path) -> None:
     paths = write_runs(tmp_path, Plan())
     for path in [*paths[0:3], *paths[9:]]:  # courtyard has volumetric alone, garden adc
         shutil.rmtree(path)
-    table = build_table(load_experiment(tmp_path, "exp"), rows=["scene"], columns=["densify"], metrics=["psnr"])
+    table = build_table(
+        load_experiment(tmp_path, "exp"), rows=["scene"], columns=["densify"], metrics=["psnr"]
+    )
     assert [row[0] for row in texts(table)] == ["courtyard", "garden"]
 
 
@@ -79,13 +110,18 @@ def test_missing_and_incomplete_cells_are_marked_with_their_count(tmp_path: Path
     (paths[0] / "results.json").unlink()  # courtyard, adc, seed 0
     for path in paths[9:]:  # garden, volumetric
         shutil.rmtree(path)
-    table = build_table(load_experiment(tmp_path, "exp"), rows=["scene"], columns=["densify"], metrics=["psnr"])
+    table = build_table(
+        load_experiment(tmp_path, "exp"), rows=["scene"], columns=["densify"], metrics=["psnr"]
+    )
     rows = {row[0]: row[1:] for row in texts(table)}
     assert rows["courtyard"][0].strip("*").endswith("(2/3)")
     assert rows["garden"][1] == "— (0/3)"
     assert "(2/3)" not in rows["garden"][0]
     assert "mean of 1 scene" in rows  # only courtyard has both arms
-    assert any("Left out (1): exp/courtyard/sfm-adc/c0ffee00-seed0: unfinished" in note for note in table.notes)
+    assert any(
+        "Left out (1): exp/courtyard/sfm-adc/c0ffee00-seed0: unfinished" in note
+        for note in table.notes
+    )
 
 
 def test_an_unavailable_metric_is_na_with_its_reason(make_experiment: Make) -> None:
@@ -95,7 +131,9 @@ def test_an_unavailable_metric_is_na_with_its_reason(make_experiment: Make) -> N
 
 
 @pytest.mark.parametrize("there", [True, False])
-def test_where_another_lpips_alone_was_asked_for_it_has_the_column(there: bool, tmp_path: Path) -> None:
+def test_where_another_lpips_alone_was_asked_for_it_has_the_column(
+    there: bool, tmp_path: Path
+) -> None:
     measured = {"lpips_squeeze": 0.1} if there else {}
     one_trial(tmp_path, 0, settings={"eval__lpips": ["squeeze"]}, psnr=27.0, **measured)
     keys = [quantity.key for quantity in choose_quantities(load_experiment(tmp_path, "exp").trials)]
@@ -134,15 +172,21 @@ def test_a_cell_never_mixes_settings(tmp_path: Path) -> None:
     experiment = load_experiment(tmp_path, "exp")
     with pytest.raises(InputError, match=r"differ in densify\.volume_threshold: 0\.03 \| 0\.1"):
         build_table(experiment, rows=["scene", "densify"])
-    assert build_table(experiment).row_headings[-1] == "densify.volume_threshold"  # by default it becomes a row
+    # by default it becomes a row
+    assert build_table(experiment).row_headings[-1] == "densify.volume_threshold"
     table = build_table(experiment, rows=["scene", "densify.volume_threshold"], metrics=["psnr"])
     assert [row.labels for row in table.rows] == [("garden", "0.03"), ("garden", "0.1")]
 
 
 def test_settings_that_only_say_where_a_trial_ran_do_not_matter(tmp_path: Path) -> None:
     one_trial(tmp_path, 0, "aaaaaaaa", psnr=27.0)
-    one_trial(tmp_path, 1, "bbbbbbbb", {"tracking__name": "off", "scene__path": "/elsewhere"}, psnr=28.0)
-    assert texts(build_table(load_experiment(tmp_path, "exp"), metrics=["psnr"]))[0][3] == "27.50 ± 0.71"
+    one_trial(
+        tmp_path, 1, "bbbbbbbb", {"tracking__name": "off", "scene__path": "/elsewhere"}, psnr=28.0
+    )
+    assert (
+        texts(build_table(load_experiment(tmp_path, "exp"), metrics=["psnr"]))[0][3]
+        == "27.50 ± 0.71"
+    )
 
 
 def test_one_seed_twice_is_refused(tmp_path: Path) -> None:
@@ -163,13 +207,16 @@ def test_arms_under_different_conditions_are_shown_but_not_compared(tmp_path: Pa
 @pytest.mark.parametrize(
     ("second_budget", "blocked", "compared"),
     [
-        ({"max_gaussians": None, "cap": None}, (0, 0), True),  # neither cap acted: both grew as they liked
+        # neither cap acted: both grew as they liked
+        ({"max_gaussians": None, "cap": None}, (0, 0), True),
         ({"max_gaussians": None, "cap": None}, (3, 0), False),
         ({"max_gaussians": 1000, "cap": "hard"}, (0, 3), False),
         ({"max_gaussians": 50_000, "cap": "soft"}, (3, 0), True),  # one budget for both
-        ({"max_gaussians": None, "cap": None, "seconds": 60}, (0, 0), False),  # who knows what it would have become
+        # who knows what it would have become
+        ({"max_gaussians": None, "cap": None, "seconds": 60}, (0, 0), False),
         ({"max_gaussians": None, "cap": None}, (None, 0), False),  # no count of what was refused
-        ({"max_gaussians": 1000, "cap": "governor"}, (0, 0), False),  # it steers also where it refuses nothing
+        # it steers also where it refuses nothing
+        ({"max_gaussians": 1000, "cap": "governor"}, (0, 0), False),
     ],
 )
 def test_arms_are_compared_under_one_budget_or_under_none_that_acted(
@@ -199,7 +246,9 @@ def test_the_mean_of_scenes_weighs_scenes_alike(tmp_path: Path) -> None:
 def test_costs_are_averaged_by_both_rules(make_experiment: Make, tmp_path: Path) -> None:
     for scene, adc, volumetric in (("a", 1_000_000, 2_000_000), ("b", 3_000_000, 3_000_000)):
         one_trial(tmp_path, 0, psnr=20.0, _scene=scene, _num_gaussians=adc)
-        one_trial(tmp_path, 0, psnr=20.0, _scene=scene, _num_gaussians=volumetric, _densify="volumetric")
+        one_trial(
+            tmp_path, 0, psnr=20.0, _scene=scene, _num_gaussians=volumetric, _densify="volumetric"
+        )
     trials = load_experiment(tmp_path, "exp").trials
     arms = [[trial for trial in trials if trial.densify == name] for name in ("adc", "volumetric")]
     change = relative_change(*arms, lambda trial: trial.record.num_gaussians)
@@ -215,7 +264,9 @@ def test_metrics_of_earlier_iterations_have_columns_of_their_own(tmp_path: Path)
     table = build_table(experiment, metrics=["psnr@7000", "psnr"])
     assert [column.heading for column in table.columns] == ["PSNR at 7,000 ↑", "PSNR (dB) ↑"]
     assert texts(table)[0][3:] == ["21.00 ± 1.41", "27.50 ± 0.71"]
-    with pytest.raises(InputError, match=r"measured at iteration '9000'; measured were \(eval\.at\) 7000"):
+    with pytest.raises(
+        InputError, match=r"measured at iteration '9000'; measured were \(eval\.at\) 7000"
+    ):
         build_table(experiment, metrics=["psnr@9000"])
 
 
@@ -240,7 +291,10 @@ def test_the_notes_say_how_to_read_the_table_and_what_is_left_out(tmp_path: Path
     assert any(note.endswith("n/a, weights file alexnet.pth not found.") for note in notes)
     assert notes[-1].startswith("Left out (1): exp/garden/sfm-volumetric/c0ffee00-seed2: damaged")
     complete = build_table(load_experiment(tmp_path, "exp"), rows=["densify"], metrics=["psnr"])
-    assert complete.notes[0] == "Mean over 3 trials; ± is the deviation (n − 1) over the trials' means of scenes."
+    assert (
+        complete.notes[0]
+        == "Mean over 3 trials; ± is the deviation (n − 1) over the trials' means of scenes."
+    )
 
 
 def test_rows_are_in_the_order_of_numbers_then_of_text(tmp_path: Path) -> None:
@@ -261,9 +315,13 @@ def test_markdown(make_experiment: Make) -> None:
 
 def test_csv_has_a_line_for_each_cell_in_full_precision(make_experiment: Make) -> None:
     experiment = make_experiment()
-    rows = list(csv.DictReader(io.StringIO(to_csv(build_table(experiment, metrics=["psnr", "gaussians"])))))
+    rows = list(
+        csv.DictReader(io.StringIO(to_csv(build_table(experiment, metrics=["psnr", "gaussians"]))))
+    )
     first = next(row for row in rows if row["scene"] == "courtyard" and row["quantity"] == "psnr")
-    values = [t.metrics["psnr"] for t in experiment.trials if (t.scene, t.densify) == ("courtyard", "adc")]
+    values = [
+        t.metrics["psnr"] for t in experiment.trials if (t.scene, t.densify) == ("courtyard", "adc")
+    ]
     assert float(first["mean"]) == pytest.approx(statistics.fmean(values), abs=1e-12)
     assert float(first["std"]) == pytest.approx(statistics.stdev(values), abs=1e-12)
     assert first["trials"].split()[0] == "exp/courtyard/sfm-adc/c0ffee00-seed0"
@@ -310,7 +368,10 @@ def has_latex() -> bool:
     """Whether pdflatex and booktabs are installed."""
     if shutil.which("pdflatex") is None or shutil.which("kpsewhich") is None:
         return False
-    return subprocess.run(["kpsewhich", "booktabs.sty"], capture_output=True, check=False).returncode == 0
+    return (
+        subprocess.run(["kpsewhich", "booktabs.sty"], capture_output=True, check=False).returncode
+        == 0
+    )
 
 
 @pytest.mark.skipif(not has_latex(), reason="pdflatex with booktabs is not installed")
@@ -318,9 +379,16 @@ def test_latex_compiles(make_experiment: Make, tmp_path: Path) -> None:
     experiment = make_experiment()
     (experiment.trials[0].path / "results.json").write_text("{")
     experiment = load_experiment(tmp_path, "exp")
-    tables = [build_table(experiment), build_table(experiment, rows=["scene"], columns=["init", "densify"])]
+    tables = [
+        build_table(experiment),
+        build_table(experiment, rows=["scene"], columns=["init", "densify"]),
+    ]
     body = "\n".join(to_latex(table) for table in tables)
-    source = "\\documentclass{article}\n\\usepackage{booktabs}\n\\begin{document}\n" + body + "\\end{document}\n"
+    source = (
+        "\\documentclass{article}\n\\usepackage{booktabs}\n\\begin{document}\n"
+        + body
+        + "\\end{document}\n"
+    )
     (tmp_path / "table.tex").write_text(source)
     command = ["pdflatex", "-interaction=nonstopmode", "-halt-on-error", "table.tex"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, check=False)
@@ -332,7 +400,9 @@ def test_latex_has_as_many_cells_as_columns(make_experiment: Make) -> None:
     source = to_latex(build_table(make_experiment(), rows=["scene"], columns=["densify"]))
     width = len(re.search(r"begin\{tabular\}\{(\w+)\}", source)[1])
     body = source.split("\\midrule")[1].split("\\bottomrule")[0]
-    assert {len(re.split(r"(?<!\\)&", line)) for line in body.splitlines() if line.endswith("\\\\")} == {width}
+    assert {
+        len(re.split(r"(?<!\\)&", line)) for line in body.splitlines() if line.endswith("\\\\")
+    } == {width}
 
 
 def test_results_written_by_hand_are_plain_json(make_experiment: Make) -> None:
@@ -355,19 +425,33 @@ def test_counts_from_a_million_and_times_from_ten_minutes_have_the_larger_unit(
     trials = load_experiment(tmp_path, "exp").trials
     object.__setattr__(trials[0].record, "num_gaussians", gaussians)
     trials[0].record.seconds.update(train=seconds, init=5.0, evaluate=2.0)
-    found = [quantity(name, trials[:1]) for name in ("num_gaussians", "train", "init_points", "total_time")]
+    found = [
+        quantity(name, trials[:1])
+        for name in ("num_gaussians", "train", "init_points", "total_time")
+    ]
     assert [one.name.partition(" ↓")[0] for one in found] == headings
     values = [one.read(trials[0]) for one in found]
-    scales = [{"(s)": 1, "(min)": 60, "(k)": 1e3, "(M)": 1e6}[name.split()[-1]] for name in headings]
+    scales = [
+        {"(s)": 1, "(min)": 60, "(k)": 1e3, "(M)": 1e6}[name.split()[-1]] for name in headings
+    ]
     own = [gaussians, seconds, 3000, seconds + 7]
-    assert values == pytest.approx([value / scale for value, scale in zip(own, scales, strict=True)])
+    assert values == pytest.approx(
+        [value / scale for value, scale in zip(own, scales, strict=True)]
+    )
     decimals = [{"(s)": 1, "(min)": 1, "(k)": 1, "(M)": 2}[name.split()[-1]] for name in headings]
-    assert [one.format(1.23456) for one in found] == [f"{1.23456:.{places}f}" for places in decimals]
+    assert [one.format(1.23456) for one in found] == [
+        f"{1.23456:.{places}f}" for places in decimals
+    ]
     asked = asked_quantity("gaussians")
     assert (asked.key, asked.name, asked.read(trials[0])) == ("gaussians", "Gaussians", gaussians)
-    fixed = [quantity(name, trials[:1]) for name in ("gaussians_millions", "train_minutes", "peak_memory_mb")]
+    fixed = [
+        quantity(name, trials[:1])
+        for name in ("gaussians_millions", "train_minutes", "peak_memory_mb")
+    ]
     assert [one.format(1.26) for one in fixed] == ["1.26", "1.3", "1"]
-    assert [one.read(trials[0]) for one in fixed] == pytest.approx([gaussians / 1e6, seconds / 60, 900])
+    assert [one.read(trials[0]) for one in fixed] == pytest.approx(
+        [gaussians / 1e6, seconds / 60, 900]
+    )
 
 
 @pytest.mark.parametrize(

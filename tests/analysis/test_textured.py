@@ -17,8 +17,11 @@ from tests.analysis.synthetic import Plan, write_runs
 
 
 def test_it_is_the_mean_error_where_the_fifth_of_most_texture_lies(tmp_path: Path) -> None:
-    """Steps grow from left to right, so texture does; the render is off by the tenth of a column's number."""
-    write_runs(tmp_path, Plan(scenes=("garden",), densifiers=("adc",), seeds=(0,), views=1, pictures=True))
+    """Steps grow from left to right, so texture does; the render is off by the tenth of a column's
+    number."""
+    write_runs(
+        tmp_path, Plan(scenes=("garden",), densifiers=("adc",), seeds=(0,), views=1, pictures=True)
+    )
     (trial,) = load_experiment(tmp_path, "exp").trials
     column = np.arange(100)
     truth = np.repeat((9 + column**2 // 50)[None], 20, axis=0)
@@ -31,7 +34,8 @@ def test_it_is_the_mean_error_where_the_fifth_of_most_texture_lies(tmp_path: Pat
     counts[:, 50:] = 0
     (trial.path / MASKS).mkdir()
     Image.fromarray(counts).save(trial.path / MASKS / "view000.png")
-    assert textured_error(trial) == pytest.approx(4.0, abs=0.2)  # of the left half, its last ten columns
+    # of the left half, its last ten columns
+    assert textured_error(trial) == pytest.approx(4.0, abs=0.2)
     for picture in (trial.path / "renders").iterdir():
         picture.unlink()
     with pytest.raises(InputError, match="holds no renders"):

@@ -23,8 +23,11 @@ SWEEP = ["densify=adc,none", "seed=0,1", "init=random", "tracking=none"]
 
 
 def test_a_sweep_has_one_time() -> None:
-    """Microseconds, so that two of them never agree by chance; each densifier is a composition of its own."""
-    trials = compose_trials([*SWEEP, "name=x-${now:%H%M%S%f}", "scene.name=y-${now:%f}"], multirun=True)
+    """Microseconds, so that two of them never agree by chance; each densifier is a composition of
+    its own."""
+    trials = compose_trials(
+        [*SWEEP, "name=x-${now:%H%M%S%f}", "scene.name=y-${now:%f}"], multirun=True
+    )
     assert len({trial.values["name"] for trial in trials}) == 1
     assert len({trial.values["scene"]["name"] for trial in trials}) == 1
 
@@ -44,15 +47,23 @@ def test_a_sweep_has_one_time() -> None:
             "densify.x.0.a=1000000000000000000000 is not a whole number of 64 bits",
         ),
         (["-m", "seed=range(0,1000000000000000000000)"], "lists more than 1,000,000 values"),
-        (["-m", "+hydra.sweeper.tune.ranges=1", "seed=0,1"], "hydra.sweeper.tune.ranges is not a setting"),
-        (["-m", "hydra/sweeper=basic", "hydra.sweeper.params=3", "seed=0,1"], "hydra.sweeper.params"),
+        (
+            ["-m", "+hydra.sweeper.tune.ranges=1", "seed=0,1"],
+            "hydra.sweeper.tune.ranges is not a setting",
+        ),
+        (
+            ["-m", "hydra/sweeper=basic", "hydra.sweeper.params=3", "seed=0,1"],
+            "hydra.sweeper.params",
+        ),
         (["-m", "densify=glob([av]*)"], """'densify=glob("[av]*")'"""),
         (["-m", "densify=choice([av,b)"], "is not a setting like key=value"),
         (["-m", "hydra/launcher=joblib", "seed=0,1", "hydra.launcher.jobs=3"], "n_jobs"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else None,
 )
-def test_what_cannot_be_is_refused_in_a_line(words: list[str], text: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_cannot_be_is_refused_in_a_line(
+    words: list[str], text: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     if "hydra/launcher=joblib" in words:
         pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     assert cli.run([*words, "--dry-run"]) == 2
@@ -82,9 +93,19 @@ def test_what_is_hydras_is_taken_and_a_look_writes_nothing(
 
 def test_settings_read_hydras_node() -> None:
     """Each job's own number, although trials that differ in the seed share a composition."""
-    words = ["name=x-${hydra:runtime.choices.densify}-${hydra:job.num}", "init=random", "densify=adc,none", "seed=0,1"]
+    words = [
+        "name=x-${hydra:runtime.choices.densify}-${hydra:job.num}",
+        "init=random",
+        "densify=adc,none",
+        "seed=0,1",
+    ]
     trials = compose_trials(words, multirun=True)
-    assert [trial.values["name"] for trial in trials] == ["x-adc-0", "x-adc-1", "x-none-2", "x-none-3"]
+    assert [trial.values["name"] for trial in trials] == [
+        "x-adc-0",
+        "x-adc-1",
+        "x-none-2",
+        "x-none-3",
+    ]
     (trial,) = compose_trials(["name=x-${hydra:runtime.choices.densify}"])
     assert trial.values["name"] == "x-volumetric"
 
@@ -102,7 +123,9 @@ def test_a_glob_of_characters_works_as_it_is_advised(capsys: pytest.CaptureFixtu
     assert "sfm-adc" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("words", [["--config-dir", "own", "--help"], ["-h", "--config-dir=own"], ["-m", "--help"]])
+@pytest.mark.parametrize(
+    "words", [["--config-dir", "own", "--help"], ["-h", "--config-dir=own"], ["-m", "--help"]]
+)
 def test_help_is_given_wherever_it_is_asked_for(
     words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -111,7 +134,8 @@ def test_help_is_given_wherever_it_is_asked_for(
     assert cli.run(words) == 0
     out = capsys.readouterr().out
     assert "Verbs" in out
-    assert ("patient" in out) == any("own" in word for word in words)  # a folder's own choices are listed
+    # a folder's own choices are listed
+    assert ("patient" in out) == any("own" in word for word in words)
     assert cli.run(["--config-dir", "nowhere", "--help"]) == 2
 
 

@@ -1,4 +1,5 @@
-"""Several grids in one experiment: what trials they make, and that plan, dry run and retry see one experiment."""
+"""Several grids in one experiment: what trials they make, and that plan, dry run and retry see one
+experiment."""
 
 from __future__ import annotations
 
@@ -34,11 +35,16 @@ def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def arms(*words: str) -> list[tuple[str, int]]:
     """Densifier and seed of each trial, in order."""
-    return [(trial.values["densify"]["name"], trial.values["seed"]) for trial in compose_trials(words)]
+    return [
+        (trial.values["densify"]["name"], trial.values["seed"]) for trial in compose_trials(words)
+    ]
 
 
 def test_words_are_shared_own_or_given() -> None:
-    grids = [{"densify": "adc"}, {"densify": "volumetric", "densify.volume_threshold": "1,2", "seed": "7"}]
+    grids = [
+        {"densify": "adc"},
+        {"densify": "volumetric", "densify.volume_threshold": "1,2", "seed": "7"},
+    ]
     given = ["train=quick", "densify.volume_threshold=3", "+experiment=x"]
     assert words_of_grids({"seed": "0,1"}, grids, given) == [
         ["densify=adc", "seed=0,1", "train=quick", "+experiment=x"],
@@ -52,7 +58,9 @@ def test_thresholds_beside_a_baseline_that_knows_none() -> None:
     places = ["/".join(TrialFolder.of(trial.values).path.parts[-2:]) for trial in trials]
     assert len(places) == len(set(places)) == 21
     assert set(places) > KNOWN  # results from before are found again
-    assert [place.split("/")[0] for place in places[:4]] == ["sfm-adc"] * 3 + ["sfm-volumetric-0.001"]
+    assert [place.split("/")[0] for place in places[:4]] == ["sfm-adc"] * 3 + [
+        "sfm-volumetric-0.001"
+    ]
     assert "volume_threshold" not in trials[0].values["densify"]
     for trial in (trials[0], trials[-1]):
         assert compose_one(trial.overrides).values == trial.values  # as `retry` composes it
@@ -61,8 +69,12 @@ def test_thresholds_beside_a_baseline_that_knows_none() -> None:
 def test_the_command_line_speaks_to_every_grid_that_knows_the_setting() -> None:
     own = arms("+experiment=threshold", "densify.volume_threshold=0.5,0.7", "seed=4")
     assert own == [("adc", 4), ("volumetric-0.5", 4), ("volumetric-0.7", 4)]
-    trials = compose_trials(["+experiment=threshold", "seed=4", "densify.max_gaussians=5000", "train.iterations=7"])
-    assert {(t.values["densify"]["max_gaussians"], t.values["train"]["iterations"]) for t in trials} == {(5000, 7)}
+    trials = compose_trials(
+        ["+experiment=threshold", "seed=4", "densify.max_gaussians=5000", "train.iterations=7"]
+    )
+    assert {
+        (t.values["densify"]["max_gaussians"], t.values["train"]["iterations"]) for t in trials
+    } == {(5000, 7)}
     with pytest.raises(InputError, match=r"densify\.volume_threshold is not a setting"):
         arms("+experiment=threshold", "densify=mcmc")
 
@@ -72,8 +84,16 @@ def test_grids_in_a_users_own_experiment(tmp_path: Path) -> None:
     file = tmp_path / "own" / "experiment" / "mine.yaml"
     search = f"hydra.searchpath=[file://{tmp_path}/own]"
     head = "# @package _global_\nname: mine\nhydra:\n  mode: MULTIRUN\n  sweeper:\n    grids: "
-    file.write_text(head + '[{densify: adc, seed: "0,1"}, {densify: none, train.iterations: 0}, {eval.flip: false}]\n')
-    assert arms(search, "+experiment=mine") == [("adc", 0), ("adc", 1), ("none", 0), ("volumetric", 0)]
+    file.write_text(
+        head
+        + '[{densify: adc, seed: "0,1"}, {densify: none, train.iterations: 0}, {eval.flip: false}]\n'
+    )
+    assert arms(search, "+experiment=mine") == [
+        ("adc", 0),
+        ("adc", 1),
+        ("none", 0),
+        ("volumetric", 0),
+    ]
     for wrong in ("[densify]", "[{}]", "[{seed: [0, 1]}]"):
         file.write_text(f"{head}{wrong}\n")
         with pytest.raises(InputError, match=r"^hydra\.sweeper\.grids"):
@@ -85,12 +105,17 @@ def test_grids_in_a_users_own_experiment(tmp_path: Path) -> None:
     [
         (["+experiment=demo,threshold"], "two experiments are two sweeps"),
         (["+experiment=demo", "+experiment=threshold"], "two experiments are two sweeps"),
-        (["+experiment=threshold", "hydra/sweeper=basic"], "gsbench's own sweeper alone joins grids"),
+        (
+            ["+experiment=threshold", "hydra/sweeper=basic"],
+            "gsbench's own sweeper alone joins grids",
+        ),
         (["hydra.sweeper.grids=[{seed: 1}]"], "add -m"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else None,
 )
-def test_what_cannot_be_is_refused_in_a_line(words: list[str], text: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_cannot_be_is_refused_in_a_line(
+    words: list[str], text: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert cli.run(["-m", *words] if len(words) < 2 and "grids" not in words[0] else words) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert text in line

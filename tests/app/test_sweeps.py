@@ -1,4 +1,5 @@
-"""A sweep in planned looks: which trials each look launches, when it stops, and that a stopped one goes on."""
+"""A sweep in planned looks: which trials each look launches, when it stops, and that a stopped one
+goes on."""
 
 from __future__ import annotations
 
@@ -22,15 +23,24 @@ from gsbench.runs.trial_record import record_from
 from tests.analysis.synthetic import Plan, trial_data, write_trial
 from tests.launch.test_declare import TINY
 
-BASE = ["-m", *(word for word in TINY if word != "densify=none"), "name=stop", "launch.stop_when_decided=true"]
+BASE = [
+    "-m",
+    *(word for word in TINY if word != "densify=none"),
+    "name=stop",
+    "launch.stop_when_decided=true",
+]
 SWEEP = [*BASE, "densify=adc,volumetric", "seed=0,1,2,3", "eval.primary=psnr"]
 
 
 class Fake:
-    """Made-up results in the place of trained ones: ``psnr`` of an arm on a seed; ``stops_at`` raises there."""
+    """Made-up results in the place of trained ones: ``psnr`` of an arm on a seed; ``stops_at``
+    raises there."""
 
     def __init__(
-        self, psnr: Callable[[str, int], float], fails: int | None = None, stops_at: int | None = None
+        self,
+        psnr: Callable[[str, int], float],
+        fails: int | None = None,
+        stops_at: int | None = None,
     ) -> None:
         self.psnr, self.fails, self.stops_at = psnr, fails, stops_at
         self.batches: list[list[tuple[str, int]]] = []
@@ -55,7 +65,9 @@ class Fake:
                 data = trial_data(Plan(experiment="stop"), "courtyard", "random", arm, seed, views)
                 write_trial(trial.files.runs, data, views, trial.folder.name.partition("-")[0])
                 (trial.folder / CONFIG).write_text(trial.yaml)
-            outcomes.append(outcome_of_results(trial.folder, record_from(results.read_bytes(), results)))
+            outcomes.append(
+                outcome_of_results(trial.folder, record_from(results.read_bytes(), results))
+            )
         return outcomes
 
 
@@ -108,7 +120,9 @@ def verdicts_of(runs: Path) -> list[Verdict]:
     return judge(read_experiment(runs / "stop").trials, read_declarations(runs / "stop")[-1])
 
 
-def test_noise_gets_all_seeds_and_each_trial_is_launched_once(sweep: Callable[..., int], runs: Path) -> None:
+def test_noise_gets_all_seeds_and_each_trial_is_launched_once(
+    sweep: Callable[..., int], runs: Path
+) -> None:
     fake = Fake(noise)
     assert sweep(fake) == 0
     assert [len(batch) for batch in fake.batches] == [4, 2, 2]
@@ -127,7 +141,10 @@ def test_seeds_of_planned_looks_are_declared_at_once_and_cost_the_metric_nothing
     assert found is not None
     assert (found.beforehand, found.added) == (True, ())
     missing = 0 if psnr is noise else 4
-    assert any(f"{missing} of the 8 declared trials are missing" in line for line in found.sentences("PSNR"))
+    assert any(
+        f"{missing} of the 8 declared trials are missing" in line
+        for line in found.sentences("PSNR")
+    )
     assert any("Seeds come in planned looks" in line for line in found.sentences("PSNR"))
 
 
@@ -143,17 +160,22 @@ def test_a_decided_pair_gets_no_seeds_and_the_pairs_share_the_error_rate(
     assert "2 of 12 trials were not needed" in caplog.text
 
 
-def test_stopped_at_any_trial_it_goes_on_with_the_same_plan(sweep: Callable[..., int], runs: Path) -> None:
+def test_stopped_at_any_trial_it_goes_on_with_the_same_plan(
+    sweep: Callable[..., int], runs: Path
+) -> None:
     assert sweep(Fake(noise, stops_at=2)) == cli.INTERRUPTED
     (plan,) = read_declarations(runs / "stop")
     fake = Fake(noise)
     assert sweep(fake) == 0
-    assert [len(batch) for batch in fake.batches] == [4, 2, 2]  # what is done is handed over, and skipped there
+    # what is done is handed over, and skipped there
+    assert [len(batch) for batch in fake.batches] == [4, 2, 2]
     assert read_declarations(runs / "stop") == [plan]
     assert not any(verdict.late for verdict in verdicts_of(runs))
 
 
-def test_a_failed_seed_ends_the_looks_and_its_return_decides(sweep: Callable[..., int], runs: Path) -> None:
+def test_a_failed_seed_ends_the_looks_and_its_return_decides(
+    sweep: Callable[..., int], runs: Path
+) -> None:
     assert sweep(Fake(clear, fails=1)) == 1
     (verdict,) = verdicts_of(runs)
     assert not verdict.final
@@ -163,10 +185,14 @@ def test_a_failed_seed_ends_the_looks_and_its_return_decides(sweep: Callable[...
 
 
 @pytest.mark.slow
-def test_more_seeds_after_looking_are_another_plan_and_lose_the_place(sweep: Callable[..., int], runs: Path) -> None:
+def test_more_seeds_after_looking_are_another_plan_and_lose_the_place(
+    sweep: Callable[..., int], runs: Path
+) -> None:
     assert sweep(Fake(noise)) == 0
     for file in (runs / "stop").glob("*/*/*/results.json"):  # measured long before the second plan
-        file.write_text(file.read_text().replace('"raster"', '"measured": "2020-01-01T00:00:00Z", "raster"'))
+        file.write_text(
+            file.read_text().replace('"raster"', '"measured": "2020-01-01T00:00:00Z", "raster"')
+        )
     assert sweep(Fake(noise), "seed=0,1,2,3,4,5") == 0
     assert len(read_declarations(runs / "stop")) == 2
     (verdict,) = verdicts_of(runs)
@@ -186,10 +212,21 @@ def test_settings_make_arms_and_the_report_opens_with_the_looks(
 ) -> None:
     """Arms that differ in a setting alone are told apart as in the report."""
     fake = Fake(clear)
-    assert sweep(fake, "densify=adc,volumetric", "densify.max_gaussians=1000,2000", "launch.least_difference=0.5") == 0
+    assert (
+        sweep(
+            fake,
+            "densify=adc,volumetric",
+            "densify.max_gaussians=1000,2000",
+            "launch.least_difference=0.5",
+        )
+        == 0
+    )
     verdicts = verdicts_of(runs)
-    assert [(str(v.question.baseline), str(v.question.arm), v.question.least) for v in verdicts] == [
-        (f"random-adc max_gaussians={count}", f"random-volumetric max_gaussians={count}", 0.5) for count in (1000, 2000)
+    assert [
+        (str(v.question.baseline), str(v.question.arm), v.question.least) for v in verdicts
+    ] == [
+        (f"random-adc max_gaussians={count}", f"random-volumetric max_gaussians={count}", 0.5)
+        for count in (1000, 2000)
     ]
     assert cli.run(["report", "stop"]) == 0
     text = (runs / "stop" / "report.html").read_text()
@@ -214,11 +251,17 @@ def test_settings_make_arms_and_the_report_opens_with_the_looks(
     ids=lambda value: " ".join(value) if isinstance(value, list) else None,
 )
 def test_what_cannot_be_looked_at_is_refused_before_any_trial(
-    sweep: Callable[..., int], runs: Path, words: list[str], message: str, capsys: pytest.CaptureFixture[str]
+    sweep: Callable[..., int],
+    runs: Path,
+    words: list[str],
+    message: str,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     fake = Fake(clear)
     assert sweep(fake, *words) == 2
-    (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("gsbench: ")]
+    (line,) = [
+        line for line in capsys.readouterr().err.splitlines() if line.startswith("gsbench: ")
+    ]
     assert message in line
     assert not fake.batches
     assert not runs.exists()
@@ -229,7 +272,9 @@ def test_one_trial_is_no_sweep(runs: Path, capsys: pytest.CaptureFixture[str]) -
     assert "adds seeds to a sweep" in capsys.readouterr().err
 
 
-def test_a_dry_run_says_when_it_looks_and_writes_nothing(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_dry_run_says_when_it_looks_and_writes_nothing(
+    runs: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert cli.run([*SWEEP, "--dry-run"]) == 0
     assert "looks at 2, 3, 4 seeds, 4 trials until the first, 8 at most" in capsys.readouterr().out
     assert not runs.exists()

@@ -1,4 +1,5 @@
-"""Tuning parity with trials that take no time: what is declared, searched and chosen, and that nobody is favoured."""
+"""Tuning parity with trials that take no time: what is declared, searched and chosen, and that
+nobody is favoured."""
 
 from __future__ import annotations
 
@@ -49,15 +50,21 @@ hydra:
         densify.stop: tag(int, interval(300, 500))
     tune: {points: 4}
 """
-WORDS = [*(word for word in TINY if not word.startswith(("densify=", "seed=", "name="))), "+experiment=fair"]
+WORDS = [
+    *(word for word in TINY if not word.startswith(("densify=", "seed=", "name="))),
+    "+experiment=fair",
+]
 KEYS = {"adc": "gradient_threshold", "volumetric": "volume_threshold"}
 BEST = {"adc": 3e-4, "volumetric": 0.01}
 
 
 class Fake:
-    """Made-up results in the place of trained ones, best at `BEST`; ``stops`` and ``fails`` are numbers of trials."""
+    """Made-up results in the place of trained ones, best at `BEST`; ``stops`` and ``fails`` are
+    numbers of trials."""
 
-    def __init__(self, stops: int | None = None, fails: Sequence[int] = (), own_metric: bool = False) -> None:
+    def __init__(
+        self, stops: int | None = None, fails: Sequence[int] = (), own_metric: bool = False
+    ) -> None:
         self.stops, self.fails, self.own_metric = stops, fails, own_metric
         self.trained: list[Trial] = []
         self.batches: list[int] = []
@@ -81,13 +88,17 @@ class Fake:
             views = {"psnr": 26.0 - error + 0.01 * values["seed"] + np.arange(3.0)}
             if self.own_metric:
                 views["mine"] = views["psnr"]
-            data = trial_data(Plan(experiment=values["name"]), "courtyard", "random", arm, values["seed"], views)
+            data = trial_data(
+                Plan(experiment=values["name"]), "courtyard", "random", arm, values["seed"], views
+            )
             write_trial(trial.files.runs, data, views, trial.folder.name.partition("-")[0])
             (trial.folder / CONFIG).write_text(trial.yaml)
         return outcome_of_results(trial.folder, record_from(results.read_bytes(), results))
 
     def tuning(self, arm: str) -> list[Trial]:
-        return [trial for trial in self.trained if trial.values["name"] == f"fair-tune-random-{arm}"]
+        return [
+            trial for trial in self.trained if trial.values["name"] == f"fair-tune-random-{arm}"
+        ]
 
     def judged(self) -> list[Trial]:
         return [trial for trial in self.trained if trial.values["name"] == "fair"]
@@ -130,7 +141,8 @@ def test_each_arm_gets_the_same_points_on_validation_views_and_the_sweep_gets_th
 ) -> None:
     fake = Fake()
     assert sweep(fake) == 0
-    assert fake.batches == [2, 2, 2, 2, 4]  # a point of both arms at a time, then the sweep as a whole
+    # a point of both arms at a time, then the sweep as a whole
+    assert fake.batches == [2, 2, 2, 2, 4]
     for arm in ("adc", "volumetric"):
         values = [trial.values for trial in fake.tuning(arm)]
         assert len(values) == 4
@@ -144,7 +156,8 @@ def test_each_arm_gets_the_same_points_on_validation_views_and_the_sweep_gets_th
         assert {one["densify"][KEYS[arm]] for one in own} == {closest}
         assert not any(one["scene"]["validation"] for one in own)
     assert all(isinstance(one.values["densify"]["stop"], int) for one in fake.tuning("volumetric"))
-    assert fake.tuning("adc")[0].values["densify"]["gradient_threshold"] == 0.0002  # the arm as it is comes first
+    # the arm as it is comes first
+    assert fake.tuning("adc")[0].values["densify"]["gradient_threshold"] == 0.0002
 
 
 @pytest.mark.parametrize("stops", [3, 9])  # in the search, and in the sweep
@@ -169,10 +182,16 @@ def test_killed_anywhere_it_goes_on_and_chooses_the_same(
 
 @pytest.mark.parametrize(
     "strange",
-    [{"tracking.uri": "http://theirs"}, {"densify.volume_threshold": 7.0}, {"densify.stop": "${oc.env:HOME}"}],
+    [
+        {"tracking.uri": "http://theirs"},
+        {"densify.volume_threshold": 7.0},
+        {"densify.stop": "${oc.env:HOME}"},
+    ],
 )
 @pytest.mark.slow
-def test_no_record_sets_what_was_not_searched(strange: dict[str, Any], sweep: Sweep, runs: Path) -> None:
+def test_no_record_sets_what_was_not_searched(
+    strange: dict[str, Any], sweep: Sweep, runs: Path
+) -> None:
     assert sweep(Fake()) == 0
     file = runs / "fair-tune-random-volumetric" / "tuning.json"
     record = json.loads(file.read_text())
@@ -186,7 +205,9 @@ def test_no_record_sets_what_was_not_searched(strange: dict[str, Any], sweep: Sw
 
 
 @pytest.mark.slow
-def test_seeds_may_be_added_to_a_tuned_sweep_and_it_may_stop_when_decided(sweep: Sweep, runs: Path) -> None:
+def test_seeds_may_be_added_to_a_tuned_sweep_and_it_may_stop_when_decided(
+    sweep: Sweep, runs: Path
+) -> None:
     assert sweep(Fake(), "launch.stop_when_decided=true", "seed=0,1,2") == 0
     more = Fake()
     assert sweep(more, "launch.stop_when_decided=true", "seed=0,1,2") == 0
@@ -198,12 +219,19 @@ def test_seeds_may_be_added_to_a_tuned_sweep_and_it_may_stop_when_decided(sweep:
 @pytest.mark.slow
 def test_a_point_is_judged_on_all_scenes_and_seeds_of_the_tuning(sweep: Sweep, runs: Path) -> None:
     fake = Fake()
-    words = ["scene.sector=0,1", "scene.split=sector", "hydra.sweeper.tune.seed='7,8'", "hydra.sweeper.tune.points=2"]
+    words = [
+        "scene.sector=0,1",
+        "scene.split=sector",
+        "hydra.sweeper.tune.seed='7,8'",
+        "hydra.sweeper.tune.points=2",
+    ]
     assert sweep(fake, *words) == 0
     assert [(one.values["scene"]["sector"], one.values["seed"]) for one in fake.tuning("adc")] == [
         (sector, seed) for _ in range(2) for sector in (0, 1) for seed in (7, 8)
     ]
-    assert tuning(runs, "adc").points[0].value == pytest.approx(26 - np.log(1.5) + 0.075 + 1, abs=1e-4)
+    assert tuning(runs, "adc").points[0].value == pytest.approx(
+        26 - np.log(1.5) + 0.075 + 1, abs=1e-4
+    )
 
 
 @pytest.mark.slow
@@ -211,14 +239,23 @@ def test_points_that_fail_are_part_of_the_budget_and_an_arm_without_any_ends_the
     sweep: Sweep, runs: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert sweep(Fake(fails=[0])) == 1
-    assert [point.value is None for point in tuning(runs, "adc").points] == [True, False, False, False]
+    assert [point.value is None for point in tuning(runs, "adc").points] == [
+        True,
+        False,
+        False,
+        False,
+    ]
     mended = Fake()
     assert sweep(mended) == 0
-    assert mended.tuning("adc")[0].values["densify"]["gradient_threshold"] == 0.0002  # it is tried again
+    # it is tried again
+    assert mended.tuning("adc")[0].values["densify"]["gradient_threshold"] == 0.0002
     assert all(point.value is not None for point in tuning(runs, "adc").points)
     capsys.readouterr()
     assert sweep(Fake(fails=[0, 2, 4, 6]), "name=none") == 1
-    assert "no point of random-adc has a psnr (gsbench status none-tune-random-adc says why)" in capsys.readouterr().err
+    assert (
+        "no point of random-adc has a psnr (gsbench status none-tune-random-adc says why)"
+        in capsys.readouterr().err
+    )
 
 
 def test_a_typed_value_takes_the_place_of_an_interval(sweep: Sweep, runs: Path) -> None:
@@ -241,7 +278,10 @@ def test_a_dry_run_says_what_will_be_tuned_and_trains_nothing(
     look = ["--dry-run"]
     assert sweep(Fake(), *look) == 0
     said = capsys.readouterr().out
-    assert "tunes first: 4 points each for random-adc and random-volumetric, by psnr of validation views" in said
+    assert (
+        "tunes first: 4 points each for random-adc and random-volumetric, by psnr of validation "
+        "views" in said
+    )
     assert "8 trainings" in said
     assert "with the values found, which are not known yet" in said
     assert not runs.exists()
@@ -251,8 +291,18 @@ def test_an_interval_searches_one_arm(runs: Path, monkeypatch: pytest.MonkeyPatc
     """A search is the tuning of one arm: its best is trained with the seeds of the command."""
     fake = Fake()
     monkeypatch.setattr("gsbench.app.command.run_batch", fake)
-    words = ["-m", *WORDS[:-1], "densify=volumetric", "name=fair", "seed=0,1", "hydra.sweeper.tune.at_once=2"]
-    searched = ["densify.volume_threshold=tag(log, interval(1e-3, 1e-1))", "hydra.sweeper.tune.points=3"]
+    words = [
+        "-m",
+        *WORDS[:-1],
+        "densify=volumetric",
+        "name=fair",
+        "seed=0,1",
+        "hydra.sweeper.tune.at_once=2",
+    ]
+    searched = [
+        "densify.volume_threshold=tag(log, interval(1e-3, 1e-1))",
+        "hydra.sweeper.tune.points=3",
+    ]
     assert cli.run([*words, *searched]) == 0
     assert fake.batches == [2, 1, 2]
     part = search_summary(runs / "fair-tune-random-volumetric")
@@ -269,8 +319,14 @@ def test_a_metric_of_ones_own_is_made_best_in_the_direction_of_its_class(
     sweep: Sweep, runs: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sys, "path", list(sys.path))
-    Path("own.py").write_text("class Mine:\n    direction = -1\n    def measure(self, *given): ...\n")
-    words = ["hydra.sweeper.tune.metric=mine", "eval.extra.mine._target_=own.Mine", "allow_targets=[own]"]
+    Path("own.py").write_text(
+        "class Mine:\n    direction = -1\n    def measure(self, *given): ...\n"
+    )
+    words = [
+        "hydra.sweeper.tune.metric=mine",
+        "eval.extra.mine._target_=own.Mine",
+        "allow_targets=[own]",
+    ]
     assert sweep(Fake(own_metric=True), *words, "hydra.sweeper.tune.points=2") == 0
     search = tuning(runs, "adc")
     assert search.direction == -1
@@ -291,7 +347,10 @@ def test_the_sheet_says_budget_views_points_and_what_was_chosen(sweep: Sweep, ru
     assert sweep(Fake()) == 0
     adc, volumetric = notes(runs)
     best = chosen(runs, "volumetric")
-    assert "random-volumetric: " + " and ".join(f"{key}={best[key]}" for key in sorted(best)) in volumetric
+    assert (
+        "random-volumetric: " + " and ".join(f"{key}={best[key]}" for key in sorted(best))
+        in volumetric
+    )
     assert (
         "the best of 4 points by psnr of validation views (courtyard; seed 100; the search "
         "fair-tune-random-volumetric), before any of these trials. Tried: " in volumetric
@@ -303,24 +362,37 @@ def test_the_sheet_says_budget_views_points_and_what_was_chosen(sweep: Sweep, ru
 
 
 UNEVEN = FILE.replace("        densify.gradient_threshold: tag(log, interval(1e-4, 4e-4))\n", "")
-SENTENCE = "They were not tuned alike: random-adc none and random-volumetric 4 points of 1 seed on validation views."
+SENTENCE = (
+    "They were not tuned alike: random-adc none and random-volumetric 4 points of 1 seed "
+    "on validation views."
+)
 
 
 @pytest.mark.slow
-def test_an_arm_that_was_tuned_more_is_said_in_headline_and_tables(sweep: Sweep, runs: Path) -> None:
+def test_an_arm_that_was_tuned_more_is_said_in_headline_and_tables(
+    sweep: Sweep, runs: Path
+) -> None:
     assert sweep(Fake(), file=UNEVEN) == 0
     lines = notes(runs)
     assert f"Tuning. {SENTENCE}" in lines
     page = build_report(load_experiment(runs, "fair"))
-    assert page.index("<strong>random-volumetric against") < page.index(SENTENCE) < page.index("<summary>Fairness")
+    assert (
+        page.index("<strong>random-volumetric against")
+        < page.index(SENTENCE)
+        < page.index("<summary>Fairness")
+    )
     assert any(SENTENCE in note for note in build_table(load_experiment(runs, "fair")).notes)
 
 
 @pytest.mark.slow
-def test_trials_from_before_the_tuning_and_with_other_values_are_named(sweep: Sweep, runs: Path) -> None:
+def test_trials_from_before_the_tuning_and_with_other_values_are_named(
+    sweep: Sweep, runs: Path
+) -> None:
     assert sweep(Fake()) == 0
     for file in (runs / "fair").glob("*/random-volumetric/*/results.json"):
-        file.write_text(file.read_text().replace('"raster"', '"measured": "2020-01-01T00:00:00Z", "raster"'))
+        file.write_text(
+            file.read_text().replace('"raster"', '"measured": "2020-01-01T00:00:00Z", "raster"')
+        )
     (line,) = [note for note in notes(runs) if "random-volumetric: " in note]
     assert "when 2 of these 2 trials had been measured" in line
     file = runs / "fair-tune-random-volumetric" / "tuning.json"
@@ -330,7 +402,10 @@ def test_trials_from_before_the_tuning_and_with_other_values_are_named(sweep: Sw
     file.write_text(json.dumps(record))
     lines = notes(runs)
     assert any("These trials have other values." in line for line in lines)
-    assert any("random-adc 4 points of 1 seed on validation views and random-volumetric none" in line for line in lines)
+    assert any(
+        "random-adc 4 points of 1 seed on validation views and random-volumetric none" in line
+        for line in lines
+    )
     file.write_text("{")
     assert notes(runs)  # a record that is damaged takes nothing else with it
 
@@ -348,7 +423,8 @@ MISTAKES = [
     (FILE, "launch.wait=false", "launch.wait must be true"),
     (FILE, "hydra/sweeper=basic", "gsbench's own sweeper alone"),
     (
-        f"{FILE[: FILE.index('    tune')]}      - {{densify: adc, densify.gradient_threshold: 0.1}}\n",
+        f"{FILE[: FILE.index('    tune')]}      - "
+        f"{{densify: adc, densify.gradient_threshold: 0.1}}\n",
         "",
         "leave one of",
     ),
@@ -374,7 +450,9 @@ def test_mistakes_are_one_line_before_any_work(
 
 def test_hydra_shows_the_defaults_of_the_class() -> None:
     defaults = {
-        field.name: field.default if field.default_factory is dataclasses.MISSING else field.default_factory()
+        field.name: field.default
+        if field.default_factory is dataclasses.MISSING
+        else field.default_factory()
         for field in dataclasses.fields(TuneSettings)
     }
     assert defaults == TUNE

@@ -1,4 +1,5 @@
-"""For those who work on speed: the time of a step by kernel, and how often it makes the host wait for a GPU."""
+"""For those who work on speed: the time of a step by kernel, and how often it makes the host wait
+for a GPU."""
 
 from __future__ import annotations
 
@@ -38,13 +39,17 @@ MAKING = "lift_fresh"  # a tensor of Python numbers: an upload where it is for a
 
 @contextmanager
 def timed_kernels() -> Iterator[Counter[str]]:
-    """Processor time, ms, by compiled kernel of gsbench on the CPU within the block, of all threads together.
+    """Processor time, ms, by compiled kernel of gsbench on the CPU within the block, of all threads
+    together.
 
-    Every kernel that a module of gsbench has a name for is replaced by one that is timed, until the block ends.
+    Every kernel that a module of gsbench has a name for is replaced by one that is timed, until the
+    block ends.
     """
     times: Counter[str] = Counter()
     replaced: list[tuple[dict[str, Any], str, Any]] = []
-    for module, contents in [(name, vars(found)) for name, found in sys.modules.items() if found is not None]:
+    for module, contents in [
+        (name, vars(found)) for name, found in sys.modules.items() if found is not None
+    ]:
         if not module.startswith(OWN_CODE):
             continue
         for name, value in list(contents.items()):
@@ -73,9 +78,10 @@ def _timed_call(kernel: Any, times: Counter[str]) -> Callable[..., Any]:
 def counting_waits(pretend: bool = False) -> Iterator[Counter[str]]:
     """Count, by operation, what would make the host wait for a CUDA device within the block.
 
-    That is reading a value, a size that depends on values (``nonzero``, an index that is a mask), a copy between device
-    and host that is not asynchronous, and a `Readback` that has not arrived when it is asked for. With ``pretend``
-    every tensor on the CPU counts as one on a device: what is made of Python numbers would be an upload.
+    That is reading a value, a size that depends on values (``nonzero``, an index that is a mask), a
+    copy between device and host that is not asynchronous, and a `Readback` that has not arrived
+    when it is asked for. With ``pretend`` every tensor on the CPU counts as one on a device: what
+    is made of Python numbers would be an upload.
     """
     counts: Counter[str] = Counter()
     before = Readback.waits
@@ -91,15 +97,24 @@ class _CountingMode(TorchDispatchMode):
         self._counts = counts
         self._pretend = pretend
 
-    def __torch_dispatch__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+    def __torch_dispatch__(
+        self, function: Any, types: Any, args: Any = (), kwargs: Any = None
+    ) -> Any:
         kwargs = kwargs or {}
         name = function.overloadpacket.__name__
         result = function(*args, **kwargs)
         if (
-            (name in WAITING and not (name == "repeat_interleave" and kwargs.get("output_size") is not None))
+            (
+                name in WAITING
+                and not (name == "repeat_interleave" and kwargs.get("output_size") is not None)
+            )
             or (name in INDEXING and any(_is_mask(index) for index in args[1]))
             or (name == MAKING and (self._pretend or result.device.type == "cuda"))
-            or (name in COPYING and _crosses(args, result) and not _is_asynchronous(name, args, kwargs))
+            or (
+                name in COPYING
+                and _crosses(args, result)
+                and not _is_asynchronous(name, args, kwargs)
+            )
         ):
             self._counts[name] += 1
         return result

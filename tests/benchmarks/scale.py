@@ -1,9 +1,10 @@
-"""An experiment of thousands of finished trials, made by copying, and how long verbs take to read it.
+"""An experiment of thousands of finished trials, made by copying, and how long verbs take to read
+it.
 
     python -m tests.benchmarks.scale FOLDER [SCENES ARMS SEEDS]
 
-prints a line for each verb, and one for the dry run of a sweep of as many further trials: its name, CPU seconds and
-wall seconds of the whole command.
+prints a line for each verb, and one for the dry run of a sweep of as many further trials: its name,
+CPU seconds and wall seconds of the whole command.
 """
 
 from __future__ import annotations
@@ -29,17 +30,30 @@ DENSIFIERS = "adc absgrad absgs edgeaware longaxis mcmc pixelgs revised taming v
 
 def values_of(runs: Path, scene: int, arm: int, seed: int) -> dict[str, Any]:
     """Settings as many as a trial's; every second arm is a variant of the one before."""
-    groups = {group: {f"setting_{k}": k / 7 for k in range(20)} for group in ("scene", "init", "train", "eval")}
+    groups = {
+        group: {f"setting_{k}": k / 7 for k in range(20)}
+        for group in ("scene", "init", "train", "eval")
+    }
     densify = {f"setting_{k}": k / 7 for k in range(20)} | {
         "name": "adc" if arm < 2 else f"arm{arm // 2}",
         "volume_threshold": 0.03 if arm % 2 else 0.3,
     }
-    names: dict[str, Any] = {"name": NAME, "seed": seed, "runs": str(runs), "tracking": {"name": "none"}, "launch": {}}
-    return names | groups | {
-        "scene": groups["scene"] | {"name": f"scene{scene:02d}"},
-        "init": groups["init"] | {"name": "sfm"},
-        "densify": densify,
-    }  # fmt: skip
+    names: dict[str, Any] = {
+        "name": NAME,
+        "seed": seed,
+        "runs": str(runs),
+        "tracking": {"name": "none"},
+        "launch": {},
+    }
+    return (
+        names
+        | groups
+        | {
+            "scene": groups["scene"] | {"name": f"scene{scene:02d}"},
+            "init": groups["init"] | {"name": "sfm"},
+            "densify": densify,
+        }
+    )
 
 
 def write_trial(values: dict[str, Any], psnr: float) -> None:
@@ -49,11 +63,19 @@ def write_trial(values: dict[str, Any], psnr: float) -> None:
     views = [psnr + k / 10 for k in range(-3, 4)]
     per_view = "view,psnr\n" + "".join(f"v{k},{value!r}\n" for k, value in enumerate(views))
     steps = range(100, 2001, 100)
-    curve = "".join(json.dumps({"step": k, "loss": 1 / k, "num_gaussians": k, "seconds": k / 10}) + "\n" for k in steps)
+    curve = "".join(
+        json.dumps({"step": k, "loss": 1 / k, "num_gaussians": k, "seconds": k / 10}) + "\n"
+        for k in steps
+    )
     record = record_of(
         values,
         metrics={"psnr": sum(views) / len(views)},
-        hashes={"config": config_hash(values), "data": values["scene"]["name"], "init": "i", "cloud": "c"},
+        hashes={
+            "config": config_hash(values),
+            "data": values["scene"]["name"],
+            "init": "i",
+            "cloud": "c",
+        },
         resolution=(400, 300),
         init_report={f"number_{k}": k / 3 for k in range(40)},
         machine={"cpu": "c", "architecture": "a", "kernels": "k", "torch": "t", "device": "cpu"},
@@ -63,11 +85,17 @@ def write_trial(values: dict[str, Any], psnr: float) -> None:
     made_of = {
         "config": config_hash(values),
         "results": sha256_of(record.to_json()),
-        "digests": {name: hashlib.sha256(content.encode()).hexdigest() for name, content in files.items()},
-        "stages": {}, "pycolmap": None, "sources": {}, "folders": {}, "entries": {},
+        "digests": {
+            name: hashlib.sha256(content.encode()).hexdigest() for name, content in files.items()
+        },
+        "stages": {},
+        "pycolmap": None,
+        "sources": {},
+        "folders": {},
+        "entries": {},
         "published": published,
         "settings": values,
-    }  # fmt: skip
+    }
     results = json.dumps(record.to_json() | {"made_of": made_of}, indent=1)
     for name, content in (files | {"results.json": results}).items():
         (folder / name).write_text(content)
@@ -78,7 +106,10 @@ def write_all(runs: Path, scenes: int, arms: int, seeds: int) -> int:
     for scene in range(scenes):
         for arm in range(arms):
             for seed in range(seeds):
-                write_trial(values_of(runs, scene, arm, seed), 25 + scene / 10 + arm / 20 + (seed * 7 % 5) / 30)
+                write_trial(
+                    values_of(runs, scene, arm, seed),
+                    25 + scene / 10 + arm / 20 + (seed * 7 % 5) / 30,
+                )
     return scenes * arms * seeds
 
 
@@ -115,6 +146,9 @@ if __name__ == "__main__":
     shape = tuple(map(int, sys.argv[2:5])) or (50, 20, 10)
     if not (place / NAME).exists():
         write_all(place, *shape)
-    for name, argv in [*((words[0], words) for words in VERBS), ("dry run", dry_run(place, *shape))]:
+    for name, argv in [
+        *((words[0], words) for words in VERBS),
+        ("dry run", dry_run(place, *shape)),
+    ]:
         cpu, wall = timed(place, argv)
         print(f"{name:<8} {cpu:6.1f} s CPU {wall:6.1f} s", flush=True)

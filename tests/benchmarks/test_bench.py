@@ -36,20 +36,28 @@ KEYS = {"raster", "size", "count", "forward_ms", "backward_ms", "step_ms", "peak
 
 
 def test_rows() -> None:
-    rows = run_bench(["cpu", "reference"], [(40, 30), (33, 17)], [50, 100], repeats=2, threads=1, memory=False)
+    rows = run_bench(
+        ["cpu", "reference"], [(40, 30), (33, 17)], [50, 100], repeats=2, threads=1, memory=False
+    )
     assert [(row["size"], row["count"], row["raster"]) for row in rows] == [
-        (size, count, raster) for size in ("40x30", "33x17") for count in (50, 100) for raster in ("cpu", "reference")
+        (size, count, raster)
+        for size in ("40x30", "33x17")
+        for count in (50, 100)
+        for raster in ("cpu", "reference")
     ]
     for row in rows:
         assert row.keys() >= KEYS
         parts = row["forward_ms"] + row["loss_ms"] + row["backward_ms"] + row["adam_ms"]
         assert min(row["forward_ms"], row["backward_ms"], row["adam_ms"]) > 0
-        assert row["step_ms"] == pytest.approx(parts, abs=0.01)  # the median of two steps is their mean
+        # the median of two steps is their mean
+        assert row["step_ms"] == pytest.approx(parts, abs=0.01)
         assert row["peak_memory_mb"] is None
 
 
 def test_turns_are_compared_with_the_first_and_whole_steps_are_made() -> None:
-    first, second = run_bench(["cpu", "reference"], [(40, 30)], [50], repeats=3, memory=False, scene="random")
+    first, second = run_bench(
+        ["cpu", "reference"], [(40, 30)], [50], repeats=3, memory=False, scene="random"
+    )
     assert first["step_ratio"] == 1
     assert second["step_ratio"] > 1  # the reference is meant to be read
     assert (first["scene"], first["device"]) == ("random", "cpu")
@@ -66,7 +74,8 @@ def test_kernels_of_a_step_and_waits() -> None:
 
 
 def test_times_on_a_gpu_are_of_kernels_alone() -> None:
-    """Events as torch's profiler gives them: an operator's launch counts neither as a kernel nor as a wait."""
+    """Events as torch's profiler gives them: an operator's launch counts neither as a kernel nor as
+    a wait."""
 
     def event(key: str, kind: DeviceType, count: int, cpu: float, gpu: float) -> FunctionEventAvg:
         average = FunctionEventAvg()
@@ -74,7 +83,10 @@ def test_times_on_a_gpu_are_of_kernels_alone() -> None:
         average.self_cpu_time_total, average.self_device_time_total = cpu, gpu
         return average
 
-    kernels = [event(f"kernel{k}", DeviceType.CUDA, 10, 0.0, 1e3 * (k + 1)) for k in range(LONGEST_KERNELS + 2)]
+    kernels = [
+        event(f"kernel{k}", DeviceType.CUDA, 10, 0.0, 1e3 * (k + 1))
+        for k in range(LONGEST_KERNELS + 2)
+    ]
     others = [event("aten::sort", DeviceType.CPU, 10, 7e4, 5e4)]
     waits = [event("cudaStreamSynchronize", DeviceType.CPU, 15, 2e4, 0.0)]
     found = per_step([*kernels, *others, *waits], 10, torch.device("cuda"))
@@ -82,19 +94,26 @@ def test_times_on_a_gpu_are_of_kernels_alone() -> None:
     assert list(found["kernels_ms"])[:2] == ["kernel13", "kernel12"]
     assert found["kernels_ms"]["all others"] == pytest.approx(0.1 + 0.2)
     assert sum(found["kernels_ms"].values()) == pytest.approx(sum(range(1, 15)) / 10)
-    assert (found["waits"], found["waits_ms"]) == ({"cudaStreamSynchronize": 1.5}, {"cudaStreamSynchronize": 2.0})
+    assert (found["waits"], found["waits_ms"]) == (
+        {"cudaStreamSynchronize": 1.5},
+        {"cudaStreamSynchronize": 2.0},
+    )
 
 
 def test_whole_steps_leave_the_scene_as_it_is() -> None:
     stepper = Stepper("cpu", Setting("trained", 40, 30, 50, threads=1))
-    before = [tensor.detach().clone() for tensor in stepper.trainer.gaussians.values.tensors().values()]
+    before = [
+        tensor.detach().clone() for tensor in stepper.trainer.gaussians.values.tensors().values()
+    ]
     for _ in range(3):
         stepper.step()
         stepper.steps_per_second()
     assert stepper.trainer.step == 6
     assert stepper.trainer.sh_degree == 3
     assert stepper.trainer.densifier.statistics["visible_count"].max() == 3  # of whole steps alone
-    for tensor, old in zip(stepper.trainer.gaussians.values.tensors().values(), before, strict=True):
+    for tensor, old in zip(
+        stepper.trainer.gaussians.values.tensors().values(), before, strict=True
+    ):
         assert torch.equal(tensor, old)
 
 
@@ -107,16 +126,22 @@ def test_a_rasterizer_of_the_users_own(
     )
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(tmp_path))
-    assert bench(["--raster", "twice.Twice", "--size", "20x20", "--count", "9", "--repeats", "1"]) == 0
+    assert (
+        bench(["--raster", "twice.Twice", "--size", "20x20", "--count", "9", "--repeats", "1"]) == 0
+    )
     assert capsys.readouterr().out.splitlines()[1].split()[0] == "twice.Twice"
 
 
 def test_json_with_memory(capsys: pytest.CaptureFixture[str]) -> None:
-    assert bench(["--raster", "cpu", "--size", "40x30", "--count", "60", "--json", "--repeats", "1"]) == 0
+    assert (
+        bench(["--raster", "cpu", "--size", "40x30", "--count", "60", "--json", "--repeats", "1"])
+        == 0
+    )
     (row,) = json.loads(capsys.readouterr().out)
     assert row.keys() >= KEYS
     assert (row["raster"], row["size"], row["count"]) == ("cpu", "40x30", 60)
-    assert 50 < row["peak_memory_mb"] < 10_000  # a process with torch, and no more than a small scene
+    # a process with torch, and no more than a small scene
+    assert 50 < row["peak_memory_mb"] < 10_000
 
 
 def test_table_of_a_ply(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -166,7 +191,12 @@ def test_kernels_are_timed_and_put_back_when_a_step_fails() -> None:
         assert cpu_executor.composite_tiles is not kernel
         raise ArithmeticError
     assert cpu_executor.composite_tiles is kernel
-    assert {"project_shards", "composite_tiles", "composite_backward_tiles", "similarity_rows"} <= times.keys()
+    assert {
+        "project_shards",
+        "composite_tiles",
+        "composite_backward_tiles",
+        "similarity_rows",
+    } <= times.keys()
     assert min(times.values()) >= 0
 
 
@@ -177,7 +207,10 @@ def test_kernels_are_timed_and_put_back_when_a_step_fails() -> None:
         (["--count", "0"], "at least 1"),
         (["--raster", "nosuch", "--no-memory"], "nosuch"),
         (["--ply", "/no/such.ply"], "such.ply"),
-        (["--raster", "gsplat", "--no-memory"], "raster=gsplat runs on a CUDA device, and torch finds none"),
+        (
+            ["--raster", "gsplat", "--no-memory"],
+            "raster=gsplat runs on a CUDA device, and torch finds none",
+        ),
     ],
 )
 def test_bad_input(arguments: list[str], cause: str) -> None:

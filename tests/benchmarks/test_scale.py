@@ -1,4 +1,5 @@
-"""Verbs over an experiment of many trials: what they say is right; how long they take is printed, and fails nothing."""
+"""Verbs over an experiment of many trials: what they say is right; how long they take is printed,
+and fails nothing."""
 
 from __future__ import annotations
 

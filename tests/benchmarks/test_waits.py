@@ -85,16 +85,21 @@ def test_a_readback_waits_only_if_it_has_not_arrived(monkeypatch: pytest.MonkeyP
 
 @pytest.mark.parametrize("raster", ["triton", "reference"])
 def test_one_wait_in_a_training_step(raster: str) -> None:
-    """With Triton: its look at how much there is to composite. The reference shows that others would be seen."""
+    """With Triton: its look at how much there is to composite. The reference shows that others
+    would be seen."""
     pytest.importorskip("triton")
     environment = os.environ | {
         "TRITON_INTERPRET": "1",
         "PYTHONPATH": os.pathsep.join(path for path in [str(ROOT), *sys.path] if path),
     }
     command = [sys.executable, "-m", "tests.train.one_step", raster]
-    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=600, check=False)
+    done = subprocess.run(
+        command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=600, check=False
+    )
     assert done.returncode == 0, done.stderr
-    counts = {name: count for line in done.stdout.splitlines() for name, count in json.loads(line).items()}
+    counts = {
+        name: count for line in done.stdout.splitlines() for name, count in json.loads(line).items()
+    }
     assert counts.keys() == {"adc", "absgrad", "mcmc"}
     for name, count in counts.items():
         if raster == "triton":

@@ -2,11 +2,11 @@
 
     python -m tests.benchmarks.threads [TRIAL WIDTH] ...
 
-A trial is a folder with a trained model; a training view of its own is drawn, ``WIDTH`` px wide. Without any: the
-scene of `gsbench bench`. Every shard is timed on one thread, by processor time, the fastest of some steps. Then the
-shards of a stage go to the threads in their order, each to the first that is free; torch's Adam is divided evenly, and
-all else is serial. What threads do to each other (memory, caches, the handing out) is not in it, so speedups are upper
-bounds.
+A trial is a folder with a trained model; a training view of its own is drawn, ``WIDTH`` px wide.
+Without any: the scene of `gsbench bench`. Every shard is timed on one thread, by processor time,
+the fastest of some steps. Then the shards of a stage go to the threads in their order, each to the
+first that is free; torch's Adam is divided evenly, and all else is serial. What threads do to each
+other (memory, caches, the handing out) is not in it, so speedups are upper bounds.
 """
 
 from __future__ import annotations
@@ -43,22 +43,30 @@ STEPS = 9
 
 
 def trained(folder: Path, width: int) -> tuple[Gaussians, Scene]:
-    """A trial's model, and its first training view, ``width`` px wide, with noise for a photograph."""
+    """A trial's model, and its first training view, ``width`` px wide, with noise for a
+    photograph."""
     values = TrialFolder(folder).configuration()
     steps = TrialSteps(Parts(values), Store(Path(values["runs"]) / STORE))
     next(step for step in steps.steps() if step.stage == TRAIN)  # whose views are known by then
     camera = steps.views.scene.train[0].camera
     camera = camera.resized(width, round(camera.height * width / camera.width))
-    image = np.random.default_rng(0).integers(0, 256, (camera.height, camera.width, 3), dtype=np.uint8)
+    image = np.random.default_rng(0).integers(
+        0, 256, (camera.height, camera.width, 3), dtype=np.uint8
+    )
     return read_ply(folder / POINT_CLOUD), Scene("bench", (View("0.png", camera, image),), ())
 
 
 class Timed:
-    """A training of one thread; ``stages`` are the stages of the last step in order: name and ms of each shard."""
+    """A training of one thread; ``stages`` are the stages of the last step in order: name and ms of
+    each shard."""
 
     def __init__(self, gaussians: Gaussians, scene: Scene) -> None:
-        densifier = ADC(start=NEVER - 1, stop=NEVER, opacity_reset_interval=NEVER, max_gaussians=None)
-        self.trainer = Trainer(scene, gaussians, densifier, CpuRasterizer(threads=1), constant_scene_options(), 0)
+        densifier = ADC(
+            start=NEVER - 1, stop=NEVER, opacity_reset_interval=NEVER, max_gaussians=None
+        )
+        self.trainer = Trainer(
+            scene, gaussians, densifier, CpuRasterizer(threads=1), constant_scene_options(), 0
+        )
         self.trainer.step = SH_DEGREE
         self.stages: list[tuple[str, list[float]]] = []
 
@@ -101,12 +109,18 @@ def simulate(title: str, gaussians: Gaussians, scene: Scene) -> None:
             training = Timed(gaussians, scene)
             steps = [training.step() for _ in range(2 + STEPS)][2:]
         names = [name for name, _ in steps[0][0]]
-        fastest = [np.min([stages[k][1] for stages, _, _ in steps], axis=0).tolist() for k in range(len(names))]
+        fastest = [
+            np.min([stages[k][1] for stages, _, _ in steps], axis=0).tolist()
+            for k in range(len(names))
+        ]
         adam, serial = (float(np.median([step[part] for step in steps])) for part in (1, 2))
         one = sum(map(sum, fastest)) + adam + serial
         if shards == TILE_SHARDS[0]:
             camera = scene.train[0].camera
-            print(f"\n{title}, {len(gaussians):,} Gaussians, {camera.width}x{camera.height}: {one:.1f} ms on a thread")
+            print(
+                f"\n{title}, {len(gaussians):,} Gaussians, {camera.width}x{camera.height}: "
+                f"{one:.1f} ms on a thread"
+            )
             print(f"  serial {serial:.1f} ms, Adam by torch {adam:.1f} ms")
             for name, times in zip(names, fastest, strict=True):
                 mean = sum(times) / len(times)

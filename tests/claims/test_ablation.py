@@ -1,4 +1,5 @@
-"""Switches of densifiers: which are on, which runs they make, and verdicts from result files with known gains."""
+"""Switches of densifiers: which are on, which runs they make, and verdicts from result files with
+known gains."""
 
 from __future__ import annotations
 
@@ -45,7 +46,13 @@ def on(*names: str) -> Run:
 
 def test_what_acts_within_another_is_trained_only_where_that_is_on() -> None:
     runs = runs_to_train(NESTED)
-    assert runs == [on("rule", "shrink", "once"), on("once", "rule"), on("rule", "shrink"), on("rule"), on()]
+    assert runs == [
+        on("rule", "shrink", "once"),
+        on("once", "rule"),
+        on("rule", "shrink"),
+        on("rule"),
+        on(),
+    ]
     assert effective_run(on("shrink", "once"), NESTED) == on()
     alone = {"shrink": NESTED["shrink"]}  # where the rule is not asked about it stays as it is: on
     assert runs_to_train(alone) == [on("shrink"), on()]
@@ -57,7 +64,11 @@ def test_switches_within_each_other_are_refused() -> None:
     circle = {"a": Switch({"x": 1}, within="b"), "b": Switch({"y": 1}, within="a")}
     with pytest.raises(InputError, match="circle"):
         runs_to_train(circle)
-    chain = {"a": Switch({"x": 1}), "b": Switch({"y": 1}, within="a"), "c": Switch({"z": 1}, within="b")}
+    chain = {
+        "a": Switch({"x": 1}),
+        "b": Switch({"y": 1}, within="a"),
+        "c": Switch({"z": 1}, within="b"),
+    }
     assert [sorted(found) for found in runs_to_train(chain)] == [
         ["a", "b", "c"],
         ["a", "b"],
@@ -66,7 +77,9 @@ def test_switches_within_each_other_are_refused() -> None:
     ]
 
 
-@pytest.mark.parametrize("arm", [name for name in options("densify") if name != "none" and "/" not in name])
+@pytest.mark.parametrize(
+    "arm", [name for name in options("densify") if name != "none" and "/" not in name]
+)
 def test_every_declared_switch_of_every_arm_makes_another_densifier(arm: str) -> None:
     """Its settings are those of the class, allowed there, and act on the arm as configured."""
     values = compose_one([f"densify={arm}"]).values["densify"]
@@ -80,18 +93,29 @@ def test_every_declared_switch_of_every_arm_makes_another_densifier(arm: str) ->
 
 def test_the_paper_rule_has_the_three_that_matter_and_only_those_that_are_on() -> None:
     once = compose_one(["densify=volumetric_once"]).values["densify"]
-    assert list(declared_switches(Volumetric.SWITCHES, once)) == ["volume_rule", "shrink", "no_resplit"]
+    assert list(declared_switches(Volumetric.SWITCHES, once)) == [
+        "volume_rule",
+        "shrink",
+        "no_resplit",
+    ]
     plain = compose_one(["densify=volumetric"]).values["densify"]
     assert list(declared_switches(Volumetric.SWITCHES, plain)) == ["volume_rule", "shrink"]
-    defaults = {entry.name: entry.default for entry in fields(Volumetric) if entry.default is not MISSING}
+    defaults = {
+        entry.name: entry.default for entry in fields(Volumetric) if entry.default is not MISSING
+    }
     assert set().union(*(switch.off for switch in Volumetric.SWITCHES.values())) <= set(defaults)
 
 
 def test_a_yaml_declares_switches_that_are_no_part_of_a_result() -> None:
-    values: dict[str, Any] = {"grow": 1, "switches": {"growth": {"off": {"grow": 0}, "words": "it grows"}}}
+    values: dict[str, Any] = {
+        "grow": 1,
+        "switches": {"growth": {"off": {"grow": 0}, "words": "it grows"}},
+    }
     assert declared_switches({}, values) == {"growth": Switch({"grow": 0}, "it grows")}
     plain = compose_one(["densify=adc"]).values
-    named = compose_one(["densify=adc", "+densify.switches={mine: {off: {split_shrink: 2}}}"]).values
+    named = compose_one(
+        ["densify=adc", "+densify.switches={mine: {off: {split_shrink: 2}}}"]
+    ).values
     assert config_hash(named) == config_hash(plain)
     assert build("densify", named["densify"], []).split_shrink == 1.6
     for wrong in ({"a": {}}, {"a": 1}, [1], {"a": {"off": 3}}, {"a": {"off": {"x": 1}, "of": 2}}):
@@ -107,14 +131,22 @@ def test_a_name_that_is_no_switch_is_named_with_the_nearest() -> None:
     assert list(choose_switches(NESTED, ["once"], "x")) == ["once"]
 
 
-def write_ablation(runs: Path, gains: Mapping[str, float], seeds: int = 3) -> dict[Run, dict[str, str]]:
-    """Trials in which each part of `NESTED` adds its gain in PSNR, where it acts; their folders by run and scene."""
+def write_ablation(
+    runs: Path, gains: Mapping[str, float], seeds: int = 3
+) -> dict[Run, dict[str, str]]:
+    """Trials in which each part of `NESTED` adds its gain in PSNR, where it acts; their folders by
+    run and scene."""
     keys = {}
     for number, chosen in enumerate(runs_to_train(NESTED)):
         for seed in range(seeds):
             noise = 0.001 * np.random.default_rng([number, seed]).normal()
             views = {"psnr": 26 + sum(gains[name] for name in chosen) + noise + np.zeros(3)}
-            write_trial(runs, trial_data(Plan(), "courtyard", "sfm", "volumetric", seed, views), views, f"{number:08x}")
+            write_trial(
+                runs,
+                trial_data(Plan(), "courtyard", "sfm", "volumetric", seed, views),
+                views,
+                f"{number:08x}",
+            )
         keys[chosen] = {"courtyard": f"courtyard/sfm-volumetric/{number:08x}"}
     return keys
 
@@ -132,7 +164,9 @@ def test_each_combination_is_judged_against_all_parts(tmp_path: Path) -> None:
     assert verdicts[0].family == 4
     lines = markdown_table(verdicts)
     assert lines[0] == "| run | difference in PSNR (dB) from all parts | interval | verdict |"
-    assert lines[2].startswith("| without once | ") or lines[2].startswith("| without shrink | −0.4")
+    assert lines[2].startswith("| without once | ") or lines[2].startswith(
+        "| without shrink | −0.4"
+    )
 
 
 def test_a_combination_whose_trials_are_missing_has_no_verdict(tmp_path: Path) -> None:
@@ -142,7 +176,9 @@ def test_a_combination_whose_trials_are_missing_has_no_verdict(tmp_path: Path) -
         path.unlink()
     verdicts = judge_runs(load_experiment(tmp_path, "exp").trials, keys, "psnr")
     assert verdicts[-1].answer is None
-    assert markdown_table(verdicts)[-1].endswith("| unknown | unknown | courtyard: seed 0 has no partner |")
+    assert markdown_table(verdicts)[-1].endswith(
+        "| unknown | unknown | courtyard: seed 0 has no partner |"
+    )
 
 
 @pytest.mark.parametrize(
@@ -154,16 +190,25 @@ def test_a_combination_whose_trials_are_missing_has_no_verdict(tmp_path: Path) -
         (["densify=adc", "--switches", "opacity_rest"], "did you mean opacity_reset"),
         (["densify=adc", "+densify.switches.a.off.split_shrnk=2"], "split_shrnk"),
         (["densify=adc", "--fast"], "unrecognized arguments: --fast"),
-        (["densify=adc", "launch.stop_when_decided=true", "eval.primary=psnr", "seed=0,1"], "stop_when_decided"),
+        (
+            ["densify=adc", "launch.stop_when_decided=true", "eval.primary=psnr", "seed=0,1"],
+            "stop_when_decided",
+        ),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else None,
 )
 def test_bad_words_are_refused_in_a_line(
-    words: list[str], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    words: list[str],
+    message: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs"))
     assert run(["ablate", *(word for word in TINY if word != "densify=none"), *words]) == 2
-    (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("gsbench: ")]
+    (line,) = [
+        line for line in capsys.readouterr().err.splitlines() if line.startswith("gsbench: ")
+    ]
     assert message in line
     assert not (tmp_path / "runs").exists()
 
@@ -173,7 +218,12 @@ def test_the_verb_trains_each_run_once_and_judges_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs"))
-    words = [*(word for word in TINY if word != "densify=none"), "densify=adc", "seed=0,1", "name=parts"]
+    words = [
+        *(word for word in TINY if word != "densify=none"),
+        "densify=adc",
+        "seed=0,1",
+        "name=parts",
+    ]
     words += ["+densify.switches.size.off.split_size=0.5", "--switches", "size"]
     assert run(["ablate", *words]) == 0
     out = capsys.readouterr().out

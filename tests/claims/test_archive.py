@@ -1,4 +1,5 @@
-"""Archives of results: what comes back, what is never in them, and damage of every kind named in one line."""
+"""Archives of results: what comes back, what is never in them, and damage of every kind named in
+one line."""
 
 from __future__ import annotations
 
@@ -16,7 +17,8 @@ from gsbench.cli import run
 from gsbench.errors import InputError
 from tests.analysis.synthetic import Plan, write_runs
 
-MANY = Plan(scenes=[f"scene{k}" for k in range(9)], seeds=range(3), views=25)  # as many trials as Table 1 has
+# as many trials as Table 1 has
+MANY = Plan(scenes=[f"scene{k}" for k in range(9)], seeds=range(3), views=25)
 
 
 def export(tmp_path: Path, plan: Plan = Plan()) -> Path:  # noqa: B008 - never changed
@@ -51,7 +53,9 @@ def test_results_settings_and_views_come_back(tmp_path: Path) -> None:
         assert other.record == one.record
         assert other.config == one.config
         assert read_views(other) == read_views(one)
-    assert (back.folder / "declared.jsonl").read_text() == (there.folder / "declared.jsonl").read_text()
+    assert (back.folder / "declared.jsonl").read_text() == (
+        there.folder / "declared.jsonl"
+    ).read_text()
 
 
 def test_an_archive_is_small_and_the_same_results_make_the_same(tmp_path: Path) -> None:
@@ -76,7 +80,8 @@ def test_no_pixels_and_no_paths_of_the_machine(tmp_path: Path) -> None:
     (path / "config.yaml").write_text(json.dumps(config))
     results = json.loads((path / "results.json").read_text())
     looked = (
-        "weights not found: a.pth (looked in /home/alice/weights, /home/alice/.cache/torch; switched off): get them"
+        "weights not found: a.pth (looked in /home/alice/weights, /home/alice/.cache/torch; "
+        "switched off): get them"
     )
     results["unavailable"] = {"lpips_alex": looked, "where": "/home/alice/weights/a.pth"}
     (path / "results.json").write_text(json.dumps(results))
@@ -88,12 +93,14 @@ def test_no_pixels_and_no_paths_of_the_machine(tmp_path: Path) -> None:
     assert b"python x.py" in b"".join(content.values())
     assert b"https://a.org/c" in b"".join(content.values())
     assert any(
-        one.config.get("scene.path") == "garden" for one in unpack_archive(tmp_path / "exp.zip", runs / "b").trials
+        one.config.get("scene.path") == "garden"
+        for one in unpack_archive(tmp_path / "exp.zip", runs / "b").trials
     )
 
 
 def test_it_is_an_ro_crate(tmp_path: Path) -> None:
-    """The rules of RO-Crate 1.2, sections 3 (root data entity), 4 (data entities) and 2 (packaging)."""
+    """The rules of RO-Crate 1.2, sections 3 (root data entity), 4 (data entities) and 2
+    (packaging)."""
     file = export(tmp_path)
     content = members(file)
     crate = json.loads(content["ro-crate-metadata.json"])
@@ -164,7 +171,10 @@ def flip_a_bit(file: Path) -> None:
         (lambda file: file.write_bytes(b""), "not a complete zip"),
         (lambda file: file.write_text("results"), "not a complete zip"),
         (lambda file: file.unlink(), "no such file"),
-        (edit("results.jsonl", b'"psnr":2', b'"psnr":3'), "results.jsonl was changed after the export"),
+        (
+            edit("results.jsonl", b'"psnr":2', b'"psnr":3'),
+            "results.jsonl was changed after the export",
+        ),
         (edit("per_view.csv", b"view000", b"view00x"), "per_view.csv was changed"),
         (edit("archive.json", b'"version": 1', b'"version": 2'), "of version 2 of the archive"),
         (edit("archive.json", b"gsbench results", b"other"), "not one of gsbench"),
@@ -181,11 +191,20 @@ def flip_a_bit(file: Path) -> None:
         (resigned("results.jsonl", b"{", b"["), "not that of an archive"),
         (resigned("results.jsonl", b"{", b"[" * 200_000), "not that of an archive"),
         (resigned("results.jsonl", b"-seed1", b"-seed0"), "is in it twice"),
-        (resigned("configurations.jsonl", b'"name":"adc"', b'"name":"volumetric"'), "says densify volumetric"),
-        (resigned("configurations.jsonl", b"-seed1", b"-seed0"), "configuration says seed 1, its results 0"),
+        (
+            resigned("configurations.jsonl", b'"name":"adc"', b'"name":"volumetric"'),
+            "says densify volumetric",
+        ),
+        (
+            resigned("configurations.jsonl", b"-seed1", b"-seed0"),
+            "configuration says seed 1, its results 0",
+        ),
         (resigned("per_view.csv", b"-seed1,", b"-seed9,"), "per_view.csv"),
         (edit("archive.json", b"{", b"[" * 200_000), "not JSON"),
-        (edit("archive.json", b'"experiment": "exp"', b'"experiment": "../up"'), "cannot be the name of an experiment"),
+        (
+            edit("archive.json", b'"experiment": "exp"', b'"experiment": "../up"'),
+            "cannot be the name of an experiment",
+        ),
     ],
 )
 def test_damage_of_every_kind_is_one_line_and_leaves_nothing(
@@ -229,6 +248,11 @@ def test_a_damaged_trial_is_left_out_by_name_and_the_rest_is_exported(
     assert run(["export", "--results", "exp", "--out", str(tmp_path / "b.zip")]) == 2
     assert "no whole trial to export" in capsys.readouterr().err
     assert not (tmp_path / "b.zip").exists()
-    for words in (["--results", "exp", "exp:courtyard:adc:0"], ["--results", "exq"], ["exp:courtyard:adc:0"], []):
+    for words in (
+        ["--results", "exp", "exp:courtyard:adc:0"],
+        ["--results", "exq"],
+        ["exp:courtyard:adc:0"],
+        [],
+    ):
         assert run(["export", *words]) == 2
         assert len(capsys.readouterr().err.splitlines()) == 1

@@ -1,4 +1,5 @@
-"""A check from its file to its page: what is asked, what is run at each look, and that again nothing is."""
+"""A check from its file to its page: what is asked, what is run at each look, and that again
+nothing is."""
 
 from __future__ import annotations
 
@@ -64,12 +65,16 @@ class FakeRunner:
             folder, values = TrialFolder.of(trial.values), trial.values
             if values["seed"] == self.fails:
                 folder.path.mkdir(parents=True)
-                (folder.path / "failed.json").write_text('{"error": "InputError", "message": "no room\\nat all"}')
+                (folder.path / "failed.json").write_text(
+                    '{"error": "InputError", "message": "no room\\nat all"}'
+                )
                 continue
             arm = values["densify"]["name"]
             rng = np.random.default_rng([values["seed"], arm == "adc"])
             views = {"psnr": 26 + EFFECT * (arm != "adc") + rng.normal(0, self.noise) + np.zeros(3)}
-            data = trial_data(Plan(experiment="check_it"), "courtyard", "sfm", arm, values["seed"], views)
+            data = trial_data(
+                Plan(experiment="check_it"), "courtyard", "sfm", arm, values["seed"], views
+            )
             write_trial(folder.runs, data, views, folder.path.name.partition("-")[0])
 
 
@@ -78,7 +83,9 @@ def looked(check: Check, runner: FakeRunner) -> list[ClaimVerdict]:
 
     def run(planned: Sequence[KeyAndSeed]) -> None:
         trials = check.to_run(planned)
-        if left := [one for one in trials if not (TrialFolder.of(one.values).path / "results.json").exists()]:
+        if left := [
+            one for one in trials if not (TrialFolder.of(one.values).path / "results.json").exists()
+        ]:
             runner(left)
 
     check = replace(check, declaration=replace(check.declaration, time="2020-01-01T00:00:00Z"))
@@ -117,7 +124,9 @@ def test_a_failed_seed_makes_its_claim_wait_and_its_return_decides(tmp_path: Pat
 
 def test_what_is_missing_here_is_named_and_nothing_is_run_for_it(tmp_path: Path) -> None:
     file = parse_claims(content() | {"scenes": {"courtyard": None, "garden": None}})
-    check = prepare(file, tmp_path, lambda trials: ["no data"] * (trials[0].values["scene"]["name"] == "garden"))
+    check = prepare(
+        file, tmp_path, lambda trials: ["no data"] * (trials[0].values["scene"]["name"] == "garden")
+    )
     assert list(check.declaration.questions[0].scenes) == ["courtyard"]
     (verdict,) = looked(check, FakeRunner(noise=0.001))
     assert verdict.word == "supported"
@@ -125,12 +134,16 @@ def test_what_is_missing_here_is_named_and_nothing_is_run_for_it(tmp_path: Path)
     nothing = prepare(file, tmp_path / "b", lambda trials: ["no data"])
     assert looked(nothing, FakeRunner(0.1))[0].reason == "courtyard, garden: no data"
     assert "not testable here  lpips: courtyard, garden: no data" in describe(nothing)
-    assert nothing.declaration.hash != check.declaration.hash  # what can be tested here is a part of it
+    # what can be tested here is a part of it
+    assert nothing.declaration.hash != check.declaration.hash
 
 
 def test_settings_that_do_not_compose_name_their_place(tmp_path: Path) -> None:
     for bad, message in (
-        (changed("arms", "adc", to={"densify": "adcc"}), "claim lpips, scene courtyard, arm adc: .*did you mean adc"),
+        (
+            changed("arms", "adc", to={"densify": "adcc"}),
+            "claim lpips, scene courtyard, arm adc: .*did you mean adc",
+        ),
         (changed("settings", to={"scene.max_siz": 160}), "did you mean max_size"),
         (changed("arms", "volumetric", to={"densify": "adc"}), "the same trial on courtyard"),
         (changed("arms", "adc", to={"densify.cap": "soft,hard"}), "several values"),
@@ -145,7 +158,9 @@ def test_another_seed_is_another_folder_and_the_same_settings(tmp_path: Path) ->
     other = with_seed(trial, 7)
     assert yaml.safe_load(other.yaml)["seed"] == other.values["seed"] == 7
     assert yaml.safe_load(other.yaml) | {"seed": 0} == yaml.safe_load(trial.yaml)
-    assert TrialFolder.of(other.values).path.name == TrialFolder.of(trial.values).path.name.replace("seed0", "seed7")
+    assert TrialFolder.of(other.values).path.name == TrialFolder.of(trial.values).path.name.replace(
+        "seed0", "seed7"
+    )
     assert "seed=7" in other.overrides
 
 
@@ -168,12 +183,17 @@ def test_the_page_says_all(tmp_path: Path) -> None:
     assert "http" not in to_html(page).replace("http://www.w3.org", "")  # one file, no network
 
 
-def judged(outcome: Any, mean: float = 0.0, error: float = 0.0, direction: str = "higher", **more: Any) -> ClaimVerdict:
-    """A verdict on a claim with a least effect of 0.3, whose interval is the mean if the error is 0."""
+def judged(
+    outcome: Any, mean: float = 0.0, error: float = 0.0, direction: str = "higher", **more: Any
+) -> ClaimVerdict:
+    """A verdict on a claim with a least effect of 0.3, whose interval is the mean if the error is
+    0."""
     file = parse_claims(content(direction=direction))
     answer = Answer(mean, StudentT(mean, error, 1e6), 0.05, 0.05, 0.05)
     question = file.question(file.claims[0], {})
-    verdict = Verdict(question, asked_quantity("psnr"), Pairs(()), outcome=outcome, answer=answer, **more)
+    verdict = Verdict(
+        question, asked_quantity("psnr"), Pairs(()), outcome=outcome, answer=answer, **more
+    )
     return ClaimVerdict(file.claims[0], verdict)
 
 
@@ -186,15 +206,33 @@ def judged(outcome: Any, mean: float = 0.0, error: float = 0.0, direction: str =
         (judged("supported", 0.5, 0.15), "it is higher; by 0.3 or more is not shown"),
         (judged("supported", -0.3, direction="lower"), "it is lower"),
         (judged("supported", -0.29, direction="lower"), "it is lower; by 0.3 or more is not shown"),
-        (judged("supported", 0.0, direction="same"), "any effect is smaller than the least that matters (0.3)"),
-        (judged("too small to matter", 0.1), "any effect is smaller than the least that matters (0.3); it is higher"),
-        (judged("too small to matter", -0.1), "any effect is smaller than the least that matters (0.3); it is lower"),
-        (judged("too small to matter", 0.1, 0.1), "any effect is smaller than the least that matters (0.3)"),
+        (
+            judged("supported", 0.0, direction="same"),
+            "any effect is smaller than the least that matters (0.3)",
+        ),
+        (
+            judged("too small to matter", 0.1),
+            "any effect is smaller than the least that matters (0.3); it is higher",
+        ),
+        (
+            judged("too small to matter", -0.1),
+            "any effect is smaller than the least that matters (0.3); it is lower",
+        ),
+        (
+            judged("too small to matter", 0.1, 0.1),
+            "any effect is smaller than the least that matters (0.3)",
+        ),
         (judged("refuted", -1.0), "it is the opposite of higher"),
         (judged("refuted", 1.0, direction="same"), "it differs by more than 0.3"),
         (judged("undecided"), "all 0 seeds show neither a difference nor that it is below 0.3"),
-        (judged("undecided", rests_on_outlying=True), "it depends on trials far outside the others"),
-        (judged("undecided", rests_on_outlying=True, final=False), "trials are missing: the next look waits for them"),
+        (
+            judged("undecided", rests_on_outlying=True),
+            "it depends on trials far outside the others",
+        ),
+        (
+            judged("undecided", rests_on_outlying=True, final=False),
+            "trials are missing: the next look waits for them",
+        ),
         (judged("undecided", untestable="no data"), "no data"),
     ],
 )
@@ -204,7 +242,12 @@ def test_each_verdict_has_its_reason(one: ClaimVerdict, reason: str) -> None:
 
 
 def test_numbers_and_late_trials_on_the_page() -> None:
-    assert [_number(value) for value in (1000.0, -1000.0, 999.94, 0.5)] == ["1,000", "-1,000", "999.9", "0.5"]
+    assert [_number(value) for value in (1000.0, -1000.0, 999.94, 0.5)] == [
+        "1,000",
+        "-1,000",
+        "999.9",
+        "0.5",
+    ]
     assert _late_words(judged("undecided")) == ""
     assert _late_words(judged("undecided", late=2)).startswith("2 trials had been measured before")
 
@@ -220,11 +263,16 @@ def test_the_verb_on_made_up_trials_and_on_their_archive(
     assert run(["check", str(path), "--dry-run"]) == 0
     out = capsys.readouterr().out
     assert "1 claim to be tested" in out
-    assert "4 trials until the first look, 8 at most; each test may err in 5 % of such sweeps" in out
+    assert (
+        "4 trials until the first look, 8 at most; each test may err in 5 % of such sweeps" in out
+    )
     assert run(["check", str(path)]) == 0
     assert runner.batches == [4]
     home = tmp_path / "runs" / "check_it"
-    assert capsys.readouterr().out == f"supported            lpips: it is higher\n{home / 'claims.html'}\n"
+    assert (
+        capsys.readouterr().out
+        == f"supported            lpips: it is higher\n{home / 'claims.html'}\n"
+    )
     assert "supported" in (home / "claims.html").read_text()
     assert run(["export", "--results", "check_it", "--out", str(archive)]) == 0
     capsys.readouterr()
@@ -233,7 +281,9 @@ def test_the_verb_on_made_up_trials_and_on_their_archive(
     assert "supported            lpips: PSNR (dB) of volumetric against adc: +1.0" in out
     assert "judged on 4 trials: 1 scene, 2 seeds, two arms; looks planned at 2, 3, 4 seeds" in out
     assert run(["check", str(path), "--from", str(archive), "--out", str(page)]) == 0
-    assert page.read_text().count("supported") == (home / "claims.html").read_text().count("supported")
+    assert page.read_text().count("supported") == (home / "claims.html").read_text().count(
+        "supported"
+    )
     for changes, message in (
         ({"least": 0.2}, "its least was 0.3 when it was declared"),
         ({"direction": "lower"}, "its sign was 1"),
@@ -263,10 +313,17 @@ def test_the_verb_runs_real_trials_declares_first_and_ends_with_the_same_page(
     settings = {key: yaml.safe_load(value) for key, value in words.items()}
     arms = {"few": {"init.count": 200}, "many": {"init.count": 300, "train.opacity": 0.03}}
     claim = content()["claims"][0] | {"baseline": "few", "arm": "many"}
-    claims = [claim | {"id": "points"}, claim | {"id": "size", "not_testable": "too large", "metric": "ssim"}]
-    claims.append(claim | {"id": "texture", "metric": "error_textured", "direction": "lower", "least": "2%"})
+    claims = [
+        claim | {"id": "points"},
+        claim | {"id": "size", "not_testable": "too large", "metric": "ssim"},
+    ]
+    claims.append(
+        claim | {"id": "texture", "metric": "error_textured", "direction": "lower", "least": "2%"}
+    )
     path = tmp_path / "claims.yaml"
-    path.write_text(json.dumps(content() | {"settings": settings, "arms": arms, "claims": claims, "seeds": 2}))
+    path.write_text(
+        json.dumps(content() | {"settings": settings, "arms": arms, "claims": claims, "seeds": 2})
+    )
     assert run(["check", str(path), "--dry-run"]) == 0
     assert "4 trials until the first look" in capsys.readouterr().out
     assert not (tmp_path / "runs" / "check_it").exists()
@@ -276,7 +333,9 @@ def test_the_verb_runs_real_trials_declares_first_and_ends_with_the_same_page(
     assert "not testable here    size: too large" in out
     home = tmp_path / "runs" / "check_it"
     (declared,) = read_declarations(home)
-    measured = [json.loads(file.read_text())["measured"] for file in home.glob("*/*/*/results.json")]
+    measured = [
+        json.loads(file.read_text())["measured"] for file in home.glob("*/*/*/results.json")
+    ]
     assert len(measured) == 4
     assert min(measured) >= declared.time
     first = (home / "claims.html").read_text()
@@ -306,13 +365,26 @@ def test_the_verb_runs_real_trials_declares_first_and_ends_with_the_same_page(
 
 
 @pytest.mark.parametrize("key", ["allow_targets", "+allow_targets"])
-def test_a_file_of_claims_allows_no_code(tmp_path: Path, key: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_of_claims_allows_no_code(
+    tmp_path: Path, key: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A stranger's claims may name a class; only the one who types may let it run."""
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "stranger.py").write_text("from gsbench.densify import ADC\n\n\nclass Mine(ADC):\n    pass\n")
-    with pytest.raises(InputError, match=r"no file can allow code to run: type allow_targets=\[…\]"):
+    (tmp_path / "stranger.py").write_text(
+        "from gsbench.densify import ADC\n\n\nclass Mine(ADC):\n    pass\n"
+    )
+    with pytest.raises(
+        InputError, match=r"no file can allow code to run: type allow_targets=\[…\]"
+    ):
         parse_claims(content() | {"settings": {key: ["stranger"]}})
-    arms = {"adc": None, "volumetric": {"densify": "adc", "densify._target_": "stranger.Mine", "densify.name": "mine"}}
+    arms = {
+        "adc": None,
+        "volumetric": {
+            "densify": "adc",
+            "densify._target_": "stranger.Mine",
+            "densify.name": "mine",
+        },
+    }
     file = parse_claims(content() | {"arms": arms})
     with pytest.raises(InputError, match=r"stranger\.Mine is not gsbench's own"):
         prepare(file, tmp_path, lambda trials: [])

@@ -1,4 +1,5 @@
-"""Files of claims: those that ship, and every kind of bad input as one line that names the place and the mend."""
+"""Files of claims: those that ship, and every kind of bad input as one line that names the place
+and the mend."""
 
 from __future__ import annotations
 
@@ -74,7 +75,9 @@ def test_the_files_that_ship_are_sound(path: Path) -> None:
 
 
 def test_words_of_a_trial_are_those_of_a_command_line() -> None:
-    file = parse_claims(changed("claims", 0, "budget", to={"densify.max_gaussians": 15000, "densify.cap": None}))
+    file = parse_claims(
+        changed("claims", 0, "budget", to={"densify.max_gaussians": 15000, "densify.cap": None})
+    )
     assert file.words(file.claims[0], "own", "adc") == [
         "scene.max_size=160",
         "eval.lpips=[squeeze]",
@@ -98,7 +101,9 @@ def test_the_nearer_setting_counts() -> None:
 def test_the_direction_of_a_claim_is_the_sign_of_its_question() -> None:
     def sign(direction: str) -> int:
         file = parse_claims(changed("claims", 0, "direction", to=direction))
-        return file.question(file.claims[0], {"courtyard": ("garden/sfm-adc/0a", "garden/sfm-volumetric/0b")}).sign
+        return file.question(
+            file.claims[0], {"courtyard": ("garden/sfm-adc/0a", "garden/sfm-volumetric/0b")}
+        ).sign
 
     assert [sign(direction) for direction in ("higher", "same", "lower")] == [1, 0, -1]
 
@@ -107,7 +112,12 @@ def test_the_question_has_what_decides_and_no_words() -> None:
     file = parse_claims(GOOD)
     keys = ("garden/sfm-adc/0a", "garden/sfm-volumetric/0b")
     question = file.question(file.claims[0], {"courtyard": keys})
-    assert (question.metric, question.sign, question.least, question.relative) == ("lpips_squeeze", -1, 0.005, False)
+    assert (question.metric, question.sign, question.least, question.relative) == (
+        "lpips_squeeze",
+        -1,
+        0.005,
+        False,
+    )
     assert (str(question.baseline), question.seeds) == ("adc densify=adc", tuple(range(file.seeds)))
     assert question.planned == dict.fromkeys(keys, question.seeds)
     other = parse_claims(changed("claims", 0, "says", to="in other words"))
@@ -122,40 +132,92 @@ def test_effects_are_differences_or_parts() -> None:
 
 
 BAD: list[tuple[str, Callable[[], Any], str]] = [
-    ("an unknown arm", lambda: changed("claims", 0, "arm", to="volumetrik"), "did you mean volumetric"),
-    ("an unknown baseline", lambda: changed("claims", 0, "baseline", to="adcc"), "baseline 'adcc'.*did you mean adc"),
-    ("an unknown metric", lambda: changed("claims", 0, "metric", to="lpips_squeze"), "did you mean lpips_squeeze"),
-    ("an unknown scene", lambda: changed("claims", 0, "scenes", to=["courtyrad"]), "did you mean courtyard"),
+    (
+        "an unknown arm",
+        lambda: changed("claims", 0, "arm", to="volumetrik"),
+        "did you mean volumetric",
+    ),
+    (
+        "an unknown baseline",
+        lambda: changed("claims", 0, "baseline", to="adcc"),
+        "baseline 'adcc'.*did you mean adc",
+    ),
+    (
+        "an unknown metric",
+        lambda: changed("claims", 0, "metric", to="lpips_squeze"),
+        "did you mean lpips_squeeze",
+    ),
+    (
+        "an unknown scene",
+        lambda: changed("claims", 0, "scenes", to=["courtyrad"]),
+        "did you mean courtyard",
+    ),
     ("a scene twice", lambda: changed("claims", 0, "scenes", to=["own", "own"]), "is listed twice"),
-    ("an arm against itself", lambda: changed("claims", 0, "arm", to="adc"), "compared with itself"),
+    (
+        "an arm against itself",
+        lambda: changed("claims", 0, "arm", to="adc"),
+        "compared with itself",
+    ),
     ("zero width", lambda: changed("claims", 0, "least", to=0), "above 0"),
     ("zero percent", lambda: changed("claims", 0, "least", to="0%"), "above 0"),
     ("a negative width", lambda: changed("claims", 0, "least", to=-0.1), "above 0"),
     ("no number", lambda: changed("claims", 0, "least", to="much"), "above 0"),
     ("an infinite width", lambda: changed("claims", 0, "least", to="inf"), "above 0"),
-    ("a count without percent", lambda: changed("claims", 0, "metric", to="gaussians"), "such as 10%"),
+    (
+        "a count without percent",
+        lambda: changed("claims", 0, "metric", to="gaussians"),
+        "such as 10%",
+    ),
     (
         "a width above the metric's range",
         lambda: changed("claims", 0, to=GOOD["claims"][0] | {"metric": "ssim", "least": 1}),
         "more than ssim can differ by",
     ),
-    ("an unknown direction", lambda: changed("claims", 0, "direction", to="lowre"), "'higher', 'lower' or 'same'"),
+    (
+        "an unknown direction",
+        lambda: changed("claims", 0, "direction", to="lowre"),
+        "'higher', 'lower' or 'same'",
+    ),
     ("an unknown key", lambda: changed("claims", 0, "metrics", to="psnr"), "did you mean metric"),
     ("an unknown key at the top", lambda: changed("clams", to=[]), "did you mean claims"),
-    ("a key that is missing", lambda: without("claims", 0, "refuted_if"), "claims.1..refuted_if is not given"),
+    (
+        "a key that is missing",
+        lambda: without("claims", 0, "refuted_if"),
+        "claims.1..refuted_if is not given",
+    ),
     ("no seeds", lambda: without("seeds"), "seeds is not given"),
     ("one seed", lambda: changed("seeds", to=1), "at least 2"),
     ("no claims", lambda: changed("claims", to=[]), "at least one claim"),
-    ("claims that are missing", lambda: without("claims"), "at least one claim|claims is not given"),
+    (
+        "claims that are missing",
+        lambda: without("claims"),
+        "at least one claim|claims is not given",
+    ),
     ("a claim that is text", lambda: changed("claims", 0, to="it is better"), "must be a mapping"),
-    ("an empty sentence", lambda: changed("claims", 0, "says", to="  "), "says must be a text that is not empty"),
+    (
+        "an empty sentence",
+        lambda: changed("claims", 0, "says", to="  "),
+        "says must be a text that is not empty",
+    ),
     ("no scenes", lambda: changed("scenes", to={}), "at least one"),
-    ("a scene that is text", lambda: changed("scenes", "own", to="photos"), "must be a mapping of settings"),
+    (
+        "a scene that is text",
+        lambda: changed("scenes", "own", to="photos"),
+        "must be a mapping of settings",
+    ),
     ("nested settings", lambda: changed("settings", to={"scene": {"max_size": 160}}), "with dots"),
-    ("a nested budget", lambda: changed("claims", 0, "budget", to={"densify": {"cap": "hard"}}), "with dots"),
+    (
+        "a nested budget",
+        lambda: changed("claims", 0, "budget", to={"densify": {"cap": "hard"}}),
+        "with dots",
+    ),
     ("a seed of its own", lambda: changed("settings", to={"seed": 3}), "set by the plan"),
     ("a name of its own", lambda: changed("arms", "adc", to={"name": "x"}), "set by the plan"),
-    ("a primary metric", lambda: changed("settings", to={"eval.primary": "psnr"}), "set by the plan"),
+    (
+        "a primary metric",
+        lambda: changed("settings", to={"eval.primary": "psnr"}),
+        "set by the plan",
+    ),
     ("no setting", lambda: changed("settings", to={"scene max": 160}), "is not a setting"),
     ("an error rate of 1", lambda: changed("error_rate", to=1.0), "error_rate"),
     ("a list", lambda: [], "must be a mapping"),
@@ -165,7 +227,9 @@ BAD: list[tuple[str, Callable[[], Any], str]] = [
 ]
 
 
-@pytest.mark.parametrize(("content", "message"), [case[1:] for case in BAD], ids=[case[0] for case in BAD])
+@pytest.mark.parametrize(
+    ("content", "message"), [case[1:] for case in BAD], ids=[case[0] for case in BAD]
+)
 def test_bad_input_is_one_line(content: Callable[[], Any], message: str) -> None:
     with pytest.raises(InputError, match=message) as caught:
         parse_claims(content())

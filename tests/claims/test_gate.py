@@ -1,4 +1,5 @@
-"""The gate on made-up trials: what passes, what is worse, what is not decided, and what is refused."""
+"""The gate on made-up trials: what passes, what is worse, what is not decided, and what is
+refused."""
 
 from __future__ import annotations
 
@@ -40,21 +41,35 @@ VALUES: dict[str, Any] = {"eval": {"extra": {}}}
 SCENES = dict.fromkeys(("courtyard", "garden"), ("sfm-adc", "sfm-adc"))
 
 
-def asked(metric: str = "psnr", least: str | None = "0.1", seeds: int = 4, **scenes: tuple[str, str]) -> Declaration:
-    return replace(declare_gate(metric, least, scenes or SCENES, range(seeds), VALUES), time="2020-01-01T00:00:00Z")
+def asked(
+    metric: str = "psnr", least: str | None = "0.1", seeds: int = 4, **scenes: tuple[str, str]
+) -> Declaration:
+    return replace(
+        declare_gate(metric, least, scenes or SCENES, range(seeds), VALUES),
+        time="2020-01-01T00:00:00Z",
+    )
 
 
-def trials(runs: Path, effect: float, noise: float, seeds: int = 4, scenes: Sequence[str] = tuple(SCENES)) -> Any:
+def trials(
+    runs: Path, effect: float, noise: float, seeds: int = 4, scenes: Sequence[str] = tuple(SCENES)
+) -> Any:
     """Trials of one version, whose PSNR is 26 + ``effect`` with that noise (dB)."""
     for scene in scenes:
         for seed in range(seeds):
             rng = np.random.default_rng([seed, len(scene), int(1000 * abs(effect))])
-            views = {"psnr": 26 + effect + rng.normal(0, noise) + np.zeros(3), "flip": 0.1 + np.zeros(3)}
-            write_trial(runs, trial_data(Plan(experiment="gate"), scene, "sfm", "adc", seed, views), views)
+            views = {
+                "psnr": 26 + effect + rng.normal(0, noise) + np.zeros(3),
+                "flip": 0.1 + np.zeros(3),
+            }
+            write_trial(
+                runs, trial_data(Plan(experiment="gate"), scene, "sfm", "adc", seed, views), views
+            )
     return load_experiment(runs, "gate").trials
 
 
-def gate(tmp_path: Path, effect: float, noise: float, declared: Declaration | None = None) -> tuple[Verdict, int]:
+def gate(
+    tmp_path: Path, effect: float, noise: float, declared: Declaration | None = None
+) -> tuple[Verdict, int]:
     """The verdict on a version with that effect, and the most seeds that were asked for."""
     old, new = (trials(tmp_path / str(k), k * effect, noise) for k in (0, 1))
     most = [0]
@@ -62,7 +77,9 @@ def gate(tmp_path: Path, effect: float, noise: float, declared: Declaration | No
     def run_them(planned: Sequence[tuple[str, int]]) -> None:
         most[0] = max(seed for _, seed in planned) + 1
 
-    found = Gate(declared or asked(), lambda: old, lambda: [one for one in new if one.seed < most[0]])
+    found = Gate(
+        declared or asked(), lambda: old, lambda: [one for one in new if one.seed < most[0]]
+    )
     (verdict,) = run_looks(found.declaration, found.judged, run_them)
     return verdict, most[0]
 
@@ -77,7 +94,9 @@ def gate(tmp_path: Path, effect: float, noise: float, declared: Declaration | No
         (0.0, 1.0, PASSED, "equal to the last bit in all 4 pairs of trials", 2),
     ],
 )
-def test_results(tmp_path: Path, effect: float, noise: float, result: str, words: str, seeds: int) -> None:
+def test_results(
+    tmp_path: Path, effect: float, noise: float, result: str, words: str, seeds: int
+) -> None:
     verdict, most = gate(tmp_path, effect, noise)
     assert (result_of(verdict), most) == (result, seeds)
     assert words in describe(verdict)
@@ -93,9 +112,17 @@ def test_what_is_shown_not_to_be_worse_passes_though_it_may_be_better(tmp_path: 
 
 @pytest.mark.parametrize(
     ("sign", "mean", "result"),
-    [(1, -0.1, NOT_DECIDED), (1, -0.09, PASSED), (-1, 0.1, NOT_DECIDED), (-1, 0.09, PASSED), (1, -0.2, NOT_DECIDED)],
+    [
+        (1, -0.1, NOT_DECIDED),
+        (1, -0.09, PASSED),
+        (-1, 0.1, NOT_DECIDED),
+        (-1, 0.09, PASSED),
+        (1, -0.2, NOT_DECIDED),
+    ],
 )
-def test_a_loss_of_the_least_that_matters_is_not_excluded_by_itself(sign: int, mean: float, result: str) -> None:
+def test_a_loss_of_the_least_that_matters_is_not_excluded_by_itself(
+    sign: int, mean: float, result: str
+) -> None:
     question = replace(asked().questions[0], sign=sign)
     answer = Answer(mean, StudentT(mean, 0.0, 3.0), 0.05, 0.05, 0.05)
     undecided = Verdict(question, asked_quantity("psnr"), Pairs(()), answer=answer)
@@ -104,16 +131,22 @@ def test_a_loss_of_the_least_that_matters_is_not_excluded_by_itself(sign: int, m
 
 def test_a_look_waits_for_every_scene_also_where_the_first_is_equal(tmp_path: Path) -> None:
     old = trials(tmp_path, 0, 0.1)
-    (verdict,) = Gate(asked(), lambda: old, lambda: [one for one in old if one.scene == "garden"]).judged()
+    (verdict,) = Gate(
+        asked(), lambda: old, lambda: [one for one in old if one.scene == "garden"]
+    ).judged()
     assert not verdict.final
     assert result_of(verdict) == NOT_DECIDED
     assert "trials are missing" in describe(verdict)
 
 
-def test_the_code_may_differ_and_the_baseline_may_be_older_than_the_question(tmp_path: Path) -> None:
+def test_the_code_may_differ_and_the_baseline_may_be_older_than_the_question(
+    tmp_path: Path,
+) -> None:
     def made_by(own: Sequence[TrialResult], state: str, measured: str) -> list[TrialResult]:
         code = Code(rooms={"densify": state})
-        return [replace(one, record=replace(one.record, code=code, measured=measured)) for one in own]
+        return [
+            replace(one, record=replace(one.record, code=code, measured=measured)) for one in own
+        ]
 
     old = made_by(trials(tmp_path / "a", 0, 0.01), "one", "2019-01-01T00:00:00Z")
     new = made_by(trials(tmp_path / "b", -1, 0.01), "two", "2021-01-01T00:00:00Z")
@@ -132,9 +165,14 @@ def test_deviations_name_machines_and_libraries(tmp_path: Path) -> None:
     assert deviations(own, own) == []
     machine = {"cpu": "Ours", "kernels": "znver4", "torch": "AVX512", "device": "cpu"}
     versions = own[0].record.versions | {"torch": "9.9", "gsbench": "9.9"}
-    other = [replace(one, record=replace(one.record, machine=machine, versions=versions)) for one in own]
+    other = [
+        replace(one, record=replace(one.record, machine=machine, versions=versions)) for one in own
+    ]
     first, second = deviations(own, other)
-    assert "another kind of machine (not recorded) than the new trials (Ours (znver4, torch AVX512))" in first
+    assert (
+        "another kind of machine (not recorded) than the new trials (Ours (znver4, torch AVX512))"
+        in first
+    )
     assert "with torch 2.13.0, the new trials with 9.9" in second
 
 
@@ -186,7 +224,9 @@ def test_bad_input_of_the_verb(
     assert message in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(("effect", "code", "words"), [(-1.0, 1, "worse in PSNR"), (1.0, 0, "passed, better in PSNR")])
+@pytest.mark.parametrize(
+    ("effect", "code", "words"), [(-1.0, 1, "worse in PSNR"), (1.0, 0, "passed, better in PSNR")]
+)
 def test_the_verb_ends_with_the_result_of_its_gate(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -214,7 +254,10 @@ def test_the_verb_ends_with_the_result_of_its_gate(
     monkeypatch.setattr("gsbench.runs.trial_folder.TrialFolder.why_not_done", lacking)
     old = trials(tmp_path / "old", 0, 0.01, scenes=("courtyard",))
     write_archive(load_experiment(tmp_path / "old", "gate"), tmp_path / "exp.zip")
-    assert run(["gate", "exp.zip", "scene=courtyard", "init=sfm", "densify=adc", "--seeds", "3"]) == code
+    assert (
+        run(["gate", "exp.zip", "scene=courtyard", "init=sfm", "densify=adc", "--seeds", "3"])
+        == code
+    )
     assert words in capsys.readouterr().out
     assert trained == [0, 1]  # the first look decides
     assert len(old) == 4
@@ -235,8 +278,12 @@ def test_bisecting_finds_each_commit_within_its_steps(worse: int) -> None:
 def test_bisecting_passes_over_what_is_not_decided_or_does_not_train() -> None:
     assert first_worse(12, lambda commit: PASSED) is None
     answers = {6: NOT_DECIDED, 7: None}
-    assert first_worse(12, lambda commit: answers.get(commit, WORSE if commit >= 9 else PASSED)) == (8, 9)
-    assert first_worse(12, lambda commit: answers.get(commit, WORSE if commit >= 8 else PASSED)) == (5, 8)
+    assert first_worse(
+        12, lambda commit: answers.get(commit, WORSE if commit >= 9 else PASSED)
+    ) == (8, 9)
+    assert first_worse(
+        12, lambda commit: answers.get(commit, WORSE if commit >= 8 else PASSED)
+    ) == (5, 8)
     asked_for: list[int] = []
 
     def never(commit: int) -> str:
@@ -245,4 +292,5 @@ def test_bisecting_passes_over_what_is_not_decided_or_does_not_train() -> None:
 
     assert first_worse(12, never) == (0, 12)
     assert len(asked_for) <= most_steps(12)
-    assert first_worse(12, lambda commit: WORSE if commit == 12 else None) == (0, 12)  # costs no step
+    # costs no step
+    assert first_worse(12, lambda commit: WORSE if commit == 12 else None) == (0, 12)

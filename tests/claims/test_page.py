@@ -1,4 +1,5 @@
-"""The page of a check: what it says of scenes like these, of machines and clouds, and of initialisers."""
+"""The page of a check: what it says of scenes like these, of machines and clouds, and of
+initialisers."""
 
 from __future__ import annotations
 
@@ -22,25 +23,37 @@ SIZE = "nine scenes, 30,000 iterations"
 
 
 def made(runs: Path, scenes: Sequence[str], seeds: int = 4, **plan: Any) -> list[TrialResult]:
-    write_runs(runs, Plan(scenes=scenes, seeds=range(seeds), scene_noise=0.0, effect={"psnr": 1.0}, **plan))
+    write_runs(
+        runs, Plan(scenes=scenes, seeds=range(seeds), scene_noise=0.0, effect={"psnr": 1.0}, **plan)
+    )
     return list(read_experiment(runs / "exp").trials)
 
 
 def page_of(trials: Sequence[TrialResult]) -> Page:
     """The page of one claim about all scenes of the trials."""
     names = list(dict.fromkeys(trial.scene for trial in trials))
-    file = parse_claims(content() | {"size": SIZE, "scenes": {name: {"scene": "courtyard"} for name in names}})
+    file = parse_claims(
+        content() | {"size": SIZE, "scenes": {name: {"scene": "courtyard"} for name in names}}
+    )
     keys = {(trial.scene, trial.densify): trial.key for trial in trials}
-    question = file.question(file.claims[0], {name: (keys[name, "adc"], keys[name, "volumetric"]) for name in names})
+    question = file.question(
+        file.claims[0], {name: (keys[name, "adc"], keys[name, "volumetric"]) for name in names}
+    )
     declared = Declaration(time=EARLY, questions=(question,), looks=file.looks)
-    return make_page(file, claim_verdicts(file, declared, judge(trials, declared)), declared, [declared])
+    return make_page(
+        file, claim_verdicts(file, declared, judge(trials, declared)), declared, [declared]
+    )
 
 
 @pytest.mark.parametrize("scenes", ["abcde", "abcdef"])
-def test_from_six_scenes_on_scenes_like_these_are_asked_beside_the_verdict(tmp_path: Path, scenes: str) -> None:
+def test_from_six_scenes_on_scenes_like_these_are_asked_beside_the_verdict(
+    tmp_path: Path, scenes: str
+) -> None:
     page = page_of(made(tmp_path, tuple(scenes)))
     assert page.sections[0].verdict.word == "supported"
-    assert ("scenes like these: supported; it is higher in 6 of 6" in to_text(page)) == (len(scenes) == 6)
+    assert ("scenes like these: supported; it is higher in 6 of 6" in to_text(page)) == (
+        len(scenes) == 6
+    )
     assert "A verdict is about these scenes" in to_text(page)
     assert f"The paper: {SIZE}." in to_text(page)
 
@@ -52,9 +65,17 @@ def test_the_page_says_where_machines_and_clouds_of_its_trials_differ(tmp_path: 
         found = []
         for trial in trials:
             cpu = cpus[trial.seed]
-            machine = {"cpu": cpu, "architecture": "x86_64", "kernels": "znver4", "torch": "AVX512", "device": "cpu"}
+            machine = {
+                "cpu": cpu,
+                "architecture": "x86_64",
+                "kernels": "znver4",
+                "torch": "AVX512",
+                "device": "cpu",
+            }
             hashes = trial.record.hashes | {"cloud": 64 * cpu[0]}
-            found.append(replace(trial, record=replace(trial.record, machine=machine, hashes=hashes)))
+            found.append(
+                replace(trial, record=replace(trial.record, machine=machine, hashes=hashes))
+            )
         return page_of(found).lines
 
     mixed, plain = lines(("Abacus", "Brain")), lines(("Abacus", "Abacus"))
@@ -65,12 +86,17 @@ def test_the_page_says_where_machines_and_clouds_of_its_trials_differ(tmp_path: 
 
 def test_where_scenes_differ_in_the_initialiser_a_sheet_stands_for_each(tmp_path: Path) -> None:
     trials = [
-        replace(one, record=replace(one.record, init="dataset" if one.scene != "courtyard" else one.init))
+        replace(
+            one,
+            record=replace(one.record, init="dataset" if one.scene != "courtyard" else one.init),
+        )
         for one in made(tmp_path, ("courtyard", "room", "yard"), seeds=2)
     ]
     page = page_of(trials)
     (section,) = page.sections
-    counts = [line for sheet in section.fairness for line in sheet.notes if line.startswith("Compared")]
+    counts = [
+        line for sheet in section.fairness for line in sheet.notes if line.startswith("Compared")
+    ]
     assert [line.split()[1] for line in counts] == ["2", "4"]
     assert [seeds for _, seeds in section.trials] == ["seeds 0, 1"] * 6
     text = to_html(page)

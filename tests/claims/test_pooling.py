@@ -1,4 +1,5 @@
-"""The mean of many studies: Student's t over them, refused where protocols are unlike; archives as studies."""
+"""The mean of many studies: Student's t over them, refused where protocols are unlike; archives as
+studies."""
 
 from __future__ import annotations
 
@@ -14,14 +15,24 @@ from scipy import stats
 from gsbench.analysis.results import load_experiment
 from gsbench.analysis.statistics import Interval, t_test
 from gsbench.claims.archive import write_archive
-from gsbench.claims.pooling import PooledQuestion, Study, describe, markdown_table, pool, read_studies
+from gsbench.claims.pooling import (
+    PooledQuestion,
+    Study,
+    describe,
+    markdown_table,
+    pool,
+    read_studies,
+)
 from gsbench.cli import run
 from gsbench.errors import InputError
 from tests.analysis.synthetic import Plan, write_runs
 
 WANTED = PooledQuestion(("volumetric", "new"), ("adc", "gaussian-splatting"), "psnr")
 EFFECTS = (0.5, 0.9, 0.4, 0.7)
-STUDIES = [Study(f"trial {k}", effect, Interval(effect - 0.1, effect + 0.1)) for k, effect in enumerate(EFFECTS)]
+STUDIES = [
+    Study(f"trial {k}", effect, Interval(effect - 0.1, effect + 0.1))
+    for k, effect in enumerate(EFFECTS)
+]
 
 
 def test_studies_are_the_units() -> None:
@@ -72,15 +83,19 @@ def test_a_mean_says_where_a_further_study_would_lie() -> None:
     mean, spread = np.mean(EFFECTS), np.std(EFFECTS, ddof=1)
     own, reach = expected.confidence_interval(), stats.t.ppf(0.975, 3) * spread * 1.25**0.5
     assert describe(pooled) == [
-        f"mean {mean:+.4g} (95 % interval {own.low:+.4g} to {own.high:+.4g}, p {expected.pvalue:.3g}) of 4 studies, "
+        f"mean {mean:+.4g} (95 % interval {own.low:+.4g} to {own.high:+.4g}, p "
+        f"{expected.pvalue:.3g}) of 4 studies, "
         "each with the same weight",
-        f"studies differ by a deviation of {spread:.3g}; a further one would lie between {mean - reach:+.4g} and "
+        f"studies differ by a deviation of {spread:.3g}; a further one would lie between "
+        f"{mean - reach:+.4g} and "
         f"{mean + reach:+.4g}",
     ]
 
 
 def test_studies_are_rows_of_a_table() -> None:
-    _, _, first, second = markdown_table(pool([Study("a", 1.0, Interval(0.9, 1.25), "paper-1"), Study("b", -0.5)]))
+    _, _, first, second = markdown_table(
+        pool([Study("a", 1.0, Interval(0.9, 1.25), "paper-1"), Study("b", -0.5)])
+    )
     assert first == "| a | +1 | +0.9 to +1.25 | paper-1 |"
     assert second == "| b | -0.5 | unknown |  |"
 
@@ -98,9 +113,12 @@ def archive(
     paths = write_runs(runs, Plan(effect={"psnr": 1.0}, random_seed=seed, **plan))
     for number, path in enumerate(paths):
         results = json.loads((path / "results.json").read_text())
-        results["protocol"] = protocol if protocol != "both" else ("paper-1", "standard-1")["garden" in str(path)]
+        results["protocol"] = (
+            protocol if protocol != "both" else ("paper-1", "standard-1")["garden" in str(path)]
+        )
         results["budget"] = budget or results["budget"]
-        results["seconds"]["train"] += seed + number / 1000  # no two trainings take one and the same time
+        # no two trainings take one and the same time
+        results["seconds"]["train"] += seed + number / 1000
         (path / "results.json").write_text(json.dumps(results))
     file = tmp_path / f"{name}.zip"
     write_archive(load_experiment(runs, "exp"), file)
@@ -122,28 +140,40 @@ def test_an_archive_is_a_study_of_its_pairs(tmp_path: Path) -> None:
     test = t_test(pairs)
     assert test is not None
     assert study.interval is not None
-    assert (study.interval.low, study.interval.high) == pytest.approx((test.interval().low, test.interval().high))
+    assert (study.interval.low, study.interval.high) == pytest.approx(
+        (test.interval().low, test.interval().high)
+    )
     assert study.protocol == "paper-1"
     assert study.name == "lab"
 
 
 def test_where_each_scene_has_one_initialiser_they_are_one_study(tmp_path: Path) -> None:
     both = archive(tmp_path, "both", inits=("sfm", "dataset"))
-    assert [study.name for study in read_studies(both, WANTED, "both")[0]] == ["both (dataset)", "both (sfm)"]
+    assert [study.name for study in read_studies(both, WANTED, "both")[0]] == [
+        "both (dataset)",
+        "both (sfm)",
+    ]
     trials = load_experiment(tmp_path / "runs_both_0", "exp")
     kept = [trial for trial in trials.trials if (trial.init == "sfm") == (trial.scene == "garden")]
     write_archive(replace(trials, trials=tuple(kept)), tmp_path / "one.zip")
     (study,), notes, _ = read_studies(tmp_path / "one.zip", WANTED, "one")
     by_arm = {(trial.densify, trial.scene, trial.seed): trial.metrics["psnr"] for trial in kept}
-    pairs = np.array([by_arm["volumetric", *key[1:]] - value for key, value in by_arm.items() if key[0] == "adc"])
+    pairs = np.array(
+        [by_arm["volumetric", *key[1:]] - value for key, value in by_arm.items() if key[0] == "adc"]
+    )
     assert study.effect == pytest.approx(pairs.mean())
     assert study.interval is not None
     assert [("sfm" in note, "dataset" in note) for note in notes] == [(False, True), (True, False)]
 
 
-def test_trials_of_archives_can_be_chosen(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_trials_of_archives_can_be_chosen(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """As where one archive holds two initialisers, or two splits, under one name."""
-    files = [str(archive(tmp_path, name, seed, inits=("sfm", "random"))) for seed, name in enumerate("ab")]
+    files = [
+        str(archive(tmp_path, name, seed, inits=("sfm", "random")))
+        for seed, name in enumerate("ab")
+    ]
     assert run(["pool", *files, "--arm", "volumetric", "--where", "init=sfm"]) == 0
     out = capsys.readouterr().out
     assert "of 2 studies" in out
@@ -170,9 +200,15 @@ def test_three_labs_make_a_mean(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert "a further one would lie between" in out
 
 
-def test_two_protocols_have_no_mean_and_one_can_be_chosen(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_two_protocols_have_no_mean_and_one_can_be_chosen(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Between archives and within one: every study is shown, and none is lost."""
-    files = [str(archive(tmp_path, "a", 0)), str(archive(tmp_path, "b", 1, "both")), str(archive(tmp_path, "c", 2))]
+    files = [
+        str(archive(tmp_path, "a", 0)),
+        str(archive(tmp_path, "b", 1, "both")),
+        str(archive(tmp_path, "c", 2)),
+    ]
     assert run(["pool", *files, "--arm", "volumetric"]) == 0
     out = capsys.readouterr().out
     assert all(name in out for name in ("| a |", "| b (paper-1) |", "| b (standard-1) |", "| c |"))
@@ -215,7 +251,9 @@ def test_bad_sources_are_a_line_each_and_the_others_are_pooled(
     assert len(capsys.readouterr().err.splitlines()) == 1
 
 
-def test_labs_that_name_their_files_alike_are_told_apart(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_labs_that_name_their_files_alike_are_told_apart(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     for lab, seed in (("one", 0), ("two", 1)):
         (tmp_path / lab).mkdir()
         archive(tmp_path / lab, "results", seed)
@@ -224,8 +262,15 @@ def test_labs_that_name_their_files_alike_are_told_apart(tmp_path: Path, capsys:
     assert f"| {sources[1]} |" in capsys.readouterr().out
 
 
-def test_a_metric_that_a_source_lacks_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(["pool", str(archive(tmp_path, "lab")), "--arm", "volumetric", "--metric", "lpips_alex"]) == 2
+def test_a_metric_that_a_source_lacks_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert (
+        run(
+            ["pool", str(archive(tmp_path, "lab")), "--arm", "volumetric", "--metric", "lpips_alex"]
+        )
+        == 2
+    )
     assert "can be paired in lpips_alex" in capsys.readouterr().err
     assert run(["pool", str(tmp_path / "lab.zip")]) == 2
     assert "--arm" in capsys.readouterr().err

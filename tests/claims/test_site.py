@@ -1,4 +1,5 @@
-"""The site from archives: what its pages say, that strangers' words stay words, and that its tables sort."""
+"""The site from archives: what its pages say, that strangers' words stay words, and that its tables
+sort."""
 
 from __future__ import annotations
 
@@ -30,7 +31,9 @@ def archive(tmp_path: Path, plan: Plan, pictures: bool = False, claim: str = "")
     write_runs(runs, plan)
     if claim:
         question = Question(metric="psnr", least=0.1, scenes=CLAIM, seeds=(0, 1, 2), name=claim)
-        (runs / plan.experiment / "declared.jsonl").write_text(record_text([declared_now(questions=(question,))]))
+        (runs / plan.experiment / "declared.jsonl").write_text(
+            record_text([declared_now(questions=(question,))])
+        )
     write_archive(load_experiment(runs, plan.experiment), file, pictures)
     return file
 
@@ -56,14 +59,25 @@ class Elements(HTMLParser):
         self.text += data
 
 
-def test_the_first_page_has_arms_scenes_claims_and_links_that_lead_somewhere(tmp_path: Path) -> None:
+def test_the_first_page_has_arms_scenes_claims_and_links_that_lead_somewhere(
+    tmp_path: Path,
+) -> None:
     files = [
         archive(tmp_path, Plan(), claim="sharper"),
         archive(tmp_path, Plan(experiment="other", effect={"psnr": 2})),
     ]
     page = site(tmp_path, *files)
     found = Elements(page)
-    for words in ("courtyard", "garden", "sfm", "volumetric", "PSNR (dB)", "sharper", "better in", "paper-1"):
+    for words in (
+        "courtyard",
+        "garden",
+        "sfm",
+        "volumetric",
+        "PSNR (dB)",
+        "sharper",
+        "better in",
+        "paper-1",
+    ):
         assert words in found.text
     for _, attributes in found.elements:
         target = attributes.get("href") or attributes.get("src") or ""
@@ -78,17 +92,26 @@ def test_the_first_page_has_arms_scenes_claims_and_links_that_lead_somewhere(tmp
 
 def test_a_table_of_many_metrics_becomes_one_of_each(tmp_path: Path) -> None:
     write_runs(tmp_path, Plan())
-    table = build_table(load_experiment(tmp_path, "exp"), columns=("scene",), metrics=("psnr", "ssim", "flip"))
+    table = build_table(
+        load_experiment(tmp_path, "exp"), columns=("scene",), metrics=("psnr", "ssim", "flip")
+    )
     parts = list(_by_quantity(table))
     assert [part.title for part in parts] == [name for name, _ in table.groups]
     for place, part in enumerate(parts):
-        assert [row.entries for row in part.rows] == [row.entries[2 * place : 2 * place + 2] for row in table.rows]
+        assert [row.entries for row in part.rows] == [
+            row.entries[2 * place : 2 * place + 2] for row in table.rows
+        ]
         assert not any(row.rule_above for row in part.rows)
 
 
 @pytest.mark.parametrize(
     ("name", "taken", "key"),
-    [("A b!", set(), "a-b"), ("exp", {"exp"}, "exp-2"), ("exp", {"exp", "exp-2"}, "exp-3"), ("…", set(), "experiment")],
+    [
+        ("A b!", set(), "a-b"),
+        ("exp", {"exp"}, "exp-2"),
+        ("exp", {"exp", "exp-2"}, "exp-3"),
+        ("…", set(), "experiment"),
+    ],
 )
 def test_a_key_is_plain_and_not_taken(name: str, taken: set[str], key: str) -> None:
     assert _unique_key(name, taken) == key
@@ -97,7 +120,8 @@ def test_a_key_is_plain_and_not_taken(name: str, taken: set[str], key: str) -> N
 def test_pictures_are_there_where_the_archive_has_them(tmp_path: Path) -> None:
     file = archive(tmp_path, Plan(seeds=(0,), scenes=("courtyard",), pictures=True), pictures=True)
     site(tmp_path, file)
-    assert "data:image/jpeg" in (tmp_path / "site" / "reports" / "exp.html").read_text()  # whole views
+    # whole views
+    assert "data:image/jpeg" in (tmp_path / "site" / "reports" / "exp.html").read_text()
     without = tmp_path / "without.zip"
     write_archive(load_experiment(tmp_path / "runs-exp", "exp"), without)
     assert without.stat().st_size < file.stat().st_size / 2
@@ -138,7 +162,9 @@ def test_words_of_a_stranger_stay_words(tmp_path: Path) -> None:
         import hashlib
 
         manifest = json.loads(content["archive.json"])
-        manifest["sha256"] = {name: hashlib.sha256(content[name]).hexdigest() for name in manifest["sha256"]}
+        manifest["sha256"] = {
+            name: hashlib.sha256(content[name]).hexdigest() for name in manifest["sha256"]
+        }
         content["archive.json"] = json.dumps(manifest).encode()
 
     file = archive(tmp_path, Plan(), claim=HOSTILE)
@@ -147,7 +173,9 @@ def test_words_of_a_stranger_stay_words(tmp_path: Path) -> None:
     pages = [page, (tmp_path / "site" / "reports" / "exp.html").read_text()]
     for text in pages:
         found = Elements(text)
-        assert not [tag for tag, attributes in found.elements if "onerror" in attributes or tag == "img"]
+        assert not [
+            tag for tag, attributes in found.elements if "onerror" in attributes or tag == "img"
+        ]
     assert HOSTILE in Elements(page).text
     assert page.count("<script>") == 1
 
@@ -201,7 +229,9 @@ def test_a_picture_that_leads_elsewhere_is_refused(tmp_path: Path, name: str) ->
     rewrite(file, add)
     before = {path for path in tmp_path.rglob("*") if "inside" not in path.parts}
     with pytest.raises(
-        InputError, match=r"cannot be a picture of a trial|cannot be the folder of a trial|not that of an archive"
+        InputError,
+        match=r"cannot be a picture of a trial|cannot be the folder of a trial|not that of an "
+        r"archive",
     ):
         unpack_archive(file, tmp_path / "inside")
     assert {path for path in tmp_path.rglob("*") if "inside" not in path.parts} == before
@@ -209,14 +239,21 @@ def test_a_picture_that_leads_elsewhere_is_refused(tmp_path: Path, name: str) ->
 
 @pytest.mark.slow
 def test_a_click_on_a_heading_sorts(tmp_path: Path) -> None:
-    archives = [archive(tmp_path, Plan(experiment=name, seeds=range(k + 1))) for k, name in enumerate("cab")]
+    archives = [
+        archive(tmp_path, Plan(experiment=name, seeds=range(k + 1))) for k, name in enumerate("cab")
+    ]
     site(tmp_path, *archives)
 
     def evaluated(browser: Browser, script: str) -> str:
         return str(browser.call("Runtime.evaluate", expression=script)["result"]["value"])
 
-    names = "[...document.querySelector('table').tBodies[0].rows].map((row) => row.cells[0].textContent).join('')"
-    with Browser((tmp_path / "site" / "index.html").as_uri(), tmp_path / "profile", (400, 800)) as browser:
+    names = (
+        "[...document.querySelector('table').tBodies[0].rows].map((row) => "
+        "row.cells[0].textContent).join('')"
+    )
+    with Browser(
+        (tmp_path / "site" / "index.html").as_uri(), tmp_path / "profile", (400, 800)
+    ) as browser:
         browser.wait_until(lambda picture: bool((picture < 100).any()), "text")
         assert evaluated(browser, names) == "cab"
         for column, shown in ((0, "abc"), (0, "cba"), (1, "cab"), (1, "bac")):

@@ -1,4 +1,5 @@
-"""Looks: which trials each needs, in which order, and that a question whose trials failed gets no more."""
+"""Looks: which trials each needs, in which order, and that a question whose trials failed gets no
+more."""
 
 from __future__ import annotations
 
@@ -14,10 +15,17 @@ from gsbench.claims.stopping import KeyAndSeed, headline, run_looks, trials_of_l
 from gsbench.runs.experiments import Arm, Declaration, Question
 
 BOTH = Question(
-    metric="psnr", baseline=Arm("sfm", "adc"), arm=Arm("sfm", "new"), scenes={"x": ("a", "b")}, seeds=(7, 5, 6), sign=1
+    metric="psnr",
+    baseline=Arm("sfm", "adc"),
+    arm=Arm("sfm", "new"),
+    scenes={"x": ("a", "b")},
+    seeds=(7, 5, 6),
+    sign=1,
 )
 DECLARATION = Declaration(
-    time="2020-01-01T00:00:00Z", questions=(BOTH, replace(BOTH, scenes={"x": ("a", "c")}, seeds=(5, 7))), looks=(2, 3)
+    time="2020-01-01T00:00:00Z",
+    questions=(BOTH, replace(BOTH, scenes={"x": ("a", "c")}, seeds=(5, 7))),
+    looks=(2, 3),
 )
 
 
@@ -30,7 +38,8 @@ def test_trials_come_seed_by_seed_and_each_once() -> None:
     assert trials_of_look(DECLARATION, [1], 9) == [("a", 5), ("c", 5), ("a", 7), ("c", 7)]
     both = trials_of_look(DECLARATION, [0, 1], 1)
     assert both == [("a", 7), ("b", 7), ("a", 5), ("c", 5)]
-    assert len(trials_of_look(DECLARATION, [0, 1], 3)) == 3 * 2 + 2  # the second question shares its baseline's trials
+    # the second question shares its baseline's trials
+    assert len(trials_of_look(DECLARATION, [0, 1], 3)) == 3 * 2 + 2
 
 
 @pytest.mark.parametrize(
@@ -38,23 +47,31 @@ def test_trials_come_seed_by_seed_and_each_once() -> None:
     [
         ([(True, True)], []),  # decided before: nothing is run
         ([(False, True), (True, True)], [4]),
-        ([(False, False)] * 3, [6]),  # no pair is there after the first look: both wait for what failed
+        # no pair is there after the first look: both wait for what failed
+        ([(False, False)] * 3, [6]),
     ],
 )
-def test_looks_end_when_nothing_can_be_decided(finals: list[tuple[bool, bool]], looked: list[int]) -> None:
+def test_looks_end_when_nothing_can_be_decided(
+    finals: list[tuple[bool, bool]], looked: list[int]
+) -> None:
     batches: list[list[KeyAndSeed]] = []
     answers = iter(finals)
-    verdicts = run_looks(DECLARATION, lambda: [verdict(final) for final in next(answers)], batches.append)
+    verdicts = run_looks(
+        DECLARATION, lambda: [verdict(final) for final in next(answers)], batches.append
+    )
     assert [len(batch) for batch in batches] == looked
     assert [one.final for one in verdicts] == list(finals[min(len(looked), len(finals) - 1)])
 
 
 def test_a_pair_is_told_in_a_sentence() -> None:
     assert headline(verdict(False)) == "sfm-new against sfm-adc: no verdict yet, trials are missing"
-    assert headline(replace(verdict(True), untestable="no scene")).endswith("no verdict yet, no scene")
+    assert headline(replace(verdict(True), untestable="no scene")).endswith(
+        "no verdict yet, no scene"
+    )
     answer = Answer(1.0, StudentT(1.0, 0.0, 3.0), 0.05, 0.05, 0.05, 0.0)
     waits, decided = (
-        headline(replace(verdict(final), answer=answer, outcome="supported", notes=("a note",))) for final in (0, 1)
+        headline(replace(verdict(final), answer=answer, outcome="supported", notes=("a note",)))
+        for final in (0, 1)
     )
     assert "sfm-adc: not decided yet, " in waits
     assert "not decided yet" not in decided

@@ -1,4 +1,5 @@
-"""Votes: a page that tells nothing, a whole round in a browser by keyboard, and a verdict by exact tests."""
+"""Votes: a page that tells nothing, a whole round in a browser by keyboard, and a verdict by exact
+tests."""
 
 from __future__ import annotations
 
@@ -39,7 +40,10 @@ SHARP = {"left": "right", "right": "left"}
 def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A runs folder with pictures: two scenes with seven views each, two seeds."""
     folder = tmp_path_factory.mktemp("votes")
-    write_runs(folder, Plan(views=7, seeds=(0, 1), pictures=True, effect={"lpips_vgg_raw": 0.1}, view_noise=0.1))
+    write_runs(
+        folder,
+        Plan(views=7, seeds=(0, 1), pictures=True, effect={"lpips_vgg_raw": 0.1}, view_noise=0.1),
+    )
     return folder
 
 
@@ -59,13 +63,17 @@ def made(runs: Path, out: Path, *words: str) -> RoundKey:
 
 def prefers(arm: str) -> Chooser:
     """Votes of a person who always prefers ``arm``, and sees through traps."""
-    return lambda showing: next((side for side in SHARP if getattr(showing, side) in (arm, "photograph")), "same")
+    return lambda showing: next(
+        (side for side in SHARP if getattr(showing, side) in (arm, "photograph")), "same"
+    )
 
 
 def ballot(key: RoundKey, person: int, choose: Chooser, minute: int = 0, name: str = "") -> Ballot:
     votes = tuple(Vote(showing=one.id, answer=choose(one), seconds=1.0) for one in key.showings)  # type: ignore[arg-type]
     finished = f"2026-11-27T00:{minute:02}:00Z"
-    return Ballot(round=key.round, person=f"{person:016x}", finished=finished, votes=votes, name=name)
+    return Ballot(
+        round=key.round, person=f"{person:016x}", finished=finished, votes=votes, name=name
+    )
 
 
 def saved(folder: Path, one: Ballot) -> str:
@@ -74,23 +82,40 @@ def saved(folder: Path, one: Ballot) -> str:
     return str(file)
 
 
-def made_up(arms: Sequence[str], scenes: int, views: int, people: int = 9, traps: int = 4) -> RoundKey:
+def made_up(
+    arms: Sequence[str], scenes: int, views: int, people: int = 9, traps: int = 4
+) -> RoundKey:
     """A key without pictures: every two arms on each view."""
     showings = [
         Showing(
-            id=f"{scene}{view}{one}{two}", kind="pair", scene=str(scene), view=str(view), seed=0, left=one, right=two
+            id=f"{scene}{view}{one}{two}",
+            kind="pair",
+            scene=str(scene),
+            view=str(view),
+            seed=0,
+            left=one,
+            right=two,
         )
         for scene in range(scenes)
         for view in range(views)
         for one, two in itertools.combinations(arms, 2)
     ]
     first = showings[0]
-    showings.append(replace(first, id="again", kind="again", left=first.right, right=first.left, of=first.id))
-    trap = Showing(id="", kind="trap", scene="0", view="0", seed=0, left="photograph", right="blurred")
+    showings.append(
+        replace(first, id="again", kind="again", left=first.right, right=first.left, of=first.id)
+    )
+    trap = Showing(
+        id="", kind="trap", scene="0", view="0", seed=0, left="photograph", right="blurred"
+    )
     showings += [replace(trap, id=f"trap{number}") for number in range(traps)]
     named = tuple(Arm(*arm.split("-")) for arm in arms)
     return RoundKey(
-        salt="s", time="2026-11-27T00:00:00Z", arms=named, people=people, traps_allowed=0, showings=tuple(showings)
+        salt="s",
+        time="2026-11-27T00:00:00Z",
+        arms=named,
+        people=people,
+        traps_allowed=0,
+        showings=tuple(showings),
     )
 
 
@@ -121,15 +146,21 @@ def test_each_showing_has_the_pictures_that_its_key_says(runs: Path, tmp_path: P
     entries = json.loads(text.partition('id="data">')[2].partition("</script>")[0])["showings"]
     trials = {(t.scene, str(t.arm), t.seed): t.path for t in load_experiment(runs, "exp").trials}
     for entry, showing in zip(entries, key.showings, strict=True):
-        photo, left, right = (np.asarray(Image.open(page / entry[what])) for what in ("photo", "left", "right"))
+        photo, left, right = (
+            np.asarray(Image.open(page / entry[what])) for what in ("photo", "left", "right")
+        )
         folder = trials[showing.scene, ADC, showing.seed]
-        np.testing.assert_array_equal(photo, np.asarray(Image.open(folder / "ground_truth" / f"{showing.view}.png")))
+        np.testing.assert_array_equal(
+            photo, np.asarray(Image.open(folder / "ground_truth" / f"{showing.view}.png"))
+        )
         for side, shown in (("left", left), ("right", right)):
             what = getattr(showing, side)
             if showing.kind == "trap":
                 assert np.array_equal(shown, photo) == (what == "photograph")
             else:
-                render = trials[showing.scene, what, showing.seed] / "renders" / f"{showing.view}.png"
+                render = (
+                    trials[showing.scene, what, showing.seed] / "renders" / f"{showing.view}.png"
+                )
                 np.testing.assert_array_equal(shown, np.asarray(Image.open(render)))
 
 
@@ -138,7 +169,9 @@ def test_views_sides_repeats_and_traps_follow_the_rules(runs: Path, tmp_path: Pa
     kinds = [one.kind for one in key.showings]
     assert [kinds.count(kind) for kind in ("pair", "again", "trap")] == [12, 1, 4]  # type: ignore[arg-type]
     assert [one.left for one in key.pairs].count(ADC) == 6
-    assert sorted(one.left for one in key.showings if one.kind == "trap") == 2 * ["blurred"] + 2 * ["photograph"]
+    assert sorted(one.left for one in key.showings if one.kind == "trap") == 2 * ["blurred"] + 2 * [
+        "photograph"
+    ]
     for scene in ("courtyard", "garden"):
         own = [one for one in key.pairs if one.scene == scene]
         assert len({one.view for one in own}) == len(own) == 6
@@ -157,11 +190,17 @@ def test_views_sides_repeats_and_traps_follow_the_rules(runs: Path, tmp_path: Pa
     for showing in key.showings:
         if showing.kind == "again":
             first = next(one for one in key.pairs if one.id == showing.of)
-            assert (showing.left, showing.right, showing.view) == (first.right, first.left, first.view)
+            assert (showing.left, showing.right, showing.view) == (
+                first.right,
+                first.left,
+                first.view,
+            )
             assert key.showings.index(showing) > key.showings.index(first)
 
 
-def test_more_pairs_than_views_are_said(runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_more_pairs_than_views_are_said(
+    runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     key = made(runs, tmp_path / "page", "--pairs", "40", "--people", "9")
     out = capsys.readouterr().out
     assert len(key.pairs) == 14
@@ -190,7 +229,10 @@ def test_it_is_declared_and_leaves_other_declarations_alone(runs: Path, tmp_path
         (["make", "exp"], "needs --out"),
         (["make", "exp", "--out", "."], "is there already"),
         (["make", "exp", "--out", "new", "--arms", "adc"], "sfm-adc alone"),
-        (["make", "exp", "--out", "new", "--arms", "adc,mcmc"], "'mcmc' names 0 arms; there are sfm-adc"),
+        (
+            ["make", "exp", "--out", "new", "--arms", "adc,mcmc"],
+            "'mcmc' names 0 arms; there are sfm-adc",
+        ),
         (["make", "exp", "--out", "new", "--pairs", "0"], "from 1 to 1000"),
         (["make", "exp", "x.json", "--out", "new"], "takes no files"),
         (["judge", "exp", "absent.json"], "absent.json is not there"),
@@ -199,7 +241,12 @@ def test_it_is_declared_and_leaves_other_declarations_alone(runs: Path, tmp_path
     ],
 )
 def test_bad_input_is_one_line(
-    runs: Path, words: list[str], message: str, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: Any
+    runs: Path,
+    words: list[str],
+    message: str,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    monkeypatch: Any,
 ) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "file").touch()
@@ -221,7 +268,9 @@ def test_without_pictures_there_is_no_page(tmp_path: Path) -> None:
 # ---- files of votes
 
 
-def test_files_that_do_not_fit_are_refused(runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_files_that_do_not_fit_are_refused(
+    runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     key = made(runs, tmp_path / "page", "--pairs", "12", "--people", "2")
     sound = ballot(key, 1, prefers(ADC))
     part = replace(sound, person=f"{2:016x}", votes=sound.votes[:-1])
@@ -247,7 +296,9 @@ def test_files_that_do_not_fit_are_refused(runs: Path, tmp_path: Path, capsys: p
     assert "other votes before" in capsys.readouterr().err
 
 
-def test_a_changed_key_judges_nothing(runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_changed_key_judges_nothing(
+    runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     key = made(runs, tmp_path / "page", "--pairs", "12")
     file = runs / "exp" / "votes" / key.round / "key.json"
     text = file.read_text()
@@ -274,8 +325,13 @@ def test_the_report_shows_where_people_and_lpips_disagree(runs: Path, tmp_path: 
     page = build_report(load_experiment(runs, "exp"))
     part = page.partition(f"Round {key.round}")[2].partition("</section>")[0].partition("Round ")[0]
     # LPIPS is worse by 0.1 for the arm that this person prefers, on every view.
-    assert re.search(r"LPIPS VGG raw ↓</th><td>undecided</td><td>\+0.1\d+</td><td>0 of 12 views", part)
-    assert part.count("people prefer sfm-volumetric (mean vote +1.00), LPIPS VGG raw prefers sfm-adc") == 3
+    assert re.search(
+        r"LPIPS VGG raw ↓</th><td>undecided</td><td>\+0.1\d+</td><td>0 of 12 views", part
+    )
+    assert (
+        part.count("people prefer sfm-volumetric (mean vote +1.00), LPIPS VGG raw prefers sfm-adc")
+        == 3
+    )
     assert part.count("<img") == 12
 
 
@@ -339,12 +395,18 @@ def test_more_arms_share_the_error_rate() -> None:
 
     def choose(showing: Showing) -> str:
         return max(
-            SHARP, key=lambda side: order.index(getattr(showing, side)) if showing.kind != "trap" else side == "left"
+            SHARP,
+            key=lambda side: (
+                order.index(getattr(showing, side)) if showing.kind != "trap" else side == "left"
+            ),
         )
 
     verdict = judge_round(key, [ballot(key, n, choose) for n in range(9)])
     assert [str(pair.arm) for pair in verdict.pairs] == ["sfm-b", "sfm-c"]
-    assert all(pair.people is not None and pair.people.level == pytest.approx(0.025) for pair in verdict.pairs)
+    assert all(
+        pair.people is not None and pair.people.level == pytest.approx(0.025)
+        for pair in verdict.pairs
+    )
     assert [str(arm) for arm, _, _ in verdict.ranking] == ["sfm-b", "sfm-c", "sfm-a"]
     assert all(interval.low <= chance <= interval.high for _, chance, interval in verdict.ranking)
 
@@ -362,7 +424,9 @@ def test_the_ranking_is_the_maximum_of_its_likelihood() -> None:
         np.testing.assert_allclose(chances, 1 / (1 + np.exp(theta.mean() - theta)), atol=1e-5)
 
 
-@pytest.mark.parametrize("name", ["everybody guesses", "people differ", "scenes differ", "people and scenes differ"])
+@pytest.mark.parametrize(
+    "name", ["everybody guesses", "people differ", "scenes differ", "people and scenes differ"]
+)
 def test_without_an_effect_few_rounds_state_one(name: str) -> None:
     untruths = script("vote_untruths")
     people, scenes, both, votes = untruths.rates(untruths.KINDS[name], 0.0, 300)[1::2]
@@ -413,7 +477,11 @@ def test_two_people_vote_by_keyboard_and_are_judged(
         with Browser(address, tmp_path / f"profile{width}", (width, 800)) as browser:
             metrics = {"width": width, "height": 800, "deviceScaleFactor": 1, "mobile": False}
             browser.call("Emulation.setDeviceMetricsOverride", **metrics)
-            browser.call("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(tmp_path / str(width)))
+            browser.call(
+                "Browser.setDownloadBehavior",
+                behavior="allow",
+                downloadPath=str(tmp_path / str(width)),
+            )
             voter = Voter(browser, key, chooser)
             voter.wait("!document.getElementById('start').hidden")
             browser.call("Input.insertText", text=f"person {width}")
@@ -423,17 +491,25 @@ def test_two_people_vote_by_keyboard_and_are_judged(
             voter.value("window.before = true")
             browser.call("Page.reload")
             voter.wait("!window.before && state.votes.length === 7 && ready")
-            # All three pictures have the same part and zoom; a vote starts the next pair with whole pictures.
+            # All three pictures have the same part and zoom; a vote starts the next pair with whole
+            # pictures.
             voter.press("+")
             voter.press("ArrowRight", modifiers=8)
-            boxes = "[...document.querySelectorAll('.panel img')].map((i) => getComputedStyle(i).transform)"
-            assert voter.value(f"new Set({boxes}).size === 1 && !{boxes}[0].startsWith('matrix(1, 0, 0, 1, 0')")
+            boxes = (
+                "[...document.querySelectorAll('.panel img')].map((i) => "
+                "getComputedStyle(i).transform)"
+            )
+            assert voter.value(
+                f"new Set({boxes}).size === 1 && !{boxes}[0].startsWith('matrix(1, 0, 0, 1, 0')"
+            )
             voter.press("f")
             assert voter.value("document.querySelectorAll('.side.under').length") == 1
             voter.press("Backspace")
             voter.answer(6, last)
             voter.wait("!document.getElementById('end').hidden")
-            assert voter.value("document.documentElement.scrollWidth <= document.documentElement.clientWidth")
+            assert voter.value(
+                "document.documentElement.scrollWidth <= document.documentElement.clientWidth"
+            )
             voter.press("Enter")
             voter.wait("document.getElementById('saved').textContent !== ''")
             saved_in = tmp_path / str(width)

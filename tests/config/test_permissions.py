@@ -1,4 +1,5 @@
-"""Other people's runs folders and trainers: what they may run is what the one who types allows, every time."""
+"""Other people's runs folders and trainers: what they may run is what the one who types allows,
+every time."""
 
 from __future__ import annotations
 
@@ -24,23 +25,48 @@ from tests.strange import place as place
 pytestmark = pytest.mark.usefixtures("place")
 STRANGE_TRIALS: dict[str, tuple[dict[str, Any], str]] = {
     "a class": ({"densify": {"_target_": "bomb.Bomb"}}, "add allow_targets=[bomb] to the command"),
-    "a metric": ({"eval": {"extra": {"x": {"_target_": "bomb.Bomb"}}}}, "add allow_targets=[bomb] to the command"),
+    "a metric": (
+        {"eval": {"extra": {"x": {"_target_": "bomb.Bomb"}}}},
+        "add allow_targets=[bomb] to the command",
+    ),
     "a program": (
-        {"densify": {"_target_": "gsbench.densify.External", "name": "x", "command": "bash {data}", "version": "1",
-                     "result": "x.ply"}}, "add allow_targets=[bash] to the command",
+        {
+            "densify": {
+                "_target_": "gsbench.densify.External",
+                "name": "x",
+                "command": "bash {data}",
+                "version": "1",
+                "result": "x.ply",
+            }
+        },
+        "add allow_targets=[bash] to the command",
     ),
     "a program by another path": (
-        {"densify": {"_target_": "gsbench.external.settings.External", "name": "x", "command": "bash {data}",
-                     "version": "1", "result": "x.ply"}}, "add allow_targets=[bash] to the command",
+        {
+            "densify": {
+                "_target_": "gsbench.external.settings.External",
+                "name": "x",
+                "command": "bash {data}",
+                "version": "1",
+                "result": "x.ply",
+            }
+        },
+        "add allow_targets=[bash] to the command",
     ),
-    "a shell": ({"launch": {"setup": ["touch exploded"]}}, "add allow_targets=[bash] to the command"),
-}  # fmt: skip
+    "a shell": (
+        {"launch": {"setup": ["touch exploded"]}},
+        "add allow_targets=[bash] to the command",
+    ),
+}
 
 
 def strange_runs(settings: dict[str, Any]) -> Path:
-    """A trial of somebody else's that failed, in no plan; its configuration allows itself everything."""
+    """A trial of somebody else's that failed, in no plan; its configuration allows itself
+    everything."""
     (trial,) = compose_trials(["name=x"])
-    values = json.loads(json.dumps(trial.values)) | {"allow_targets": ["bomb", "bash", "os", "gsbench", "bombs"]}
+    values = json.loads(json.dumps(trial.values)) | {
+        "allow_targets": ["bomb", "bash", "os", "gsbench", "bombs"]
+    }
     for group, own in settings.items():
         values[group] |= own
     folder = Path(values["runs"]) / "x" / "courtyard" / "sfm-volumetric" / "01234567-seed0"
@@ -68,7 +94,13 @@ def test_retry_runs_nothing_of_a_strange_folder_unasked(
 @pytest.mark.parametrize("case", ["a class", "a metric", "a program", "a program by another path"])
 def test_what_only_reads_runs_nothing_of_a_strange_folder(case: str) -> None:
     strange_runs(STRANGE_TRIALS[case][0])
-    for words in (["status"], ["status", "x"], ["status", "x", "--json"], ["tables", "x"], ["report", "x"]):
+    for words in (
+        ["status"],
+        ["status", "x"],
+        ["status", "x", "--json"],
+        ["tables", "x"],
+        ["report", "x"],
+    ):
         cli.run(words)
     assert not Path("exploded").exists()
 
@@ -90,7 +122,8 @@ def test_retry_does_what_it_is_allowed_to(monkeypatch: pytest.MonkeyPatch) -> No
 def test_a_plan_allows_nothing_and_names_no_folder_of_modules(
     place: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A stranger's plan says what is allowed, and a folder of the stranger's whose `mine` explodes."""
+    """A stranger's plan says what is allowed, and a folder of the stranger's whose `mine`
+    explodes."""
     theirs = place / "theirs"
     theirs.mkdir()
     (theirs / "mine.py").write_text(f"open({str(place / 'exploded')!r}, 'w')\nclass Mine: ...\n")
@@ -108,13 +141,18 @@ def test_a_plan_allows_nothing_and_names_no_folder_of_modules(
     monkeypatch.chdir(place)
     assert cli.run(["retry", "x", "allow_targets=[mine]"]) == 0
     values = began[0].values
-    assert build("densify", values["densify"], values["allow_targets"]).__class__.__module__ == "mine"
+    assert (
+        build("densify", values["densify"], values["allow_targets"]).__class__.__module__ == "mine"
+    )
     assert sys.modules["mine"].__file__ == str(place / "mine.py")
     assert not (place / "exploded").exists()
 
 
-def test_a_plan_names_no_folder_of_packages_of_settings(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Hydra imports ``pkg://conf_of_mine`` while it composes: the user's own, not one in the folder of the plan."""
+def test_a_plan_names_no_folder_of_packages_of_settings(
+    place: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Hydra imports ``pkg://conf_of_mine`` while it composes: the user's own, not one in the folder
+    of the plan."""
     theirs = place / "theirs"
     for folder, line in (("theirs", f"open({str(place / 'exploded')!r}, 'w')\n"), (".", "")):
         (place / folder / "conf_of_mine").mkdir(parents=True)
@@ -124,7 +162,10 @@ def test_a_plan_names_no_folder_of_packages_of_settings(place: Path, monkeypatch
     plan = place / "runs" / "x" / "plan.json"
     content = json.loads(plan.read_text())
     for planned in content["trials"].values():
-        planned |= {"cwd": str(theirs), "overrides": [*planned["overrides"], "hydra.searchpath=[pkg://conf_of_mine]"]}
+        planned |= {
+            "cwd": str(theirs),
+            "overrides": [*planned["overrides"], "hydra.searchpath=[pkg://conf_of_mine]"],
+        }
     plan.write_text(json.dumps(content))
     assert cli.run(["retry", "x", "allow_targets=[conf_of_mine]", "--dry-run"]) == 0
     assert sys.modules.pop("conf_of_mine").__file__ == str(place / "conf_of_mine" / "__init__.py")
@@ -148,12 +189,20 @@ PROGRAM = [
         (["densify.version_command=[curl,strange]"], "python,curl"),
         (["densify.version_command='bash -c true'"], "python,bash"),
         (["+densify.environment.PATH=/strange"], "python,PATH"),
-        (["+densify.environment.LD_PRELOAD=/strange.so", "densify.version_command=[git]"], "python,git,LD_PRELOAD"),
+        (
+            ["+densify.environment.LD_PRELOAD=/strange.so", "densify.version_command=[git]"],
+            "python,git,LD_PRELOAD",
+        ),
         (["densify._target_=gsbench.external.settings.External"], "python"),
-        (["densify.command=['{p}','{data}']", "+densify.options.p=/strange/python"], "/strange/python"),
+        (
+            ["densify.command=['{p}','{data}']", "+densify.options.p=/strange/python"],
+            "/strange/python",
+        ),
     ],
 )
-def test_every_program_and_variable_of_another_trainer_is_asked_for(words: list[str], missing: str) -> None:
+def test_every_program_and_variable_of_another_trainer_is_asked_for(
+    words: list[str], missing: str
+) -> None:
     with pytest.raises(InputError) as caught:
         compose_one([*PROGRAM, *words])
     assert f"add allow_targets=[{missing}] to the command" in str(caught.value)
@@ -167,11 +216,23 @@ def test_every_program_and_variable_of_another_trainer_is_asked_for(words: list[
             check_permissions(values | {"allow_targets": rest})
 
 
-@pytest.mark.parametrize("target", ["gsbench.external.exchange.External", "gsbench.pipeline.parts.External"])
+@pytest.mark.parametrize(
+    "target", ["gsbench.external.exchange.External", "gsbench.pipeline.parts.External"]
+)
 def test_the_class_of_another_trainer_has_two_names(target: str) -> None:
     """Permissions are asked for by these; by any other that leads to it, nothing is made."""
     with pytest.raises(InputError):
-        build("densify", {"_target_": target, "name": "x", "command": "bash {data}", "version": "1", "result": "x"}, [])
+        build(
+            "densify",
+            {
+                "_target_": target,
+                "name": "x",
+                "command": "bash {data}",
+                "version": "1",
+                "result": "x",
+            },
+            [],
+        )
     with pytest.raises(InputError):
         compose_one([*PROGRAM, f"densify._target_={target}"])
 

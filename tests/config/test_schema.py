@@ -1,4 +1,5 @@
-"""Every file in ``conf`` composes, its classes can be built, and what is written there is what the code defaults to."""
+"""Every file in ``conf`` composes, its classes can be built, and what is written there is what the
+code defaults to."""
 
 from __future__ import annotations
 
@@ -39,7 +40,11 @@ def composed(*overrides: str) -> dict[str, Any]:
 
 # What the user of another program must say: its version, where it lies, and that it may run.
 PROGRAMS = {
-    "external/program": ["densify.command=[mine,'{data}']", "densify.result=x.ply", "allow_targets=[mine]"],
+    "external/program": [
+        "densify.command=[mine,'{data}']",
+        "densify.result=x.ply",
+        "allow_targets=[mine]",
+    ],
     "external/3dgs": ["densify.options.code=/code", "allow_targets=[python,git]"],
     "external/gsplat": ["densify.options.code=/code", "allow_targets=[python,git]"],
     "external/opensplat": ["allow_targets=[opensplat]"],
@@ -57,25 +62,36 @@ def needs(option: str) -> list[str]:
     return [*PROGRAMS[option], "densify.version='1'"] if option in PROGRAMS else []
 
 
-@pytest.mark.parametrize(("group", "option"), [(group, option) for group in GROUPS for option in options(group)])
+@pytest.mark.parametrize(
+    ("group", "option"), [(group, option) for group in GROUPS for option in options(group)]
+)
 def test_every_option_composes(group: str, option: str) -> None:
     extra = ["scene.path=/data/capture"] if group == "scene" and option != "courtyard" else []
     extra += PLACES.get(option, [])
     extra += ["densify=none"] if (group, option) == ("train", "none") else []
     extra += needs(option) if group == "densify" else []
     values = composed(f"{group}={option}", *extra)
-    own = {"external/program": "external", **dict.fromkeys(("photos", "colmap", "transforms", "blender"), "capture")}
+    own = {
+        "external/program": "external",
+        **dict.fromkeys(("photos", "colmap", "transforms", "blender"), "capture"),
+    }
     assert values[group]["name"] == own.get(option, option.rpartition("/")[2])
 
 
 @pytest.mark.parametrize("option", options("densify"))
 def test_every_densifier_can_be_built_and_matches_its_class(option: str) -> None:
     config = composed(f"densify={option}", "train=paper", *needs(option))
-    values, densifier = config["densify"], build("densify", config["densify"], config["allow_targets"])
+    values, densifier = (
+        config["densify"],
+        build("densify", config["densify"], config["allow_targets"]),
+    )
     if dataclasses.is_dataclass(densifier):
         names = {field.name for field in dataclasses.fields(densifier) if field.init}
         assert names == set(values) - {"_target_", "name"}  # the YAML shows every option
-    if option not in ("absgrad", "revised", "longaxis", "volumetric_once", "mrnf", "none") and "/" not in option:
+    if (
+        option not in ("absgrad", "revised", "longaxis", "volumetric_once", "mrnf", "none")
+        and "/" not in option
+    ):
         assert densifier == type(densifier)()  # and the values of the class
 
 
@@ -100,7 +116,9 @@ def test_the_paper_schedule_is_the_class_default() -> None:
 def sweep_size(experiment: str) -> int:
     register_schemas()
     with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        config = compose("config", overrides=[f"+experiment={experiment}"], return_hydra_config=True)
+        config = compose(
+            "config", overrides=[f"+experiment={experiment}"], return_hydra_config=True
+        )
     size = 1
     for value in OmegaConf.to_container(config.hydra.sweeper.params).values():  # type: ignore[union-attr]
         size *= len(str(value).split(","))
@@ -109,8 +127,11 @@ def sweep_size(experiment: str) -> int:
 
 def test_the_demo_downloads_little_and_declares_what_it_measures() -> None:
     trials = compose_trials(["+experiment=demo"], multirun=True)
-    asked = {(tuple(trial.values["eval"]["lpips"]), trial.values["eval"]["primary"]) for trial in trials}
-    assert asked == {(("squeeze",), "flip")}  # which needs no weights; LPIPS joins where its weights are
+    asked = {
+        (tuple(trial.values["eval"]["lpips"]), trial.values["eval"]["primary"]) for trial in trials
+    }
+    # which needs no weights; LPIPS joins where its weights are
+    assert asked == {(("squeeze",), "flip")}
 
 
 def test_experiments_have_the_size_of_the_paper() -> None:
@@ -144,9 +165,15 @@ def test_rules_name_the_key(overrides: list[str], key: str) -> None:
 @pytest.mark.parametrize(
     ("words", "error"),
     [
-        (["eval.primary=lpips_vg"], r"is not a metric; did you mean lpips_vgg\? \(known are psnr, ssim, .*flip"),
+        (
+            ["eval.primary=lpips_vg"],
+            r"is not a metric; did you mean lpips_vgg\? \(known are psnr, ssim, .*flip",
+        ),
         (["eval.primary=sharpness"], "is not a metric .*eval.extra"),
-        (["eval.primary=lpips_alex", "eval.lpips=[vgg]"], r"lpips_alex is not measured: add alex to eval\.lpips"),
+        (
+            ["eval.primary=lpips_alex", "eval.lpips=[vgg]"],
+            r"lpips_alex is not measured: add alex to eval\.lpips",
+        ),
         (["eval.primary=flip", "eval.flip=false"], r"eval\.flip=false"),
     ],
 )
@@ -163,12 +190,17 @@ def test_a_metric_of_ones_own_can_be_declared_if_it_says_what_is_better(
     text += "class Unknown(Known):\n    direction = 0\n"
     (tmp_path / "declared_metrics.py").write_text(text)
     for name in ("Known", "Unknown"):
-        own = [f"eval.extra.mine._target_=declared_metrics.{name}", "allow_targets=[declared_metrics]"]
+        own = [
+            f"eval.extra.mine._target_=declared_metrics.{name}",
+            "allow_targets=[declared_metrics]",
+        ]
         values = composed(*own, "eval.primary=mine")["eval"]
         if name == "Known":
             assert set(build_metrics(values, ["declared_metrics"])) == {"mine"}
         else:
-            with pytest.raises(InputError, match=r"eval\.primary=mine: declared_metrics\.Unknown does not say"):
+            with pytest.raises(
+                InputError, match=r"eval\.primary=mine: declared_metrics\.Unknown does not say"
+            ):
                 build_metrics(values, ["declared_metrics"])
 
 
@@ -182,7 +214,9 @@ def test_wrong_type_in_a_component_names_the_key() -> None:
 @pytest.mark.slow
 def test_every_component_of_gsbench_checks_its_own_options() -> None:
     """`build` leaves it to them; what is wrong in every kind of option is a list of lists."""
-    for group, option in [(name, option) for name in ("init", "densify") for option in options(name)]:
+    for group, option in [
+        (name, option) for name in ("init", "densify") for option in options(name)
+    ]:
         values = composed(f"{group}={option}", *needs(option), *PLACES.get(option, []))[group]
         for key in values.keys() - {"_target_", "name"}:
             with pytest.raises(InputError, match=rf"{group}\.{key}"):
@@ -199,8 +233,12 @@ def test_only_trusted_code_is_imported() -> None:
 
 def test_hash_ignores_what_cannot_change_a_result() -> None:
     base = config_hash(composed())
-    assert config_hash(composed("name=other", "seed=5", "threads=1", "tracking=none", "device=cpu")) == base
-    assert config_hash(composed("eval.primary=psnr")) == base  # how a result will be read does not change it
+    assert (
+        config_hash(composed("name=other", "seed=5", "threads=1", "tracking=none", "device=cpu"))
+        == base
+    )
+    # how a result will be read does not change it
+    assert config_hash(composed("eval.primary=psnr")) == base
     assert config_hash(composed("densify.volume_threshold=0.04")) != base
     assert config_hash(composed("scene.max_size=200")) != base
 
@@ -227,7 +265,9 @@ def test_metrics_that_are_not_measured_or_known_are_refused(words: list[str], sa
     assert composed("eval.primary=fps", "eval.fps=[640,480]")["eval"]["primary"] == "fps"
 
 
-def test_hash_follows_the_source_of_a_users_class(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_hash_follows_the_source_of_a_users_class(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.syspath_prepend(str(tmp_path))
     own = ["densify._target_=own_densifier.Mine", "allow_targets=[own_densifier]"]
     hashes = []
@@ -237,7 +277,9 @@ def test_hash_follows_the_source_of_a_users_class(tmp_path: Path, monkeypatch: p
     assert hashes[0] == hashes[2] != hashes[1]
 
 
-def test_hash_follows_the_source_of_a_users_metric(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_hash_follows_the_source_of_a_users_metric(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.syspath_prepend(str(tmp_path))
     values = composed()
     own = ["eval.extra.edges._target_=own_metric.Mine", "allow_targets=[own_metric]"]
@@ -262,7 +304,9 @@ def test_values_of_a_trial_have_the_types_of_json() -> None:
 
 
 def test_an_own_metric_must_be_allowed_and_name_a_class() -> None:
-    with pytest.raises(InputError, match=r"eval\.extra\.edges\._target_=mine\.X is not gsbench's own"):
+    with pytest.raises(
+        InputError, match=r"eval\.extra\.edges\._target_=mine\.X is not gsbench's own"
+    ):
         compose_one(["eval.extra.edges._target_=mine.X"])
     with pytest.raises(InputError, match=r"eval\.extra\.edges must name a class"):
         composed("eval.extra.edges=3")
@@ -278,18 +322,30 @@ def test_no_training_needs_no_densifier() -> None:
 
 @pytest.mark.parametrize("threads", ["4097", "1000000000000", "0"])
 def test_no_more_threads_than_a_system_starts(threads: str) -> None:
-    with pytest.raises(InputError, match=r"threads must be a whole number in \[1, 4096\] or 'auto'"):
+    with pytest.raises(
+        InputError, match=r"threads must be a whole number in \[1, 4096\] or 'auto'"
+    ):
         composed(f"threads={threads}")
 
 
 @pytest.mark.parametrize(
     ("word", "is_kept"),
     [
-        ("name=1_1", False), ("name=1e3", False), ("densify.name=1e3", False), ("name=007", False),
-        ("name=2,1_1", False), ("scene.path=1.50", False), ("name=12", True), ("name=on", True), ("name=0x10", True),
-        ('name="1e3"', True), ("name=2026-11-26", True), ("name=a_1", True), ("densify.volume_threshold=1e-3", True),
+        ("name=1_1", False),
+        ("name=1e3", False),
+        ("densify.name=1e3", False),
+        ("name=007", False),
+        ("name=2,1_1", False),
+        ("scene.path=1.50", False),
+        ("name=12", True),
+        ("name=on", True),
+        ("name=0x10", True),
+        ('name="1e3"', True),
+        ("name=2026-11-26", True),
+        ("name=a_1", True),
+        ("densify.volume_threshold=1e-3", True),
     ],
-)  # fmt: skip
+)
 def test_a_text_is_kept_as_typed_or_refused(word: str, is_kept: bool) -> None:
     if is_kept:
         check_words([word])

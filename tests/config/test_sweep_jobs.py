@@ -1,4 +1,5 @@
-"""A job of a sweep has the configuration that its words give alone, whatever it shares with the others."""
+"""A job of a sweep has the configuration that its words give alone, whatever it shares with the
+others."""
 
 from __future__ import annotations
 
@@ -15,12 +16,21 @@ from gsbench.launch.jobs import job_of
 ARMS = "densify=adc,volumetric"
 SWEEPS = {  # words, and how often Hydra composes for them
     "seeds": ([ARMS, "seed=0,1,2"], 2),
-    "values": ([ARMS, "densify.max_gaussians=1000,2000", "train.iterations=100,1e3", "seed=0,1"], 2),
+    "values": (
+        [ARMS, "densify.max_gaussians=1000,2000", "train.iterations=100,1e3", "seed=0,1"],
+        2,
+    ),
     "texts": (["scene=colmap", "scene.path=/a,/b,'/c d'", "seed=3,4"], 1),
     "values for a name alike": (["scene.views=10,20", "scene.width=40,80"], 1),
     "a value made of the seed": (["scene=colmap", "scene.path='/x/${seed}'", "seed=0,1,2"], 1),
-    "a value made of another": (["scene.width='${scene.height}','1${scene.height}'", "scene.height=30,40"], 2),
-    "a name that is made": (["scene=colmap", "scene.path='/${${name}}'", "name=seed,device", "seed=1,2"], 2),
+    "a value made of another": (
+        ["scene.width='${scene.height}','1${scene.height}'", "scene.height=30,40"],
+        2,
+    ),
+    "a name that is made": (
+        ["scene=colmap", "scene.path='/${${name}}'", "name=seed,device", "seed=1,2"],
+        2,
+    ),
     "added": ([ARMS, "+densify.growth_cap=3,4", "seed=0,1"], 4),
     "null": (["densify.max_gaussians=null,5", "seed=0,1"], 2),
     "lists": (["eval.at=[],[3]", "train.iterations=10,20"], 2),
@@ -55,7 +65,9 @@ def test_every_job_is_what_its_words_say(name: str, compositions: list[list[str]
         assert (trial.values, trial.yaml) == (alone.values, alone.yaml)
 
 
-@pytest.mark.parametrize("words", [["seed=0,-1"], ["train.iterations=5,-5"], ["seed=0,1", "scene.views=9,no"]])
+@pytest.mark.parametrize(
+    "words", [["seed=0,-1"], ["train.iterations=5,-5"], ["seed=0,1", "scene.views=9,no"]]
+)
 def test_a_bad_value_is_refused_where_it_shares_a_composition(words: list[str]) -> None:
     with pytest.raises(InputError, match=f"{words[-1].partition('=')[0]} must be"):
         compose_trials(words, multirun=True)
@@ -68,7 +80,18 @@ def test_a_bad_value_is_refused_where_it_shares_a_composition(words: list[str]) 
         (["a.b={c:1}", "d.e=2"], {}),  # whose order Hydra keeps
         (["+a.b.c=1", "a.b=2"], {}),
         (["a.b=1", "~a.b"], {}),
-        (["a._target_=x.Y", "hydra.job.name=x", "a.b=${c}", "a.c=[1]", "a.d=null", "+a.e=1", "a/f=g"], {}),
+        (
+            [
+                "a._target_=x.Y",
+                "hydra.job.name=x",
+                "a.b=${c}",
+                "a.c=[1]",
+                "a.d=null",
+                "+a.e=1",
+                "a/f=g",
+            ],
+            {},
+        ),
     ],
 )
 def test_values_that_may_be_set_after_the_rest(words: list[str], values: dict[str, object]) -> None:

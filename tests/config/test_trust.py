@@ -1,6 +1,8 @@
-"""Nothing that a configuration or the current folder names is run unless the one who types allows it.
+"""Nothing that a configuration or the current folder names is run unless the one who types allows
+it.
 
-Every case tries to leave a mark: a module that writes a file when it is imported, or a call that makes a folder.
+Every case tries to leave a mark: a module that writes a file when it is imported, or a call that
+makes a folder.
 """
 
 from __future__ import annotations
@@ -33,78 +35,133 @@ def calls(**settings: Any) -> dict[str, Any]:
     return {"hydra": {"callbacks": {"x": {"_target_": LOG_CALLBACK} | settings}}}
 
 
-STRANGE: dict[str, tuple[dict[str, Any], str]] = {  # settings of a file, and a part of the line that refuses them
+# settings of a file, and a part of the line that refuses them
+STRANGE: dict[str, tuple[dict[str, Any], str]] = {
     "a callback": ({"hydra": {"callbacks": {"x": MKDIR}}}, "allow_targets=[os]"),
     "below a callback": (calls(inner=MKDIR), "allow_targets=[os]"),
     "in a list below a callback": (calls(inner=[{"a": [[MKDIR]]}]), "callbacks.x.inner.0.a.0.0."),
     "among positional arguments": (calls(_args_=[MKDIR]), "_args_: gsbench makes no"),
     "a module of the folder": (calls(inner={"_target_": "bomb.Bomb"}), "allow_targets=[bomb]"),
-    "beside Hydra's callbacks": (calls(_target_="hydra.experimental.callbacks.pickle.loads"), "allow_targets=[hydra]"),
+    "beside Hydra's callbacks": (
+        calls(_target_="hydra.experimental.callbacks.pickle.loads"),
+        "allow_targets=[hydra]",
+    ),
     "what gsbench's modules import": (
-        calls(_target_="gsbench.files.os.mkdir", path="exploded"), "is not a class for hydra.callbacks.x"
+        calls(_target_="gsbench.files.os.mkdir", path="exploded"),
+        "is not a class for hydra.callbacks.x",
     ),
     "a class of gsbench in a strange place": (
-        calls(_target_="gsbench.logs._QuietFileHandler", filename="exploded"), "is not a class for hydra.callbacks.x"
+        calls(_target_="gsbench.logs._QuietFileHandler", filename="exploded"),
+        "is not a class for hydra.callbacks.x",
     ),
     "a copy for a callback": ({"hydra": {"callbacks": {"x": "${densify}"}}}, "write the settings"),
     "a copy in a callback": (calls(inner="${hydra.launcher}"), "write the settings"),
     "all callbacks as a copy": ({"hydra": {"callbacks": "${train}"}}, "hydra.callbacks"),
     "a callback that allows itself": (
-        {"allow_targets": ["os"], "hydra": {"callbacks": {"x": MKDIR}}}, "no file can allow it"
+        {"allow_targets": ["os"], "hydra": {"callbacks": {"x": MKDIR}}},
+        "no file can allow it",
     ),
     "below the sweeper": (
-        {"hydra": {"mode": "MULTIRUN", "sweeper": {"params": {"in": MKDIR}}}}, "sweeper.params.in._target_=os.mkdir"
+        {"hydra": {"mode": "MULTIRUN", "sweeper": {"params": {"in": MKDIR}}}},
+        "sweeper.params.in._target_=os.mkdir",
     ),
-    "beside the sweeper's settings": ({"hydra": {"sweeper": {"grids": [MKDIR]}}}, "hydra.sweeper.grids.0"),
-    "a sweeper": ({"hydra": {"sweeper": {"_target_": "hydra_plugins.bomb.Bomb"}}}, "allow_targets=[hydra_plugins]"),
+    "beside the sweeper's settings": (
+        {"hydra": {"sweeper": {"grids": [MKDIR]}}},
+        "hydra.sweeper.grids.0",
+    ),
+    "a sweeper": (
+        {"hydra": {"sweeper": {"_target_": "hydra_plugins.bomb.Bomb"}}},
+        "allow_targets=[hydra_plugins]",
+    ),
     "an installed sweeper in another's place": (
-        {"hydra": {"sweeper": {"_target_": "hydra_plugins.hydra_optuna_sweeper.optuna_sweeper.OptunaSweeper"}}},
+        {
+            "hydra": {
+                "sweeper": {
+                    "_target_": "hydra_plugins.hydra_optuna_sweeper.optuna_sweeper.OptunaSweeper"
+                }
+            }
+        },
         "hydra.sweeper._target_=",
     ),
     "a text of a sweeper": (
-        {"hydra": {"sweeper": {"custom_search_space": "bomb.Bomb"}}}, "allow_targets=[hydra.sweeper]"
+        {"hydra": {"sweeper": {"custom_search_space": "bomb.Bomb"}}},
+        "allow_targets=[hydra.sweeper]",
     ),
     "below a sweeper": (
-        {"defaults": [{"override /hydra/sweeper": "basic"}], "hydra": {"sweeper": {"max_batch_size": MKDIR}}},
+        {
+            "defaults": [{"override /hydra/sweeper": "basic"}],
+            "hydra": {"sweeper": {"max_batch_size": MKDIR}},
+        },
         "max_batch_size",
     ),
     "a launcher": (
-        {"hydra": {"launcher": {"_target_": "hydra_plugins.gsbench.os.mkdir"}}}, "allow_targets=[hydra_plugins]"
+        {"hydra": {"launcher": {"_target_": "hydra_plugins.gsbench.os.mkdir"}}},
+        "allow_targets=[hydra_plugins]",
     ),
     "lines of a launcher's shell": (
-        {"defaults": [{"override /hydra/launcher": "joblib"}], "hydra": {"launcher": {"temp_folder": "/strange"}}},
+        {
+            "defaults": [{"override /hydra/launcher": "joblib"}],
+            "hydra": {"launcher": {"temp_folder": "/strange"}},
+        },
         "allow_targets=[hydra.launcher]",
     ),
     "beside the launcher": ({"hydra": {"launcher": {"in": MKDIR}}}, "hydra.launcher"),
     "a copy for the launcher": ({"hydra": {"launcher": "${densify}"}}, "hydra.launcher"),
     "a launcher that hands lines to a shell": (
-        {"hydra": {"launcher": {"_target_": "hydra_plugins.hydra_submitit_launcher.submitit_launcher.SlurmLauncher"}}},
+        {
+            "hydra": {
+                "launcher": {
+                    "_target_": "hydra_plugins.hydra_submitit_launcher.submitit_launcher.SlurmLauncher"
+                }
+            }
+        },
         "allow_targets=[hydra_plugins]",
     ),
     "a name in parts": (
-        {"name": "mkdir", "densify": {"_target_": "os.${name}", "path": "exploded"}}, "write the name itself"
+        {"name": "mkdir", "densify": {"_target_": "os.${name}", "path": "exploded"}},
+        "write the name itself",
     ),
     "made of a text": (
-        {"densify": {"inner": "${oc.create:{_target_:os.mkdir,path:exploded}}"}}, "${oc.create:…} is not resolved"
+        {"densify": {"inner": "${oc.create:{_target_:os.mkdir,path:exploded}}"}},
+        "${oc.create:…} is not resolved",
     ),
-    "decoded from a text": ({"hydra": {"job": {"name": "${oc.decode:'1'}"}}}, "${oc.decode:…} is not resolved"),
-    "a resolver with a made name": ({"hydra": {"job": {"name": "${oc.${name}:1}"}}}, "is not resolved"),
-    "a copy for the sweeper": ({"hydra": {"sweeper": {"tune": "${densify}"}}}, "write the settings"),
-    "a copy in the sweeper": ({"hydra": {"sweeper": {"tune": {"metric": "${densify}"}}}}, "write the settings"),
-    "a partial object": (
-        {"densify": {"_partial_": True}}, "_partial_: gsbench makes no"
+    "decoded from a text": (
+        {"hydra": {"job": {"name": "${oc.decode:'1'}"}}},
+        "${oc.decode:…} is not resolved",
     ),
+    "a resolver with a made name": (
+        {"hydra": {"job": {"name": "${oc.${name}:1}"}}},
+        "is not resolved",
+    ),
+    "a copy for the sweeper": (
+        {"hydra": {"sweeper": {"tune": "${densify}"}}},
+        "write the settings",
+    ),
+    "a copy in the sweeper": (
+        {"hydra": {"sweeper": {"tune": {"metric": "${densify}"}}}},
+        "write the settings",
+    ),
+    "a partial object": ({"densify": {"_partial_": True}}, "_partial_: gsbench makes no"),
     "a copy for logging": ({"hydra": {"job_logging": "${train}"}}, "write the settings"),
     "help": ({"hydra": {"help": {"_target_": "bomb.Bomb"}}}, "_target_ is not a setting"),
     "logging": (
-        {"hydra": {"job_logging": {"handlers": {"x": {"class": "bomb.Bomb"}}, "root": {"handlers": ["x"]}}}},
+        {
+            "hydra": {
+                "job_logging": {
+                    "handlers": {"x": {"class": "bomb.Bomb"}},
+                    "root": {"handlers": ["x"]},
+                }
+            }
+        },
         "job_logging.handlers.x.class=bomb.Bomb",
     ),
     "logging by a factory": (
-        {"hydra": {"hydra_logging": {"formatters": {"x": {"()": "bomb.Bomb"}}}}}, "allow_targets=[bomb]"
+        {"hydra": {"hydra_logging": {"formatters": {"x": {"()": "bomb.Bomb"}}}}},
+        "allow_targets=[bomb]",
     ),
     "logging that imports a text": (
-        {"hydra": {"job_logging": {"root": {"level": "ext://bomb.Bomb"}}}}, "allow_targets=[hydra.job_logging]"
+        {"hydra": {"job_logging": {"root": {"level": "ext://bomb.Bomb"}}}},
+        "allow_targets=[hydra.job_logging]",
     ),
     "logging to another file": (
         {
@@ -117,27 +174,61 @@ STRANGE: dict[str, tuple[dict[str, Any], str]] = {  # settings of a file, and a 
     "a package": ({"densify": {"_target_": "bombs.Bomb"}}, "allow_targets=[bombs]"),
     "a module of a package": ({"densify": {"_target_": "bombs.one.Bomb"}}, "allow_targets=[bombs]"),
     "a densifier that allows itself": (
-        {"allow_targets": ["bomb"], "densify": {"_target_": "bomb.Bomb"}}, "no file can allow it"
+        {"allow_targets": ["bomb"], "densify": {"_target_": "bomb.Bomb"}},
+        "no file can allow it",
     ),
-    "below a densifier": ({"densify": {"inner": [{"_target_": "bomb.Bomb"}]}}, "densify.inner.0._target_=bomb.Bomb"),
-    "another group's class": ({"densify": {"_target_": "gsbench.init.Random"}}, "is not a class for densify"),
+    "below a densifier": (
+        {"densify": {"inner": [{"_target_": "bomb.Bomb"}]}},
+        "densify.inner.0._target_=bomb.Bomb",
+    ),
+    "another group's class": (
+        {"densify": {"_target_": "gsbench.init.Random"}},
+        "is not a class for densify",
+    ),
     "an import of a densifier's module": (
-        {"densify": {"_target_": "gsbench.densify.adc.torch.load"}}, "cannot be imported"
+        {"densify": {"_target_": "gsbench.densify.adc.torch.load"}},
+        "cannot be imported",
     ),
     "a metric": ({"eval": {"extra": {"mine": {"_target_": "bomb.Bomb"}}}}, "allow_targets=[bomb]"),
     "below a metric": (
-        {"eval": {"extra": {"mine": {"_target_": "gsbench.eval.X", "in": {"_target_": "bomb.Bomb"}}}}}, "[bomb]"
+        {
+            "eval": {
+                "extra": {"mine": {"_target_": "gsbench.eval.X", "in": {"_target_": "bomb.Bomb"}}}
+            }
+        },
+        "[bomb]",
     ),
-    "a place that nobody reads": ({"launch": {"sbatch": {"_target_": "bomb.Bomb"}}}, "allow_targets=[bomb]"),
-    "lines of a shell": ({"launch": {"name": "slurm", "setup": ["touch exploded"]}}, "allow_targets=[bash]"),
-    "an option of sbatch": ({"launch": {"name": "slurm", "sbatch": {"task-prolog": "x"}}}, "allow_targets=[sbatch]"),
-    "a line break for sbatch": ({"launch": {"name": "slurm", "qos": "x\ntouch exploded\n"}}, "must be one line"),
+    "a place that nobody reads": (
+        {"launch": {"sbatch": {"_target_": "bomb.Bomb"}}},
+        "allow_targets=[bomb]",
+    ),
+    "lines of a shell": (
+        {"launch": {"name": "slurm", "setup": ["touch exploded"]}},
+        "allow_targets=[bash]",
+    ),
+    "an option of sbatch": (
+        {"launch": {"name": "slurm", "sbatch": {"task-prolog": "x"}}},
+        "allow_targets=[sbatch]",
+    ),
+    "a line break for sbatch": (
+        {"launch": {"name": "slurm", "qos": "x\ntouch exploded\n"}},
+        "must be one line",
+    ),
     "a line break in an option": (
-        {"launch": {"name": "slurm", "sbatch": {"comment": "x\ntouch exploded\n"}}}, "must be one line"
+        {"launch": {"name": "slurm", "sbatch": {"comment": "x\ntouch exploded\n"}}},
+        "must be one line",
     ),
-    "a line break in a name": ({"launch": {"name": "slurm", "sbatch": {"x\ntouch exploded\n": 1}}}, "launch.sbatch"),
-}  # fmt: skip
-MODES = {"run": [], "dry run": ["--dry-run"], "question": ["--cfg", "job"], "info": ["--info", "config"]}
+    "a line break in a name": (
+        {"launch": {"name": "slurm", "sbatch": {"x\ntouch exploded\n": 1}}},
+        "launch.sbatch",
+    ),
+}
+MODES = {
+    "run": [],
+    "dry run": ["--dry-run"],
+    "question": ["--cfg", "job"],
+    "info": ["--info", "config"],
+}
 
 
 @pytest.mark.parametrize("mode", ["run", "dry run"])
@@ -151,7 +242,9 @@ def test_what_a_file_names_is_not_run(
 
 
 @pytest.mark.parametrize("mode", ["question", "info"])
-@pytest.mark.parametrize("case", ["a callback", "made of a text", "a module of a package", "logging", "a launcher"])
+@pytest.mark.parametrize(
+    "case", ["a callback", "made of a text", "a module of a package", "logging", "a launcher"]
+)
 def test_nor_where_somebody_only_asks(
     case: str, mode: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -165,7 +258,10 @@ JOBS: dict[str, tuple[dict[str, Any], str]] = {  # the words that a file's sweep
     "a search path": ({"hydra.searchpath": "[pkg://bombs]"}, "cannot differ from job to job"),
     "a variable": ({"+hydra.job.env_set.PYTHONPATH": "/strange"}, "cannot differ from job to job"),
     "a class": ({"densify._target_": "bomb.Bomb"}, "allow_targets=[bomb]"),
-    "a permission": ({"allow_targets": "[bomb]", "densify._target_": "bomb.Bomb"}, "no file can allow it"),
+    "a permission": (
+        {"allow_targets": "[bomb]", "densify._target_": "bomb.Bomb"},
+        "no file can allow it",
+    ),
     "a resolver": ({"densify.name": "${oc.decode:x}"}, "is not resolved"),
 }
 
@@ -183,12 +279,17 @@ def test_nor_what_only_the_jobs_of_a_sweep_say(
     words, said = JOBS[case]
     words = words | {"seed": "0,1"}
     node = {"params": words} if place_of_words == "params" else {"grids": [words]}
-    run = [*experiment({"hydra": {"mode": "MULTIRUN", "sweeper": node}}), f"hydra/launcher={launcher}"]
+    run = [
+        *experiment({"hydra": {"mode": "MULTIRUN", "sweeper": node}}),
+        f"hydra/launcher={launcher}",
+    ]
     assert said in ask(run, capsys, monkeypatch)
     assert not Path("exploded").exists()
 
 
-@pytest.mark.parametrize("variables", [{"PYTHONPATH": "/strange"}, {"OMP_NUM_THREADS": "2"}, "${launch.sbatch}"])
+@pytest.mark.parametrize(
+    "variables", [{"PYTHONPATH": "/strange"}, {"OMP_NUM_THREADS": "2"}, "${launch.sbatch}"]
+)
 def test_a_file_sets_no_variable(
     variables: Any, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -205,7 +306,14 @@ def test_what_one_choice_of_a_sweep_brings_along_is_not_run(
     folder.mkdir(parents=True)
     logging = "hydra:\n  job_logging:\n    handlers:\n      x:\n        class: bomb.Bomb\n"
     (folder / "strange.yaml").write_text(f"# @package _global_\n{logging}scene:\n  name: x\n")
-    words = ["-m", "--config-dir", "conf", f"hydra/sweeper={sweeper}", "hydra/launcher=basic", "init=random"]
+    words = [
+        "-m",
+        "--config-dir",
+        "conf",
+        f"hydra/sweeper={sweeper}",
+        "hydra/launcher=basic",
+        "init=random",
+    ]
     assert "class=bomb.Bomb" in ask([*words, "scene=courtyard,strange"], capsys, monkeypatch)
     assert not Path("exploded").exists()
 
@@ -214,7 +322,10 @@ def test_a_launcher_in_a_strangers_file_is_not_run(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Not even in the place of an installed one."""
-    for group, target in (("launcher", "hydra_plugins.bomb.Bomb"), ("sweeper", "hydra_plugins.bomb.Bomb")):
+    for group, target in (
+        ("launcher", "hydra_plugins.bomb.Bomb"),
+        ("sweeper", "hydra_plugins.bomb.Bomb"),
+    ):
         folder = Path("conf/hydra", group)
         folder.mkdir(parents=True)
         (folder / "basic.yaml").write_text(f"_target_: {target}\n")
@@ -235,10 +346,15 @@ GSBENCH_WEIGHTS path
 """
 
 
-def test_only_variables_that_choose_threads_and_devices_are_free(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_variables_that_choose_threads_and_devices_are_free(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Of another trainer's environment; all others could start code."""
     assert foreign_variables({"OMP_NUM_THREADS": "2", "CUDA_VISIBLE_DEVICES": "1"}, []) == {}
-    assert list(foreign_variables(dict.fromkeys(VARIABLES.split(), "/strange"), [])) == VARIABLES.split()
+    assert (
+        list(foreign_variables(dict.fromkeys(VARIABLES.split(), "/strange"), []))
+        == VARIABLES.split()
+    )
     monkeypatch.setenv("MINE", "as it is")
     assert foreign_variables({"MINE": "as it is", "PATH": "other"}, []) == {"PATH": "other"}
 
@@ -254,7 +370,11 @@ def test_only_variables_that_choose_threads_and_devices_are_free(monkeypatch: py
 )
 @pytest.mark.parametrize("mode", MODES)
 def test_a_search_path_imports_nothing(
-    word: str, said: str, mode: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    word: str,
+    said: str,
+    mode: str,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     Path("conf").mkdir()
     assert said in ask([*MODES[mode], word], capsys, monkeypatch)
@@ -270,7 +390,9 @@ def test_nor_does_completion(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_a_search_path_that_was_allowed_is_read(place: Path) -> None:
     (place / "bombs" / "scene").mkdir()
-    (place / "bombs" / "scene" / "own.yaml").write_text("defaults: [courtyard, _self_]\nname: own\n")
+    (place / "bombs" / "scene" / "own.yaml").write_text(
+        "defaults: [courtyard, _self_]\nname: own\n"
+    )
     words = ["hydra.searchpath=[pkg://bombs]", "scene=own", "allow_targets=[bombs]"]
     assert compose_trials(words)[0].values["scene"]["name"] == "own"
 
@@ -279,16 +401,27 @@ def test_a_search_path_that_was_allowed_is_read(place: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "word", ["allow_targets=os", "allow_targets=[[os]]", "allow_targets={os: 1}", "allow_targets=['${name}']",
-             "allow_targets=[null]", "allow_targets=[1]", "allow_targets=['']"],
-)  # fmt: skip
+    "word",
+    [
+        "allow_targets=os",
+        "allow_targets=[[os]]",
+        "allow_targets={os: 1}",
+        "allow_targets=['${name}']",
+        "allow_targets=[null]",
+        "allow_targets=[1]",
+        "allow_targets=['']",
+    ],
+)
 def test_permissions_are_typed_as_names(word: str) -> None:
     with pytest.raises(InputError, match="a list of names"):
         typed_permissions([word])
 
 
 def test_the_last_permission_counts() -> None:
-    assert typed_permissions(["allow_targets=[a]", "seed=1", "++allow_targets=[b,c.D]"]) == ("b", "c.D")
+    assert typed_permissions(["allow_targets=[a]", "seed=1", "++allow_targets=[b,c.D]"]) == (
+        "b",
+        "c.D",
+    )
     assert typed_permissions(["seed=1"]) == ()
 
 
@@ -330,19 +463,26 @@ def test_trust_in_a_module_extends_to_gsbenchs_classes_in_it() -> None:
     ],
 )
 def test_callbacks_are_classes_of_the_allowed_module(
-    settings: dict[str, Any], said: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    settings: dict[str, Any],
+    said: str,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     run = [*experiment({"hydra": {"callbacks": {"x": settings}}}), "allow_targets=[mine]"]
     assert said in ask(run, capsys, monkeypatch)
 
 
-def test_an_allowed_callback_is_made(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_allowed_callback_is_made(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     nested = {"_target_": "mine.Calls", "in": {"_target_": "mine.Calls"}}
     run = [*experiment({"hydra": {"callbacks": {"x": nested}}}), "allow_targets=[mine]"]
     assert "the trials began" in ask(run, capsys, monkeypatch)
 
 
-def test_only_allowed_modules_of_the_folder_are_found_and_behind_what_is_installed(place: Path) -> None:
+def test_only_allowed_modules_of_the_folder_are_found_and_behind_what_is_installed(
+    place: Path,
+) -> None:
     (place / "yaml.py").write_text(BOMB)
     (place / "json").mkdir()
     (place / "json" / "__init__.py").write_text(BOMB)
@@ -350,7 +490,8 @@ def test_only_allowed_modules_of_the_folder_are_found_and_behind_what_is_install
     (place / "helper.py").write_text("")
     allow_modules(["mine", "yaml", "json"])
     with pytest.raises(
-        InputError, match=r"it lies here, but only what allow_targets names is imported from here: add helper"
+        InputError,
+        match=r"it lies here, but only what allow_targets names is imported from here: add helper",
     ):
         load_class("mine.Mine", "densify", ["mine"])
     allow_modules(["mine", "helper", "yaml", "json"])
@@ -377,7 +518,15 @@ def test_prefixes_end_at_dots(target: str | None) -> None:
 
 
 def test_options_of_slurm_that_choose_resources_need_no_permission() -> None:
-    assert not SBATCH_RESOURCES & {"wrap", "export", "export_file", "container", "bcast", "chdir", "get_user_env"}
+    assert not SBATCH_RESOURCES & {
+        "wrap",
+        "export",
+        "export_file",
+        "container",
+        "bcast",
+        "chdir",
+        "get_user_env",
+    }
     compose_one(["launch=slurm", "launch.sbatch={constraint: a100, mail-user: me}"])
 
 

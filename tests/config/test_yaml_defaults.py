@@ -1,4 +1,5 @@
-"""A value that YAML and a class both state is the same, unless it is said here that it shall differ."""
+"""A value that YAML and a class both state is the same, unless it is said here that it shall
+differ."""
 
 from __future__ import annotations
 
@@ -14,8 +15,10 @@ from gsbench.config.schema import GROUP_SCHEMAS
 from gsbench.settings import option_fields
 from gsbench.system.install import conf_dir
 
-NAMES = ("name", "kind", "protocol", "path", "sink", "enabled")  # they say which one of its group a file is
-# group/file: the keys whose values differ from the class's own; a file that is built on another has the other's too
+# they say which one of its group a file is
+NAMES = ("name", "kind", "protocol", "path", "sink", "enabled")
+# group/file: the keys whose values differ from the class's own; a file that is built on another has
+# the other's too
 DELIBERATE = {
     "densify/absgrad": {"gradient", "gradient_threshold"},
     "densify/longaxis": {"gradient", "gradient_threshold"},
@@ -32,8 +35,8 @@ DELIBERATE = {
 }
 # Built on another file, and yet of a class whose defaults are its values.
 OWN_CLASS = {"densify/edgeaware", "densify/gns"}
-# A shortened schedule, those of other authors (held to their code in tests/densify), and what starts another program
-# differ in most of what they have.
+# A shortened schedule, those of other authors (held to their code in tests/densify), and what
+# starts another program differ in most of what they have.
 WHOLE = {
     "train/quick",
     *(f"train/{name}" for name in ("fastgs", "improved_gs", "mrnf", "resgs", "taming")),
@@ -51,15 +54,20 @@ def bases(path: str) -> Iterator[str]:
     for entry in read(path).get("defaults", []):
         name = str(entry).partition("@")[0] if isinstance(entry, str) else ""
         if name and name != "_self_" and not name.startswith("/"):
-            base = next(base for base in (f"{group}/{name}", f"{group}/shared/{name}")
-                        if (conf_dir() / f"{base}.yaml").exists())  # fmt: skip
+            base = next(
+                base
+                for base in (f"{group}/{name}", f"{group}/shared/{name}")
+                if (conf_dir() / f"{base}.yaml").exists()
+            )
             yield base
             yield from bases(base)
 
 
 def class_of(path: str) -> type | None:
     """The dataclass whose options a file states."""
-    targets = [values["_target_"] for values in map(read, (path, *bases(path))) if "_target_" in values]
+    targets = [
+        values["_target_"] for values in map(read, (path, *bases(path))) if "_target_" in values
+    ]
     if targets:
         module, _, name = targets[0].rpartition(".")
         found = getattr(importlib.import_module(module), name)
@@ -71,16 +79,20 @@ FILES = [
     path
     for group in ("densify", "eval", "init", "launch", "raster", "scene", "tracking", "train")
     for path in sorted(f"{group}/{file.stem}" for file in (conf_dir() / group).glob("*.yaml"))
-    if group != "scene" or path == "scene/courtyard"  # the others say where captures lie, and as what
+    # the others say where captures lie, and as what
+    if group != "scene" or path == "scene/courtyard"
 ]
 
 
 def stated(path: str) -> dict[str, Any]:
-    """The values that a file and those below it state, but for what is given, or comes from another setting."""
+    """The values that a file and those below it state, but for what is given, or comes from another
+    setting."""
     values: dict[str, Any] = {}
     for file in (*reversed(list(bases(path))), path):
         values |= read(file)
-    given = {key: value for key, value in values.items() if key not in ("defaults", "_target_", *NAMES)}
+    given = {
+        key: value for key, value in values.items() if key not in ("defaults", "_target_", *NAMES)
+    }
     return {key: value for key, value in given.items() if not str(value).startswith(("${", "???"))}
 
 
@@ -100,19 +112,27 @@ def test_what_yaml_and_class_both_state_is_the_same(path: str) -> None:
     if cls is None:  # a function, or a class without options
         return
     defaults = {
-        field.name: field.default if field.default_factory is dataclasses.MISSING else field.default_factory()
+        field.name: field.default
+        if field.default_factory is dataclasses.MISSING
+        else field.default_factory()
         for field in option_fields(cls)
     }
     differing = {
         key
         for key, value in stated(path).items()
-        if key in defaults and defaults[key] is not dataclasses.MISSING and plain(value) != plain(defaults[key])
+        if key in defaults
+        and defaults[key] is not dataclasses.MISSING
+        and plain(value) != plain(defaults[key])
     }
-    assert differing == allowed(path), f"{path}: a value differs from the class's: correct it, or say so in DELIBERATE"
+    assert differing == allowed(path), (
+        f"{path}: a value differs from the class's: correct it, or say so in DELIBERATE"
+    )
 
 
 def test_the_list_names_files_that_are_there() -> None:
     assert DELIBERATE.keys() | WHOLE <= set(FILES)
     assert {class_of(path).__name__ for path in ("eval/paper", "train/paper", "init/sfm")} == {  # type: ignore[union-attr]
-        "EvalConfig", "TrainConfig", "Sfm"
-    }  # fmt: skip
+        "EvalConfig",
+        "TrainConfig",
+        "Sfm",
+    }

@@ -15,20 +15,29 @@ from tests.datasets.server import Server, serve
 
 
 def archive_content(scene_folder: str, seed: int = 0, photos: int = 4) -> dict[str, bytes]:
-    """Files of a scene as the archives have them: images in four sizes, a model, and what nobody wants."""
+    """Files of a scene as the archives have them: images in four sizes, a model, and what nobody
+    wants."""
     rng = np.random.default_rng([seed, *scene_folder.encode()])
     files = {}
-    for images, size in (("images", 40_000), ("images_2", 20_000), ("images_4", 9_000), ("images_8", 3_000)):
+    for images, size in (
+        ("images", 40_000),
+        ("images_2", 20_000),
+        ("images_4", 9_000),
+        ("images_8", 3_000),
+    ):
         for index in range(photos):
             files[f"{scene_folder}/{images}/IMG_{index:04d}.JPG"] = rng.bytes(size + index)
     for name in ("cameras", "images", "points3D"):
-        files[f"{scene_folder}/sparse/0/{name}.bin"] = rng.bytes(5_000) + bytes(20_000)  # half of it packs well
+        # half of it packs well
+        files[f"{scene_folder}/sparse/0/{name}.bin"] = rng.bytes(5_000) + bytes(20_000)
     files[f"{scene_folder}/images_4/.DS_Store"] = b"nobody wants this"
     files[f"{scene_folder}/poses_bounds.npy"] = rng.bytes(600)
     return files
 
 
-def write_archive(path: Path, content: Mapping[str, bytes], compression: int = zipfile.ZIP_DEFLATED) -> None:
+def write_archive(
+    path: Path, content: Mapping[str, bytes], compression: int = zipfile.ZIP_DEFLATED
+) -> None:
     with zipfile.ZipFile(path, "w", compression) as archive:
         for name, data in content.items():
             archive.writestr(name, data)

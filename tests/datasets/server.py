@@ -1,4 +1,5 @@
-"""A file server on loopback whose manners can be chosen: what a real one on a bad day does, on purpose."""
+"""A file server on loopback whose manners can be chosen: what a real one on a bad day does, on
+purpose."""
 
 from __future__ import annotations
 
@@ -16,7 +17,8 @@ RANGE = re.compile(r"bytes=(\d*)-(\d*)")
 
 @dataclass
 class Manners:
-    """How the server behaves. ``cut_every`` and ``stall_every``: after so many bytes of a body, again and again."""
+    """How the server behaves. ``cut_every`` and ``stall_every``: after so many bytes of a body,
+    again and again."""
 
     ranges: bool = True
     cut_every: int | None = None
@@ -105,7 +107,11 @@ def serve(folder: Path) -> Iterator[Server]:
                     if manners.damage is not None:
                         data = manners.damage(path, position, data)
                     limit = manners.cut_every or manners.stall_every
-                    stop = limit is not None and position + len(data) - first > limit and manners.cuts > 0
+                    stop = (
+                        limit is not None
+                        and position + len(data) - first > limit
+                        and manners.cuts > 0
+                    )
                     if stop:
                         data = data[: max(0, limit - (position - first))]
                     try:
@@ -123,7 +129,9 @@ def serve(folder: Path) -> Iterator[Server]:
     server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
     server.daemon_threads = True
     state = Server(folder, f"http://127.0.0.1:{server.server_port}", Manners())
-    threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.05}, daemon=True).start()
+    threading.Thread(
+        target=server.serve_forever, kwargs={"poll_interval": 0.05}, daemon=True
+    ).start()
     try:
         yield state
     finally:

@@ -50,7 +50,9 @@ def test_an_archive_of_a_later_version_is_refused(version: int, tmp_path: Path) 
         open_archive(io.BytesIO(data), "x.zip")
 
 
-@pytest.mark.parametrize(("offset", "layout", "value"), [(42, "<I", 5), (42, "<I", 10**9), (42, "<I", 2**32 - 2)])
+@pytest.mark.parametrize(
+    ("offset", "layout", "value"), [(42, "<I", 5), (42, "<I", 10**9), (42, "<I", 2**32 - 2)]
+)
 def test_a_wrong_offset_is_damage(offset: int, layout: str, value: int, tmp_path: Path) -> None:
     data = patched(packed("s/images/a.jpg"), DIRECTORY, offset, layout, value)
     with open_archive(io.BytesIO(data), "x.zip") as archive:
@@ -62,7 +64,8 @@ def test_a_wrong_offset_is_damage(offset: int, layout: str, value: int, tmp_path
 
 def test_a_member_without_a_name_is_passed_over() -> None:
     data = packed("s/images/a.jpg", "x")
-    data = patched(data, b"x" + data[data.rindex(b"x") + 1 :], 0, "<B", 0)  # zipfile takes a name up to the first NUL
+    # zipfile takes a name up to the first NUL
+    data = patched(data, b"x" + data[data.rindex(b"x") + 1 :], 0, "<B", 0)
     with open_archive(io.BytesIO(data), "x.zip") as archive:
         assert "" in archive.namelist()
         assert list(wanted_members(archive, "s", ["images"], "x.zip")) == ["images/a.jpg"]
@@ -78,7 +81,10 @@ def test_a_member_without_a_name_is_passed_over() -> None:
     ],
 )
 def test_names_that_cannot_lie_side_by_side_are_refused(names: tuple[str, ...], said: str) -> None:
-    with open_archive(io.BytesIO(packed(*names)), "x.zip") as archive, pytest.raises(InputError, match=said):
+    with (
+        open_archive(io.BytesIO(packed(*names)), "x.zip") as archive,
+        pytest.raises(InputError, match=said),
+    ):
         wanted_members(archive, "s", ["images"], "x.zip")
 
 
@@ -95,7 +101,8 @@ def test_damaged_bytes_of_a_member_are_damage(compression: int, tmp_path: Path) 
             (member,) = wanted_members(archive, "s", ["images"], "x.zip").values()
             with contextlib.suppress(DamagedMemberError, InputError):
                 extract(archive, member, tmp_path / "a.jpg", lambda count: None)
-                assert (tmp_path / "a.jpg").read_bytes() == content  # the byte was one that no reader looks at
+                # the byte was one that no reader looks at
+                assert (tmp_path / "a.jpg").read_bytes() == content
                 (tmp_path / "a.jpg").unlink()
     assert not (tmp_path / "a.jpg").exists()
 
@@ -104,7 +111,9 @@ def test_damaged_bytes_of_a_member_are_damage(compression: int, tmp_path: Path) 
 def served(tmp_path: Path) -> Iterator[Server]:
     with zipfile.ZipFile(tmp_path / "file.zip", "w") as archive:
         for name in ("first", "second"):
-            archive.writestr(f"s/images/{name}.jpg", np.random.default_rng(len(name)).bytes(300_000))
+            archive.writestr(
+                f"s/images/{name}.jpg", np.random.default_rng(len(name)).bytes(300_000)
+            )
     with serve(tmp_path) as running:
         yield running
 
@@ -139,7 +148,11 @@ def test_a_member_comes_whole_and_alone(served: Server, tmp_path: Path, manners:
 @pytest.mark.parametrize(
     ("manners", "kind", "said"),
     [
-        (Manners(cut_every=100), FetchError, r"3 failures in a row .*cut.*give the same command again"),
+        (
+            Manners(cut_every=100),
+            FetchError,
+            r"3 failures in a row .*cut.*give the same command again",
+        ),
         (Manners(stall_every=1), FetchError, "no answer in time"),
         (Manners(status={"/file.zip": 403}), InputError, r"403 Forbidden.*--mirror"),
         (Manners(status={"/file.zip": 503}), FetchError, r"3 failures in a row .*503"),
@@ -158,7 +171,10 @@ def test_says_what_the_server_did(
 
 
 def test_no_server_at_all() -> None:
-    with pytest.raises(FetchError, match="Connection refused"), open_archive_at("http://127.0.0.1:9/file.zip", PATIENT):
+    with (
+        pytest.raises(FetchError, match="Connection refused"),
+        open_archive_at("http://127.0.0.1:9/file.zip", PATIENT),
+    ):
         pass
 
 
@@ -173,13 +189,20 @@ def test_a_file_that_changes_in_between_is_damage(served: Server, tmp_path: Path
             extract(archive, member, tmp_path / "out", lambda count: None)
         os.truncate(served.folder / "file.zip", 1000)
         with pytest.raises(InputError, match="416"):
-            with_retries(lambda: extract(archive, member, tmp_path / "out", lambda count: None), url, PATIENT)
+            with_retries(
+                lambda: extract(archive, member, tmp_path / "out", lambda count: None), url, PATIENT
+            )
 
 
 def test_a_whole_file_comes_whole_or_not_at_all(served: Server, tmp_path: Path) -> None:
     served.manners = Manners(ranges=False, cut_every=300_000, cuts=2)
     seen: list[tuple[int, int | None]] = []
-    download(f"{served.url}/file.zip", tmp_path / "copy", PATIENT, lambda done, total: seen.append((done, total)))
+    download(
+        f"{served.url}/file.zip",
+        tmp_path / "copy",
+        PATIENT,
+        lambda done, total: seen.append((done, total)),
+    )
     content = (served.folder / "file.zip").read_bytes()
     assert (tmp_path / "copy").read_bytes() == content
     assert seen[-1] == (len(content), len(content))
@@ -189,7 +212,8 @@ def test_a_whole_file_comes_whole_or_not_at_all(served: Server, tmp_path: Path) 
 
 
 def test_offsets_beyond_four_gigabytes(tmp_path: Path) -> None:
-    """The real archive has 12.5 GB: its entries need zip64. A sparse file of the same kind takes no space."""
+    """The real archive has 12.5 GB: its entries need zip64. A sparse file of the same kind takes no
+    space."""
     file = tmp_path / "large.zip"
     with file.open("wb") as stream:
         stream.truncate(5 << 30)

@@ -1,4 +1,5 @@
-"""`gsbench fetch`: what arrives is what the archive has, only what is wanted, whole or not at all."""
+"""`gsbench fetch`: what arrives is what the archive has, only what is wanted, whole or not at
+all."""
 
 from __future__ import annotations
 
@@ -25,13 +26,16 @@ BAD_INPUT, FAILED = 2, 1
 def data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("GSBENCH_DATA", str(tmp_path / "data"))
     monkeypatch.delenv("GSBENCH_MIRROR", raising=False)
-    monkeypatch.setattr(logging.getLogger("gsbench"), "handlers", [])  # those of other tests write to closed files
+    # those of other tests write to closed files
+    monkeypatch.setattr(logging.getLogger("gsbench"), "handlers", [])
     return tmp_path / "data"
 
 
 @pytest.fixture
 def fetch(server: Server, data: Path, monkeypatch: pytest.MonkeyPatch) -> Fetch:
-    monkeypatch.setattr("gsbench.verbs.fetch.PATIENCE", RetryPolicy(timeout=0.3, tries=3, pause=0.01))
+    monkeypatch.setattr(
+        "gsbench.verbs.fetch.PATIENCE", RetryPolicy(timeout=0.3, tries=3, pause=0.01)
+    )
 
     def call(*words: str) -> int:
         return run(["fetch", *words, "--mirror", server.url])
@@ -40,13 +44,19 @@ def fetch(server: Server, data: Path, monkeypatch: pytest.MonkeyPatch) -> Fetch:
 
 
 def files_below(folder: Path) -> dict[str, bytes]:
-    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes()
+        for path in folder.rglob("*")
+        if path.is_file()
+    }
 
 
 def wanted(place: str, images: str) -> dict[str, bytes]:
     parts = (f"{place}/{images}/IMG", f"{place}/sparse/0/")
     return {
-        name.removeprefix(f"{place}/"): data for name, data in archive_content(place).items() if name.startswith(parts)
+        name.removeprefix(f"{place}/"): data
+        for name, data in archive_content(place).items()
+        if name.startswith(parts)
     }
 
 
@@ -55,7 +65,11 @@ def test_every_scene_of_the_catalogue_is_a_scene_file_at_the_same_place() -> Non
     for dataset in read_catalog().values():
         for archive in dataset.archives:
             known |= dict(archive.scenes)
-    public = {path.stem for path in (conf_dir() / "scene").glob("*.yaml") if "GSBENCH_DATA" in path.read_text()}
+    public = {
+        path.stem
+        for path in (conf_dir() / "scene").glob("*.yaml")
+        if "GSBENCH_DATA" in path.read_text()
+    }
     assert set(known) == public
     for scene, folder in known.items():
         assert wanted_files(scene).folder == folder
@@ -68,11 +82,18 @@ def test_brings_what_the_scene_file_wants_and_nothing_else(
     assert files_below(data / "garden") == wanted("garden", "images_4")
     assert files_below(data / "room") == wanted("room", "images_2")
     assert files_below(data / "flowers") == wanted("flowers", "images_4")
-    assert {path.name for path in data.iterdir() if path.is_dir()} <= {"garden", "room", "flowers", ".fetch"}
+    assert {path.name for path in data.iterdir() if path.is_dir()} <= {
+        "garden",
+        "room",
+        "flowers",
+        ".fetch",
+    }
     text = capsys.readouterr().out
     assert "licence: none is stated" in text
     assert "please cite: Barron" in text
-    whole = sum((server.folder / name).stat().st_size for name in ("360_v2.zip", "360_extra_scenes.zip"))
+    whole = sum(
+        (server.folder / name).stat().st_size for name in ("360_v2.zip", "360_extra_scenes.zip")
+    )
     assert server.sent < 0.6 * whole  # the tails of small archives count much
 
     assert fetch("tandt_db", "truck", "playroom") == 0
@@ -120,7 +141,9 @@ def test_goes_on_where_it_was_stopped(fetch: Fetch, server: Server, data: Path) 
     ],
     ids=["cuts", "stalls", "503", "redirect"],
 )
-def test_bad_manners_leave_the_same_files(fetch: Fetch, server: Server, data: Path, manners: Manners) -> None:
+def test_bad_manners_leave_the_same_files(
+    fetch: Fetch, server: Server, data: Path, manners: Manners
+) -> None:
     server.manners = manners
     assert fetch("mipnerf360", "garden", "stump") == 0
     assert files_below(data / "garden") == wanted("garden", "images_4")
@@ -148,7 +171,9 @@ def test_damaged_bytes_are_found_and_not_kept(
     assert files_below(data / "garden") == wanted("garden", "images_4")
 
 
-def test_a_folder_may_be_the_mirror(archives: Path, data: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_folder_may_be_the_mirror(
+    archives: Path, data: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert run(["fetch", "mipnerf360", "room", "--mirror", str(archives)]) == 0
     assert files_below(data / "room") == wanted("room", "images_2")
     (archives / "360_v2.zip").unlink()
@@ -160,7 +185,9 @@ def test_another_image_folder(fetch: Fetch, data: Path) -> None:
     assert fetch("mipnerf360", "garden", "--images", "images_8") == 0
     assert files_below(data / "garden") == wanted("garden", "images_8")
     assert fetch("mipnerf360", "garden") == 0
-    assert files_below(data / "garden") == wanted("garden", "images_8") | wanted("garden", "images_4")
+    assert files_below(data / "garden") == wanted("garden", "images_8") | wanted(
+        "garden", "images_4"
+    )
 
 
 def test_the_list(fetch: Fetch, data: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -182,9 +209,15 @@ def test_the_list(fetch: Fetch, data: Path, capsys: pytest.CaptureFixture[str]) 
         (["mipnerf"], "no data set 'mipnerf'; did you mean mipnerf360?"),
         (["garden"], "garden is a scene: gsbench fetch mipnerf360 garden"),
         (["mipnerf360", "gardn"], "has no scene 'gardn'; did you mean garden?"),
-        (["mipnerf360", "garden", "--mirror", "ftp://x"], "neither an http(s) address nor a folder"),
+        (
+            ["mipnerf360", "garden", "--mirror", "ftp://x"],
+            "neither an http(s) address nor a folder",
+        ),
         (["mipnerf360", "garden", "--images", "images_16"], "no files below garden/images_16"),
-        (["mipnerf360", "garden", "--mirror", "http://[::1"], "neither an http(s) address nor a folder"),
+        (
+            ["mipnerf360", "garden", "--mirror", "http://[::1"],
+            "neither an http(s) address nor a folder",
+        ),
         (["mipnerf360", "garden", "--mirror", "a\0b"], "neither an http(s) address nor a folder"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else None,
@@ -201,7 +234,11 @@ def test_bad_requests(
 
 @pytest.mark.parametrize("place", ["a-file", "a-file/below", "/proc/nosuch"])
 def test_a_data_folder_that_cannot_be_made(
-    archives: Path, data: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, place: str
+    archives: Path,
+    data: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    place: str,
 ) -> None:
     (data.parent / "a-file").touch()
     monkeypatch.setenv("GSBENCH_DATA", str(data.parent / place))
@@ -216,7 +253,12 @@ def test_a_data_folder_that_cannot_be_made(
     [("garden/images_4/up\\x.JPG", "unsafe name"), ("garden/images_4//etc/x.JPG", "unsafe name")],
 )
 def test_names_that_lead_elsewhere_are_refused(
-    fetch: Fetch, server: Server, data: Path, capsys: pytest.CaptureFixture[str], name: str, said: str
+    fetch: Fetch,
+    server: Server,
+    data: Path,
+    capsys: pytest.CaptureFixture[str],
+    name: str,
+    said: str,
 ) -> None:
     content = archive_content("garden") | {name: b"x", "garden/images_4/../../../escaped.JPG": b"x"}
     write_archive(server.folder / "360_v2.zip", content)
@@ -226,7 +268,9 @@ def test_names_that_lead_elsewhere_are_refused(
     assert not list(data.parent.rglob("escaped.JPG"))
 
 
-def test_not_a_zip(fetch: Fetch, server: Server, data: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_not_a_zip(
+    fetch: Fetch, server: Server, data: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (server.folder / "360_v2.zip").write_text("<html>this file has moved</html>")
     assert fetch("mipnerf360", "garden") == BAD_INPUT
     assert "360_v2.zip is not a complete zip archive" in capsys.readouterr().err

@@ -1,7 +1,9 @@
-"""One refinement round, stated again from the formulas: numpy, one Gaussian at a time, no code shared with gsbench.
+"""One refinement round, stated again from the formulas: numpy, one Gaussian at a time, no code
+shared with gsbench.
 
-A Gaussian is a dict of raw parameters with its two Adam moments. The normal draws come in as an iterator of rows, in
-the order in which the rules use them: all first children, then all second ones.
+A Gaussian is a dict of raw parameters with its two Adam moments. The normal draws come in as an
+iterator of rows, in the order in which the rules use them: all first children, then all second
+ones.
 """
 
 from __future__ import annotations
@@ -40,7 +42,8 @@ def newborn(parent: Row, mean: np.ndarray, log_scales: np.ndarray) -> Row:
 def split_all(
     rows: list[Row], chosen: list[int], scales: dict[int, np.ndarray], noise: Iterator[np.ndarray]
 ) -> list[Row]:
-    """Two children for each chosen row, appended: every first child, then every second; the parents go."""
+    """Two children for each chosen row, appended: every first child, then every second; the parents
+    go."""
     children = []
     for _ in range(2):
         for i in chosen:
@@ -51,20 +54,30 @@ def split_all(
 
 
 def adc_growth(
-    rows: list[Row], mean_gradient: np.ndarray, extent: float, noise: Iterator[np.ndarray], events: dict[str, int]
+    rows: list[Row],
+    mean_gradient: np.ndarray,
+    extent: float,
+    noise: Iterator[np.ndarray],
+    events: dict[str, int],
 ) -> list[Row]:
     n = len(rows)
     clones = []
     for i in range(n):
         if mean_gradient[i] >= 0.0002 and np.exp(rows[i]["log_scales"]).max() <= 0.01 * extent:
             clones.append(newborn(rows[i], rows[i]["means"].copy(), rows[i]["log_scales"].copy()))
-    chosen = [i for i in range(n) if mean_gradient[i] >= 0.0002 and np.exp(rows[i]["log_scales"]).max() > 0.01 * extent]
+    chosen = [
+        i
+        for i in range(n)
+        if mean_gradient[i] >= 0.0002 and np.exp(rows[i]["log_scales"]).max() > 0.01 * extent
+    ]
     events["cloned"], events["split_gradient"] = len(clones), len(chosen)
     scales = {i: np.log(np.exp(rows[i]["log_scales"]) / 1.6) for i in chosen}
     return split_all(rows + clones, chosen, scales, noise)
 
 
-def volume_growth(rows: list[Row], threshold: float, noise: Iterator[np.ndarray], events: dict[str, int]) -> list[Row]:
+def volume_growth(
+    rows: list[Row], threshold: float, noise: Iterator[np.ndarray], events: dict[str, int]
+) -> list[Row]:
     chosen, scales, again = [], {}, 0
     for i, row in enumerate(rows):
         s = np.exp(row["log_scales"])

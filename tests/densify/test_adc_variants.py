@@ -8,7 +8,16 @@ import numpy as np
 import pytest
 import torch
 
-from gsbench.densify import ADC, AbsGS, DensifyContext, PixelGS, QuantileADC, Refinement, ResGS, SteepGS
+from gsbench.densify import (
+    ADC,
+    AbsGS,
+    DensifyContext,
+    PixelGS,
+    QuantileADC,
+    Refinement,
+    ResGS,
+    SteepGS,
+)
 from gsbench.errors import InputError
 from gsbench.gaussians.paper_values import LearningRates
 from gsbench.gaussians.trainable import TrainableGaussians
@@ -21,12 +30,17 @@ from tests.gaussians.helpers import random_gaussians
 def absgs_growth(
     rows: list[restatement.Row], signed: np.ndarray, absolute: np.ndarray, noise: object
 ) -> tuple[list[restatement.Row], int, int]:
-    """Small (largest scale at most .001 of the extent): a copy where signed >= .0002; large: split where absolute >=
-    .0004, into two of 1 / 1.6."""
+    """Small (largest scale at most .001 of the extent): a copy where signed >= .0002; large: split
+    where absolute >= .0004, into two of 1 / 1.6."""
     largest = [np.exp(row["log_scales"]).max() for row in rows]
     clones = [i for i, size in enumerate(largest) if size <= 0.001 * EXTENT and signed[i] >= 0.0002]
-    chosen = [i for i, size in enumerate(largest) if size > 0.001 * EXTENT and absolute[i] >= 0.0004]
-    copies = [restatement.newborn(rows[i], rows[i]["means"].copy(), rows[i]["log_scales"].copy()) for i in clones]
+    chosen = [
+        i for i, size in enumerate(largest) if size > 0.001 * EXTENT and absolute[i] >= 0.0004
+    ]
+    copies = [
+        restatement.newborn(rows[i], rows[i]["means"].copy(), rows[i]["log_scales"].copy())
+        for i in clones
+    ]
     scales = {i: np.log(np.exp(rows[i]["log_scales"]) / 1.6) for i in chosen}
     return restatement.split_all(rows + copies, chosen, scales, noise), len(clones), len(chosen)  # type: ignore[arg-type]
 
@@ -118,7 +132,9 @@ class Views:
             radii = torch.from_numpy(self.radii[view].astype(np.int32))
             covered = torch.from_numpy(self.pixels[view].astype(np.int32))
             footprint = Footprint(covered, torch.from_numpy(self.depths[view]), none, none)
-            render = RenderOutput(none, none, radii, points, points.grad, lambda values=None, f=footprint: f)
+            render = RenderOutput(
+                none, none, radii, points, points.grad, lambda values=None, f=footprint: f
+            )
             densifier.observe(view + 1, render)
 
     def mean_gradient(self, fraction: float | None) -> np.ndarray:
@@ -159,7 +175,9 @@ def test_pixel_gs_round(seed: int, fraction: float | None) -> None:
     np.testing.assert_allclose(densifier.mean_gradient(), gradient, rtol=1e-5)
     event = densifier.refine(3100, trainable, torch.Generator().manual_seed(seed))
     noise = iter(noise_of(seed, [event.split_gradient]))
-    rows = restatement.prune(restatement.adc_growth(rows, gradient, EXTENT, noise, expected), 3100, EXTENT, expected)
+    rows = restatement.prune(
+        restatement.adc_growth(rows, gradient, EXTENT, noise, expected), 3100, EXTENT, expected
+    )
     assert_same(trainable, rows)
     assert expected == {name: getattr(event, name) for name in expected}
     assert event.cloned > 0
@@ -180,17 +198,22 @@ def test_views_of_equal_footprints_count_as_in_adc() -> None:
     torch.testing.assert_close(densifier.mean_gradient(), baseline.mean_gradient())
     views.pixels[1:] = 0
     views.show(densifier, trainable)
-    np.testing.assert_allclose(densifier.mean_gradient(), np.hypot(*views.gradients[0].T), rtol=1e-6)
+    np.testing.assert_allclose(
+        densifier.mean_gradient(), np.hypot(*views.gradients[0].T), rtol=1e-6
+    )
     views.pixels[0] = 1
     views.show(densifier, trainable)
-    np.testing.assert_allclose(densifier.mean_gradient(), np.hypot(*views.gradients[0].T), rtol=1e-6)
+    np.testing.assert_allclose(
+        densifier.mean_gradient(), np.hypot(*views.gradients[0].T), rtol=1e-6
+    )
     densifier.stop = 1  # nothing is gathered after the window
     views.show(densifier, trainable)
     assert not densifier.statistics["pixel_sum"].any()
 
 
 def test_large_gaussians_at_the_edge_of_views_are_not_held_back() -> None:
-    """The paper's motive: one view in which much of it is seen, three that see an edge and have no gradient."""
+    """The paper's motive: one view in which much of it is seen, three that see an edge and have no
+    gradient."""
     views, densifier, baseline = Views(0), PixelGS(near_fraction=None), ADC()
     views.gradients[:] = 0
     views.gradients[0] = 3e-4
@@ -208,7 +231,9 @@ def test_a_hard_cap_takes_those_of_the_largest_weighted_gradient() -> None:
     event = densifier.refine(600, trainable, torch.Generator())
     assert event.after == COUNT + 5
     parents = densifier.lineage.state_dict()["parents"][COUNT:].unique()
-    assert sorted(parents.tolist()) == sorted(np.argsort(-views.mean_gradient(0.37), kind="stable")[:5].tolist())
+    assert sorted(parents.tolist()) == sorted(
+        np.argsort(-views.mean_gradient(0.37), kind="stable")[:5].tolist()
+    )
 
 
 def test_a_render_that_does_not_say_is_refused() -> None:
@@ -217,13 +242,17 @@ def test_a_render_that_does_not_say_is_refused() -> None:
     points = torch.zeros(2, 2, requires_grad=True)
     points.grad = torch.zeros(2, 2)
     with pytest.raises(RuntimeError, match="footprint"):
-        densifier.observe(1, RenderOutput(torch.empty(0), torch.empty(0), torch.ones(2, dtype=torch.int32), points))
+        densifier.observe(
+            1,
+            RenderOutput(torch.empty(0), torch.empty(0), torch.ones(2, dtype=torch.int32), points),
+        )
 
 
 @pytest.mark.parametrize("step", [600, 3100])
 @pytest.mark.parametrize("rate", [0.1, 0.5, 3.0])
 def test_quantile_round(rate: float, step: int) -> None:
-    """The share with the largest gradients grows as in ADC, nobody that was never seen; then the faintest go."""
+    """The share with the largest gradients grows as in ADC, nobody that was never seen; then the
+    faintest go."""
     densifier = QuantileADC(growth_rate=rate, prune_share=0.05)
     trainable, _ = prepared(densifier, 4)
     draws = np.random.default_rng(4)
@@ -242,7 +271,9 @@ def test_quantile_round(rate: float, step: int) -> None:
     limit = np.quantile([row["opacity_logits"] for row in rows], 0.05)
     faint = [row["opacity_logits"] < limit for row in rows]
     huge = [step > 3000 and np.exp(row["log_scales"]).max() > 0.1 * EXTENT for row in rows]
-    assert_same(trainable, [row for row, f, h in zip(rows, faint, huge, strict=True) if not f and not h])
+    assert_same(
+        trainable, [row for row, f, h in zip(rows, faint, huge, strict=True) if not f and not h]
+    )
     assert event.pruned_opacity == sum(faint) > 0
     assert event.balances()
     assert event.after == foreseen
@@ -280,12 +311,16 @@ def steep_gs_growth(
     threshold: float = -1e-6,
     opacity: float = 0.5,
 ) -> tuple[list[restatement.Row], int]:
-    """Two halves on either side along the least eigenvector for each that reaches .0002 and has an eigenvalue below.
+    """Two halves on either side along the least eigenvector for each that reaches .0002 and has an
+    eigenvalue below.
 
-    Large: scales / 1.6, at the length of a draw each; small: as large as before, a step of the means away.
+    Large: scales / 1.6, at the length of a draw each; small: as large as before, a step of the
+    means away.
     """
     chosen = [
-        i for i in range(len(rows)) if gradient[i] >= 0.0002 and least(matrices[i])[0] * EXTENT * EXTENT < threshold
+        i
+        for i in range(len(rows))
+        if gradient[i] >= 0.0002 and least(matrices[i])[0] * EXTENT * EXTENT < threshold
     ]
     children = []
     for side in (1, -1):
@@ -294,7 +329,9 @@ def steep_gs_growth(
             large = scales.max() > 0.01 * EXTENT
             length = np.sqrt(((draw * scales) ** 2).sum()) if large else rate
             new = np.log(scales / 1.6) if large else rows[i]["log_scales"].copy()
-            child = restatement.newborn(rows[i], rows[i]["means"] + side * length * least(matrices[i])[1], new)
+            child = restatement.newborn(
+                rows[i], rows[i]["means"] + side * length * least(matrices[i])[1], new
+            )
             share = opacity / (1 + np.exp(-rows[i]["opacity_logits"]))
             child["opacity_logits"] = np.log(share / (1 - share))
             children.append(child)
@@ -302,7 +339,8 @@ def steep_gs_growth(
 
 
 def given(densifier: SteepGS, seed: int, count: int = 60) -> tuple[np.ndarray, np.ndarray]:
-    """Statistics of three visible iterations: mean gradients [N] and symmetric matrices [N, 3, 3], per iteration."""
+    """Statistics of three visible iterations: mean gradients [N] and symmetric matrices [N, 3, 3],
+    per iteration."""
     draw = np.random.default_rng(seed)
     gradient = draw.uniform(0, 4e-4, count)
     matrices = draw.normal(0, 1e-5, (count, 3, 3)) + 1e-5 * np.eye(3)
@@ -346,7 +384,9 @@ def test_the_eigenvalue_is_one_of_the_mean_matrix_in_units_of_the_squared_extent
     assert values.tolist() == pytest.approx([-3e-8 * EXTENT**2] * 2)
     assert directions.tolist() == [[0.0, 1.0, 0.0]] * 2
     densifier.statistics["visible_count"][:] = 1
-    assert densifier.steepest(torch.arange(60) < 1)[0].tolist() == pytest.approx([-6e-8 * EXTENT**2])
+    assert densifier.steepest(torch.arange(60) < 1)[0].tolist() == pytest.approx(
+        [-6e-8 * EXTENT**2]
+    )
 
 
 def test_each_ingredient_can_be_taken_out() -> None:
@@ -421,15 +461,17 @@ def opacity(row: restatement.Row) -> float:
 def with_opacity(row: restatement.Row, value: float, moments: bool = True) -> restatement.Row:
     changed = row | {"opacity_logits": np.log(value / (1 - value))}
     return (
-        changed if moments else changed | {f"{moment} opacity_logits": np.zeros(()) for moment in ("first", "second")}
+        changed
+        if moments
+        else changed | {f"{moment} opacity_logits": np.zeros(()) for moment in ("first", "second")}
     )
 
 
 def residual_split(
     rows: list[restatement.Row], gradient: np.ndarray, levels: np.ndarray, stage: int, noise: object
 ) -> tuple[list[restatement.Row], int]:
-    """Who reaches .00067 times 2^((level - stage) / 3), or .00067 at the stage and above, keeps .3 of its opacity and
-    gets a child: drawn from it, 1.6 times smaller, as opaque as it was."""
+    """Who reaches .00067 times 2^((level - stage) / 3), or .00067 at the stage and above, keeps .3
+    of its opacity and gets a child: drawn from it, 1.6 times smaller, as opaque as it was."""
     parents, children = [], []
     for i, row in enumerate(rows):
         threshold = 0.00067 * (2 ** ((levels[i] - stage) / 3) if levels[i] < stage else 1)
@@ -456,7 +498,9 @@ def test_res_gs_round(seed: int, step: int, stage: int) -> None:
     rows = to_rows(trainable)
     foreseen = densifier.forecast(Refinement(step, trainable, torch.Generator(), event=None))  # type: ignore[arg-type]
     event = densifier.refine(step, trainable, torch.Generator().manual_seed(seed))
-    noise = torch.randn(event.split_gradient, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    noise = torch.randn(
+        event.split_gradient, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64
+    )
     grown, count = residual_split(rows, gradient, levels, stage, iter(noise.numpy()))
     assert event.split_gradient == count > 0
     kept = [row for row in grown if opacity(row) >= 0.005]
@@ -465,7 +509,11 @@ def test_res_gs_round(seed: int, step: int, stage: int) -> None:
     assert event.balances()
     assert event.after == foreseen
     below = [0.00067 * (2 ** ((level - stage) / 3) if level < stage else 1) for level in levels]
-    children = [level + 1 for level, value, least in zip(levels, gradient, below, strict=True) if value >= least]
+    children = [
+        level + 1
+        for level, value, least in zip(levels, gradient, below, strict=True)
+        if value >= least
+    ]
     everybody = [*levels, *children]
     expected = [level for level, row in zip(everybody, grown, strict=True) if opacity(row) >= 0.005]
     assert densifier.statistics["level"].tolist() == expected  # and a round does not forget them
@@ -473,8 +521,8 @@ def test_res_gs_round(seed: int, step: int, stage: int) -> None:
 
 
 def test_the_stages_are_those_of_the_authors_loop() -> None:
-    """Their counters, one iteration after another: three parts of each phase, changes at 2,500 and 6,000, a pause of
-    500 iterations after each."""
+    """Their counters, one iteration after another: three parts of each phase, changes at 2,500 and
+    6,000, a pause of 500 iterations after each."""
     changes, level, warm, last, ahead = [2500, 6000], 1, 0, 700, 2500
     count = (ahead - last) // 3
     stages, paused, reached = {}, {}, 0
@@ -519,7 +567,8 @@ def test_from_the_end_of_the_first_phase_on_all_opacities_fade_every_500_iterati
             faded.append(step)
             if step >= 12_000:
                 pruned.append(event.pruned_opacity)
-    assert faded == list(range(2500, 25_000, 500))  # their level has gone up when they ask: 45 times
+    # their level has gone up when they ask: 45 times
+    assert faded == list(range(2500, 25_000, 500))
     assert min(pruned) > 0
 
 
@@ -553,7 +602,9 @@ def test_a_governed_round_ends_at_its_target() -> None:
     densifier = ResGS(max_gaussians=90, cap="governor", start=500, stop=1200)
     trainable, _ = prepared(densifier, 2)
     trainable.values.opacity_logits.data[:] = 1.0
-    densifier.statistics["gradient_sum"] = 1e-3 * torch.rand(60, generator=torch.Generator().manual_seed(0))
+    densifier.statistics["gradient_sum"] = 1e-3 * torch.rand(
+        60, generator=torch.Generator().manual_seed(0)
+    )
     densifier.statistics["visible_count"][:] = 1
     event = densifier.refine(1100, trainable, torch.Generator())
     assert event.target == event.after == 90

@@ -1,4 +1,5 @@
-"""Caps: freeze leaves a round out, the governor steers to a count; against counting one Gaussian at a time."""
+"""Caps: freeze leaves a round out, the governor steers to a count; against counting one Gaussian at
+a time."""
 
 from __future__ import annotations
 
@@ -31,7 +32,8 @@ def test_a_frozen_round_neither_grows_nor_prunes(kind: type[ADC]) -> None:
     """And the optimiser's step of that iteration is not lost, as it is after an edit."""
     densifier = kind(max_gaussians=60, cap="freeze")
     trainable, _ = prepared(densifier, 3, count=60)
-    assert densifier.refine(600, trainable, generator(0)).after > 60  # at the limit a round may go beyond it
+    # at the limit a round may go beyond it
+    assert densifier.refine(600, trainable, generator(0)).after > 60
     trainable.values.opacity_logits.data[:5] = -9.0  # to be pruned
     for tensor in trainable.values.tensors().values():
         tensor.grad = torch.ones_like(tensor)
@@ -41,7 +43,12 @@ def test_a_frozen_round_neither_grows_nor_prunes(kind: type[ADC]) -> None:
     event = densifier.refine(700, trainable, generator(0))
     for old, new in zip(before, to_rows(trainable), strict=True):
         assert all(np.array_equal(old[name], new[name]) for name in old)
-    assert (event.pruned_opacity, event.cloned, event.split_gradient, event.split_volume) == (0, 0, 0, 0)
+    assert (event.pruned_opacity, event.cloned, event.split_gradient, event.split_volume) == (
+        0,
+        0,
+        0,
+        0,
+    )
     assert trainable.values.means.grad is not None
     assert event.after == event.before
     assert event.balances()
@@ -93,9 +100,13 @@ COMBINATIONS = [
 ]
 
 
-@pytest.mark.parametrize(("kind", "options"), COMBINATIONS, ids=lambda value: getattr(value, "__name__", str(value)))
+@pytest.mark.parametrize(
+    ("kind", "options"), COMBINATIONS, ids=lambda value: getattr(value, "__name__", str(value))
+)
 def test_the_forecast_is_what_a_round_does(kind: type[ADC], options: dict[str, object]) -> None:
-    for seed, (step, strictness, cull) in enumerate([(600, 1, 1), (3100, 0.3, 4), (3300, 5, 1), (3200, 0.01, 2)]):
+    for seed, (step, strictness, cull) in enumerate(
+        [(600, 1, 1), (3100, 0.3, 4), (3300, 5, 1), (3200, 0.01, 2)]
+    ):
         densifier = kind(**options)  # type: ignore[arg-type]
         trainable, _ = prepared(densifier, seed, count=200)
         densifier.strictness, densifier.cull = strictness, cull
@@ -145,7 +156,9 @@ def test_a_governed_round_ends_at_its_target(kind: type[ADC]) -> None:
 @pytest.mark.parametrize("dimension", [1, 3])
 def test_the_governor_moves_a_volume_or_the_size_that_it_is_of(dimension: int) -> None:
     """Counted by hand: who is over the two thresholds that one factor gives."""
-    densifier = Volumetric(max_gaussians=450, cap="governor", stop=1200, governor_dimension=dimension)  # type: ignore[arg-type]
+    densifier = Volumetric(
+        max_gaussians=450, cap="governor", stop=1200, governor_dimension=dimension
+    )  # type: ignore[arg-type]
     trainable, gradient = prepared(densifier, 2, count=300)
     sizes = np.exp(np.array([row["log_scales"] for row in to_rows(trainable)]))  # [N, 3]
     event = densifier.refine(900, trainable, generator(0))
@@ -153,9 +166,11 @@ def test_the_governor_moves_a_volume_or_the_size_that_it_is_of(dimension: int) -
     assert factor != 1
     over, large = gradient >= 2e-4 * factor, sizes.max(-1) > 0.01 * EXTENT
     assert (event.cloned, event.split_gradient) == ((over & ~large).sum(), (over & large).sum())
-    size = np.cbrt(0.03 / (4 / 3 * np.pi)) * (factor if dimension == 3 else np.cbrt(factor))  # of a sphere of V_th
+    # of a sphere of V_th
+    size = np.cbrt(0.03 / (4 / 3 * np.pi)) * (factor if dimension == 3 else np.cbrt(factor))
     geometric_mean = np.cbrt((sizes / np.where(over & large, 1.6, 1)[:, None]).prod(-1))
-    copies = np.where(over, 2, 1)  # clones and children of a split have the same volume as one another
+    # clones and children of a split have the same volume as one another
+    copies = np.where(over, 2, 1)
     assert event.split_volume == copies[geometric_mean > size].sum() > 0
     assert abs(event.after - event.target) <= 2
 
@@ -164,9 +179,13 @@ def test_far_over_its_target_a_round_prunes_more_of_the_faint() -> None:
     densifier = ADC(max_gaussians=60, cap="governor", gradient_threshold=1.0, prune_size=100.0)
     trainable, _ = prepared(densifier, 5, count=60)
     densifier.max_gaussians = 30
-    trainable.values.opacity_logits.data.copy_(torch.logit(torch.linspace(0.006, 0.06, 60, dtype=torch.float64)))
+    trainable.values.opacity_logits.data.copy_(
+        torch.logit(torch.linspace(0.006, 0.06, 60, dtype=torch.float64))
+    )
     rounds_after_a_reset = range(3100, 3800, 100)
-    assert [densifier.may_cull(step) for step in (3000, *rounds_after_a_reset)] == [True] + [False] * 5 + [True] * 2
+    assert [densifier.may_cull(step) for step in (3000, *rounds_after_a_reset)] == [True] + [
+        False
+    ] * 5 + [True] * 2
     assert densifier.may_cull(6000)  # it resets after it has pruned
     locked = Refinement(3100, trainable, generator(0), RefineEvent(3100, len(trainable)))
     densifier.govern(locked)
@@ -186,7 +205,9 @@ def test_up_to_one_percent_over_its_target_a_count_is_not_culled(target: int, cu
     densifier = ADC(max_gaussians=200, cap="governor", gradient_threshold=1.0, prune_size=100.0)
     trainable, _ = prepared(densifier, 5, count=200)
     densifier.max_gaussians = target
-    trainable.values.opacity_logits.data.copy_(torch.logit(torch.linspace(0.006, 0.06, 200, dtype=torch.float64)))
+    trainable.values.opacity_logits.data.copy_(
+        torch.logit(torch.linspace(0.006, 0.06, 200, dtype=torch.float64))
+    )
     event = densifier.refine(14_900, trainable, generator(0))
     assert (event.cull > 1) == culls
     assert event.after == (target if culls else 200)
@@ -209,17 +230,30 @@ def test_who_cannot_say_where_a_round_leads_is_not_governed(cap: str) -> None:
     class Silent(Budgeted):
         pass
 
-    with pytest.raises(InputError, match=rf"densify\.cap={cap} needs the method forecast, which Silent lacks"):
+    with pytest.raises(
+        InputError, match=rf"densify\.cap={cap} needs the method forecast, which Silent lacks"
+    ):
         Silent(cap=cap)  # type: ignore[arg-type]
-    with pytest.raises(InputError, match=rf"densify\.max_gaussians must be set for densify\.cap={cap}"):
+    with pytest.raises(
+        InputError, match=rf"densify\.max_gaussians must be set for densify\.cap={cap}"
+    ):
         ADC(cap=cap, max_gaussians=None)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
     ("cap", "count", "most", "allowed"),
-    [("soft", 5, 9, 4), ("soft", 5, 3, 0), ("soft", 8, 20, 0), ("hard", 5, 9, 2), ("hard", 5, 6, 1), ("hard", 5, 3, 0)],
+    [
+        ("soft", 5, 9, 4),
+        ("soft", 5, 3, 0),
+        ("soft", 8, 20, 0),
+        ("hard", 5, 9, 2),
+        ("hard", 5, 6, 1),
+        ("hard", 5, 3, 0),
+    ],
 )
-def test_a_training_may_limit_the_count_further(cap: str, count: int, most: int, allowed: int) -> None:
+def test_a_training_may_limit_the_count_further(
+    cap: str, count: int, most: int, allowed: int
+) -> None:
     asked = []
 
     def limit(refinement: Refinement, cap: int | None) -> int:

@@ -20,7 +20,8 @@ from tests.gaussians.helpers import random_gaussians
 @pytest.mark.parametrize("copies", [1, 2, 3, 8])
 @pytest.mark.parametrize("opacity", [0.1, 0.6, 0.95])
 def test_shared_opacity_preserves_centre_and_integral(copies: int, opacity: float) -> None:
-    """n coincident copies: the same opacity at the centre, and the same integral along a line (numerically)."""
+    """n coincident copies: the same opacity at the centre, and the same integral along a line
+    (numerically)."""
     o = torch.tensor([opacity], dtype=torch.float64)
     new, factor = shared_opacity(o, torch.tensor([copies]))
     assert 1 - (1 - float(new)) ** copies == pytest.approx(opacity)
@@ -42,7 +43,9 @@ def test_revised_opacity_of_two_children_equals_the_parent() -> None:
 def test_quantiles_are_those_of_numpy(share: float) -> None:
     values = np.sort(np.random.default_rng(0).normal(size=8))
     for count in (1, 2, 8):
-        assert quantile(torch.from_numpy(values[:count]), share) == pytest.approx(np.quantile(values[:count], share))
+        assert quantile(torch.from_numpy(values[:count]), share) == pytest.approx(
+            np.quantile(values[:count], share)
+        )
 
 
 @pytest.mark.parametrize("densifier", [MCMC(initial_opacity=0.2), MRNF(initial_opacity=0.2)])
@@ -58,7 +61,9 @@ def test_a_training_begins_with_small_gaussians_of_one_opacity(densifier: MCMC |
 def test_the_term_of_mcmc_in_the_loss() -> None:
     gaussians = random_gaussians(5)
     expected = 0.3 * float(gaussians.opacities.mean()) + 0.05 * float(gaussians.scales.mean())
-    assert float(MCMC(opacity_weight=0.3, scale_weight=0.05).regularizer(gaussians)) == pytest.approx(expected)
+    assert float(
+        MCMC(opacity_weight=0.3, scale_weight=0.05).regularizer(gaussians)
+    ) == pytest.approx(expected)
 
 
 def test_mcmc_moves_and_adds_a_single_gaussian() -> None:
@@ -127,7 +132,9 @@ def test_absolute_gradient_is_what_absgrad_reads() -> None:
     points = torch.zeros(3, 2, dtype=torch.float64, requires_grad=True)
     points.grad = torch.zeros(3, 2, dtype=torch.float64)
     absolute = torch.tensor([[3.0, 4.0], [0.0, 0.0], [1.0, 0.0]], dtype=torch.float64)
-    render = RenderOutput(torch.empty(0), torch.empty(0), torch.ones(3, dtype=torch.int32), points, absolute)
+    render = RenderOutput(
+        torch.empty(0), torch.empty(0), torch.ones(3, dtype=torch.int32), points, absolute
+    )
     densifier = ADC(gradient="absolute")
     assert densifier.needs_absolute_gradient
     densifier.begin(gaussians, DensifyContext(1.0))
@@ -141,7 +148,9 @@ def test_absolute_gradient_is_what_absgrad_reads() -> None:
 
 
 def test_curve_rises_from_the_cloud_to_the_cap() -> None:
-    curve, hard = (Budgeted(start=500, stop=1500, max_gaussians=1100, cap=cap) for cap in ("curve", "hard"))
+    curve, hard = (
+        Budgeted(start=500, stop=1500, max_gaussians=1100, cap=cap) for cap in ("curve", "hard")
+    )
     curve.begin(random_gaussians(100), DensifyContext(1.0))
     assert [curve.limit(step) for step in (0, 500, 1000, 1500, 9000)] == [100, 100, 850, 1100, 1100]
     assert hard.limit(600) == 1100
@@ -152,7 +161,9 @@ def test_none_never_changes_anything() -> None:
     densifier = NoDensifier()
     densifier.begin(gaussians, DensifyContext(1.0))
     trainable = TrainableGaussians(gaussians, LearningRates(), 1.0)
-    assert all(densifier.refine(step, trainable, torch.Generator()) is None for step in range(1, 3001))
+    assert all(
+        densifier.refine(step, trainable, torch.Generator()) is None for step in range(1, 3001)
+    )
     assert len(trainable) == 4
 
 
@@ -161,7 +172,9 @@ def test_state_survives_saving() -> None:
     events = []
     for interrupted in (False, True):
         densifier = ADC(max_gaussians=500, cap="curve", start=500, stop=3000)
-        trainable = TrainableGaussians(random_gaussians(50, log_scale=(-5, -1)), LearningRates(), 4.0)
+        trainable = TrainableGaussians(
+            random_gaussians(50, log_scale=(-5, -1)), LearningRates(), 4.0
+        )
         densifier.begin(trainable.values.detach(), DensifyContext(4.0))
         rng, draws = torch.Generator().manual_seed(5), np.random.default_rng(0)
         for step in range(599, 701):
@@ -184,12 +197,15 @@ def test_threshold_strictness() -> None:
     counts = {}
     for inclusive in (True, False):
         densifier = ADC(threshold_inclusive=inclusive, gradient_threshold=2.5e-4)
-        trainable = TrainableGaussians(random_gaussians(1, log_scale=(-9, -8)), LearningRates(), 4.0)
+        trainable = TrainableGaussians(
+            random_gaussians(1, log_scale=(-9, -8)), LearningRates(), 4.0
+        )
         trainable.values.opacity_logits.data.fill_(2.0)
         densifier.begin(trainable.values.detach(), DensifyContext(4.0))
         densifier.statistics["gradient_sum"][:] = torch.tensor(2.5e-4)
         densifier.statistics["visible_count"][:] = 1
-        densifier.gradient_threshold = float(densifier.statistics["gradient_sum"][0])  # as float32 holds it
+        # as float32 holds it
+        densifier.gradient_threshold = float(densifier.statistics["gradient_sum"][0])
         counts[inclusive] = densifier.refine(600, trainable, torch.Generator()).cloned
     assert counts == {True: 1, False: 0}
 
@@ -232,9 +248,15 @@ def test_mcmc_shares_an_opacity_among_fifty_at_most() -> None:
 
 @pytest.mark.parametrize(
     ("kind", "setting", "value"),
-    [(ADC, "split_children", 65), (Volumetric, "volume_children", 10**9), (MRNF, "opacity_decay", 1)],
+    [
+        (ADC, "split_children", 65),
+        (Volumetric, "volume_children", 10**9),
+        (MRNF, "opacity_decay", 1),
+    ],
 )
-def test_values_that_would_empty_or_fill_the_memory_are_refused(kind: type, setting: str, value: int) -> None:
+def test_values_that_would_empty_or_fill_the_memory_are_refused(
+    kind: type, setting: str, value: int
+) -> None:
     with pytest.raises(InputError, match=rf"densify\.{setting} must be"):
         kind(**{setting: value})
 

@@ -19,7 +19,8 @@ from tests.gaussians.helpers import random_gaussians
 
 
 def halves(rows: list[restatement.Row], mean_gradient: np.ndarray) -> list[restatement.Row]:
-    """d = 0.45: centres at 3 d s along the longest axis; that axis times 0.55, the others times sqrt(1 - 0.2025)."""
+    """d = 0.45: centres at 3 d s along the longest axis; that axis times 0.55, the others times
+    sqrt(1 - 0.2025)."""
     chosen = [i for i in range(len(rows)) if mean_gradient[i] >= 0.0008]
     children = []
     for side in (1, -1):
@@ -29,7 +30,9 @@ def halves(rows: list[restatement.Row], mean_gradient: np.ndarray) -> list[resta
             axis = restatement.rotation(rows[i]["quaternions"]) @ np.eye(3)[longest]
             new = scales * 0.7975**0.5
             new[longest] = 0.55 * scales[longest]
-            child = restatement.newborn(rows[i], rows[i]["means"] + side * 1.35 * scales[longest] * axis, np.log(new))
+            child = restatement.newborn(
+                rows[i], rows[i]["means"] + side * 1.35 * scales[longest] * axis, np.log(new)
+            )
             opacity = 0.6 / (1 + np.exp(-rows[i]["opacity_logits"]))
             child["opacity_logits"] = np.log(opacity / (1 - opacity))
             children.append(child)
@@ -79,13 +82,16 @@ def expected_scores(gaussians: object, views: list[int]) -> np.ndarray:
 
 @pytest.mark.parametrize(("step", "views"), [(700, 2), (3400, 3), (6400, 3), (9400, 2)])
 def test_the_edge_aware_score_of_each_gaussian(step: int, views: int) -> None:
-    """The mean over the views drawn, each over its own mean; 400 iterations after the first two resets, over all."""
+    """The mean over the views drawn, each over its own mean; 400 iterations after the first two
+    resets, over all."""
     densifier = EdgeAware(score_views=2)
     trainable, _ = started(densifier, step)
     with torch.no_grad():
         scores = densifier.scores(trainable.values, step, torch.Generator().manual_seed(step))
     drawn = torch.randperm(3, generator=torch.Generator().manual_seed(step))[:views].tolist()
-    np.testing.assert_allclose(scores, expected_scores(trainable.values.detach(), drawn), rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(
+        scores, expected_scores(trainable.values.detach(), drawn), rtol=1e-6, atol=1e-9
+    )
 
 
 def test_in_the_last_500_iterations_the_score_is_the_gradient_and_more_are_candidates() -> None:
@@ -94,7 +100,9 @@ def test_in_the_last_500_iterations_the_score_is_the_gradient_and_more_are_candi
     for step, threshold in ((14_500, 3e-4), (14_600, 2e-4)):
         over, _ = densifier.candidates(at(step, trainable, torch.Generator()))
         np.testing.assert_array_equal(over, gradient >= threshold)
-    np.testing.assert_allclose(densifier.scores(trainable.values, 14_600, torch.Generator()), gradient)
+    np.testing.assert_allclose(
+        densifier.scores(trainable.values, 14_600, torch.Generator()), gradient
+    )
     full = EdgeAware(gradient_threshold=3e-4, max_gaussians=COUNT)
     trainable, _ = started(full, 0)
     over, _ = full.candidates(at(14_600, trainable, torch.Generator()))
@@ -104,7 +112,8 @@ def test_in_the_last_500_iterations_the_score_is_the_gradient_and_more_are_candi
 @pytest.mark.parametrize("step", [600, 3100, 14_900])
 @pytest.mark.parametrize("seed", range(2))
 def test_edge_aware_round(seed: int, step: int) -> None:
-    """Who is drawn becomes two halves along the longest axis; the faint go but in the last round, the huge stay."""
+    """Who is drawn becomes two halves along the longest axis; the faint go but in the last round,
+    the huge stay."""
     densifier = EdgeAware(gradient_threshold=3e-4, max_gaussians=COUNT + 9, cap="hard")
     trainable, gradient = started(densifier, seed)
     trainable.values.opacity_logits.data[3] = -9.0
@@ -130,7 +139,9 @@ def test_edge_aware_round(seed: int, step: int) -> None:
 
 
 def test_a_candidate_that_covers_no_edge_is_not_split_though_there_is_room() -> None:
-    densifier = EdgeAware(gradient_threshold=1e-9, max_gaussians=10 * COUNT, cap="hard", prune_opacity=0.0)
+    densifier = EdgeAware(
+        gradient_threshold=1e-9, max_gaussians=10 * COUNT, cap="hard", prune_opacity=0.0
+    )
     trainable, gradient = started(densifier, 1)
     scores = expected_scores(trainable.values.detach(), [0, 1, 2])
     assert 0 < (scores == 0).sum() < COUNT
@@ -140,7 +151,9 @@ def test_a_candidate_that_covers_no_edge_is_not_split_though_there_is_room() -> 
 
 
 @pytest.mark.parametrize("room", [0, 9])
-def test_where_nothing_can_grow_no_view_is_rendered(room: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_where_nothing_can_grow_no_view_is_rendered(
+    room: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Without room all candidates are told as blocked; without candidates none is."""
     densifier = EdgeAware(max_gaussians=COUNT + room, cap="hard")
     trainable, _ = started(densifier, 0)
@@ -156,9 +169,12 @@ def test_the_growth_control_is_a_root() -> None:
     densifier = EdgeAware(max_gaussians=10_000, start=500, stop=15_000)
     trainable, _ = started(densifier, 0)
     rng = torch.Generator()
-    allowed = [densifier.allowance(at(step, trainable, rng)) for step in (600, 7500, 14_500, 14_900)]
+    allowed = [
+        densifier.allowance(at(step, trainable, rng)) for step in (600, 7500, 14_500, 14_900)
+    ]
     assert allowed == [int(10_000 * np.sqrt(x)) - COUNT for x in (100 / 14_000, 0.5, 1, 1)]
-    short = EdgeAware(max_gaussians=1000, start=100, stop=400, interval=100)  # shorter than the closing rounds
+    # shorter than the closing rounds
+    short = EdgeAware(max_gaussians=1000, start=100, stop=400, interval=100)
     assert [short.limit(step) for step in (150, 200, 300)] == [707, 1000, 1000]
     densifier.max_gaussians = COUNT
     assert densifier.allowance(at(7500, trainable, rng)) == 0
@@ -168,7 +184,8 @@ def test_the_growth_control_is_a_root() -> None:
 
 
 def test_the_prunings_of_the_schedule() -> None:
-    """At iteration 300 below .02; at 3,300 and 6,300, after the round, the faintest fifth; resets go to .05."""
+    """At iteration 300 below .02; at 3,300 and 6,300, after the round, the faintest fifth; resets
+    go to .05."""
     densifier, events = EdgeAware(max_gaussians=60), {}
     for step in (299, 300, 3000, 3200, 3300, 6300, 9300, 12_300, 15_300):
         trainable, _ = prepared(densifier, 2)
@@ -210,7 +227,9 @@ def seen(densifier: GNS, step: int) -> None:
     points = torch.zeros(50, 2, dtype=torch.float64, requires_grad=True)
     points.grad = torch.zeros(50, 2, dtype=torch.float64)
     radii = torch.ones(50, dtype=torch.int32)
-    densifier.observe(step, RenderOutput(torch.empty(0), torch.empty(0), radii, points, points.grad))
+    densifier.observe(
+        step, RenderOutput(torch.empty(0), torch.empty(0), radii, points, points.grad)
+    )
 
 
 def restated(densifier: GNS, logits: np.ndarray, weight: float, soft: bool) -> float:
@@ -220,7 +239,9 @@ def restated(densifier: GNS, logits: np.ndarray, weight: float, soft: bool) -> f
     return weight * ((logits + 20) / np.maximum(0.05, 1 - opacities)).mean() ** 2
 
 
-@pytest.mark.parametrize(("step", "soft"), [(15_001, True), (15_951, True), (16_001, False), (22_951, False)])
+@pytest.mark.parametrize(
+    ("step", "soft"), [(15_001, True), (15_951, True), (16_001, False), (22_951, False)]
+)
 def test_the_pressure_and_its_gradient(step: int, soft: bool) -> None:
     """Against the formula and its central differences, also through the divisor."""
     densifier, gaussians = begun(max_gaussians=20)
@@ -239,7 +260,8 @@ def test_the_pressure_and_its_gradient(step: int, soft: bool) -> None:
 
 @pytest.mark.parametrize("sinks", [0.0, 2.0])
 def test_the_weight_follows_an_aim_that_falls_to_nothing(sinks: float) -> None:
-    """The authors' schedule, iteration by iteration, for opacities that stay once the first has set the aim.
+    """The authors' schedule, iteration by iteration, for opacities that stay once the first has set
+    the aim.
 
     Where they sank, the weight falls first, rests while the aim passes, and rises.
     """
@@ -273,7 +295,9 @@ def test_the_aim_starts_from_the_last_gaussian_within_the_budget(budget: int, pl
     densifier, gaussians = begun(max_gaussians=budget)
     densifier.step = 15_000
     densifier.regularizer(gaussians)
-    assert densifier.aim == pytest.approx(0.8 * sorted(gaussians.opacities.tolist(), reverse=True)[place])
+    assert densifier.aim == pytest.approx(
+        0.8 * sorted(gaussians.opacities.tolist(), reverse=True)[place]
+    )
 
 
 def test_it_grows_to_three_times_the_budget_and_selects_down_to_it() -> None:
@@ -299,22 +323,31 @@ def test_it_grows_to_three_times_the_budget_and_selects_down_to_it() -> None:
     least = trainable.values.opacities.detach().sort().values
     assert float(least[0]) < 1e-9 < float(least[1])
     assert densifier.regularizer(trainable.values) is None
-    assert [densifier.refine(step, trainable, rng) for step in (16_100, 17_050, 23_000)] == [None] * 3
+    assert [densifier.refine(step, trainable, rng) for step in (16_100, 17_050, 23_000)] == [
+        None
+    ] * 3
     assert trainable.adam["opacity_logits"].rate == pytest.approx(4 * 0.05)
     assert densifier.refine(17_051, trainable, rng).balances()
     assert trainable.adam["opacity_logits"].rate == pytest.approx(0.05)
 
 
-def test_at_the_end_of_its_time_the_budget_is_met_whatever_the_opacities(caplog: pytest.LogCaptureFixture) -> None:
+def test_at_the_end_of_its_time_the_budget_is_met_whatever_the_opacities(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     densifier = GNS(max_gaussians=20)
     trainable, _ = started(densifier, 0)
     event = densifier.refine(23_000, trainable, torch.Generator().manual_seed(0))
     assert (event.pruned_opacity, event.after) == (COUNT - 20, 20)
     assert event.balances()
-    assert f"ended with {COUNT} Gaussians, and {COUNT - 20} of them were removed at random" in caplog.text
+    assert (
+        f"ended with {COUNT} Gaussians, and {COUNT - 20} of them were removed at random"
+        in caplog.text
+    )
 
 
-def test_a_selection_that_has_met_its_budget_warns_of_nothing(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_selection_that_has_met_its_budget_warns_of_nothing(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     densifier = GNS(max_gaussians=COUNT - 1)
     trainable, _ = started(densifier, 0)
     assert densifier.refine(16_050, trainable, torch.Generator().manual_seed(0)).after == COUNT - 1

@@ -26,7 +26,9 @@ def opacity(row: restatement.Row) -> float:
     return 1 / (1 + np.exp(-row["opacity_logits"]))
 
 
-def drawn(rows: list[restatement.Row], weights: list[float], count: int, rng: torch.Generator) -> list[int]:
+def drawn(
+    rows: list[restatement.Row], weights: list[float], count: int, rng: torch.Generator
+) -> list[int]:
     """With replacement: where uniform numbers fall on the line of all weights."""
     line = np.cumsum(weights)
     numbers = torch.rand(count, generator=rng, dtype=torch.float64).numpy() * line[-1]
@@ -38,7 +40,9 @@ def shared(row: restatement.Row, copies: int) -> restatement.Row:
     o, n = opacity(row), min(copies, 50)
     new = 1 - (1 - o) ** (1 / n)
     total = sum(
-        math.comb(i - 1, k) * (-1) ** k * new ** (k + 1) / math.sqrt(k + 1) for i in range(1, n + 1) for k in range(i)
+        math.comb(i - 1, k) * (-1) ** k * new ** (k + 1) / math.sqrt(k + 1)
+        for i in range(1, n + 1)
+        for k in range(i)
     )
     kept = max(0.005, min(new, 1 - 1e-6))
     changed = restatement.newborn(row, row["means"].copy(), row["log_scales"] + math.log(o / total))
@@ -48,7 +52,9 @@ def shared(row: restatement.Row, copies: int) -> restatement.Row:
 def with_copies(rows: list[restatement.Row], sources: list[int]) -> list[restatement.Row]:
     counts = {i: sources.count(i) + 1 for i in set(sources)}
     sharing = [shared(row, counts[i]) if i in counts else row for i, row in enumerate(rows)]
-    return sharing + [{name: np.array(value) for name, value in sharing[i].items()} for i in sources]
+    return sharing + [
+        {name: np.array(value) for name, value in sharing[i].items()} for i in sources
+    ]
 
 
 def prepared(count: int, seed: int, **options: Any) -> tuple[MCMC, TrainableGaussians]:
@@ -82,22 +88,28 @@ def test_mcmc_round(seed: int, growth: float) -> None:
 
 
 def test_mcmc_noise() -> None:
-    """R S S R^T times a normal draw, times sigmoid(-100 (o - .005)), times 5e5 and the rate of the means."""
+    """R S S R^T times a normal draw, times sigmoid(-100 (o - .005)), times 5e5 and the rate of the
+    means."""
     densifier, trainable = prepared(40, 1)
     trainable.values.opacity_logits.data.copy_(torch.linspace(-9, 2, 40))
     trainable.set_step(1)
     rows = to_rows(trainable)
     densifier.after_step(1, trainable, torch.Generator().manual_seed(0))
-    noise = torch.randn(40, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64).numpy()
+    noise = torch.randn(
+        40, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64
+    ).numpy()
     for i, row in enumerate(rows):
         axes = restatement.rotation(row["quaternions"]) * np.exp(row["log_scales"])
         gate = 1 / (1 + np.exp(100 * (opacity(row) - 0.005)))
-        row["means"] = row["means"] + axes @ axes.T @ noise[i] * gate * 5e5 * trainable.position_rate
+        row["means"] = (
+            row["means"] + axes @ axes.T @ noise[i] * gate * 5e5 * trainable.position_rate
+        )
     assert_same(trainable, rows)
 
 
 def scored(values: Gaussians) -> tuple[np.ndarray, np.ndarray]:
-    """Over the three views: the largest refine weight, and 1 + .25 times the mean edge score over its median."""
+    """Over the three views: the largest refine weight, and 1 + .25 times the mean edge score over
+    its median."""
     room, weight, edge = Room(), np.zeros(COUNT), np.zeros(COUNT)
     for view, camera in enumerate(room.cameras):
         image = ReferenceRasterizer().render(values, camera, 0, BLACK).image.detach()
@@ -109,13 +121,16 @@ def scored(values: Gaussians) -> tuple[np.ndarray, np.ndarray]:
 
 
 def half(row: restatement.Row, side: int) -> restatement.Row:
-    """Half a standard deviation to a side along the longest axis, which is halved; the others times .85."""
+    """Half a standard deviation to a side along the longest axis, which is halved; the others times
+    .85."""
     scales = np.exp(row["log_scales"])
     longest = int(np.argmax(scales))
     axis = restatement.rotation(row["quaternions"])[:, longest]
     new = scales * 0.85
     new[longest] = 0.5 * scales[longest]
-    child = restatement.newborn(row, row["means"] + side * 0.5 * scales[longest] * axis, np.log(new))
+    child = restatement.newborn(
+        row, row["means"] + side * 0.5 * scales[longest] * axis, np.log(new)
+    )
     opacity = 0.6 / (1 + np.exp(-row["opacity_logits"]))
     child["opacity_logits"] = np.log(opacity / (1 - opacity))
     return child
@@ -163,7 +178,9 @@ def test_mrnf_round(step: int, room: int) -> None:
     weights = torch.from_numpy(opacities * guidance)
     refilled = draw(torch.from_numpy(seen & ~gone), weights, 7, rng).numpy()
     left = min(wanted - 7, room) if step < 15_000 else 0
-    grown = draw(torch.from_numpy(above & ~gone & ~refilled), torch.from_numpy(weight * guidance), left, rng).numpy()
+    grown = draw(
+        torch.from_numpy(above & ~gone & ~refilled), torch.from_numpy(weight * guidance), left, rng
+    ).numpy()
     split = refilled | grown
     assert (event.pruned_opacity, event.split_gradient) == (7, split.sum())
     assert split.sum() == 7 + left
@@ -203,7 +220,11 @@ def test_decay_ends_and_keeps_opaque_gaussians_finite() -> None:
 def test_rounds_and_their_end() -> None:
     densifier = MRNF(stop=1000)
     trainable, _ = begun(densifier, 0)
-    due = [step for step in range(1, 1100) if densifier.refine(step, trainable, torch.Generator()) is not None]
+    due = [
+        step
+        for step in range(1, 1100)
+        if densifier.refine(step, trainable, torch.Generator()) is not None
+    ]
     assert due == [200, 400, 600, 800]
 
 
@@ -219,7 +240,9 @@ def test_what_leaves_the_scene_by_size_goes() -> None:
 
 def test_the_bounds_hold_the_central_four_fifths() -> None:
     means = torch.tensor([[i, 10.0 * i, -i] for i in range(101)], dtype=torch.float64)
-    center, half_size, middle = bounds(means[torch.randperm(101, generator=torch.Generator().manual_seed(0))])
+    center, half_size, middle = bounds(
+        means[torch.randperm(101, generator=torch.Generator().manual_seed(0))]
+    )
     assert center.tolist() == [50, 500, -50]
     assert (half_size, middle) == (400, 80)
 
@@ -235,7 +258,11 @@ def test_noise_moves_the_faint_that_were_seen_and_is_limited() -> None:
     before = trainable.values.means.detach().clone()
     densifier.after_step(1, trainable, torch.Generator().manual_seed(0))
     moved = trainable.values.means.detach() - before
-    weight = (1 - torch.sigmoid(torch.tensor(-9.0, dtype=torch.float64))) ** 150 * 50 * trainable.position_rate
+    weight = (
+        (1 - torch.sigmoid(torch.tensor(-9.0, dtype=torch.float64))) ** 150
+        * 50
+        * trainable.position_rate
+    )
     assert float(moved[:50].std()) == pytest.approx(float(weight), rel=0.15)
     assert not moved[50:100].any()
     assert moved[100:].abs().max() < 1e-30

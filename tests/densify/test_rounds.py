@@ -1,4 +1,5 @@
-"""Whole refinement rounds against the slow restatement: the same Gaussians, optimiser moments and events."""
+"""Whole refinement rounds against the slow restatement: the same Gaussians, optimiser moments and
+events."""
 
 from __future__ import annotations
 
@@ -18,8 +19,11 @@ from tests.gaussians.helpers import random_gaussians
 EXTENT = 4.0
 
 
-def prepared(densifier: Densifier, seed: int, count: int = 60) -> tuple[TrainableGaussians, np.ndarray]:
-    """Gaussians with uneven Adam moments, and three observed iterations; also the mean gradient of each."""
+def prepared(
+    densifier: Densifier, seed: int, count: int = 60
+) -> tuple[TrainableGaussians, np.ndarray]:
+    """Gaussians with uneven Adam moments, and three observed iterations; also the mean gradient of
+    each."""
     rng = np.random.default_rng(seed)
     gaussians = random_gaussians(count, seed, log_scale=(-6.0, 0.3))
     gaussians.opacity_logits.copy_(torch.from_numpy(rng.uniform(-8, 3, count)))
@@ -42,7 +46,8 @@ def prepared(densifier: Densifier, seed: int, count: int = 60) -> tuple[Trainabl
 def observe(
     densifier: Densifier, trainable: TrainableGaussians, rng: np.random.Generator, step: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Show the densifier a made-up render; returns the gradients [N, 2] and radii [N] of the points in it."""
+    """Show the densifier a made-up render; returns the gradients [N, 2] and radii [N] of the points
+    in it."""
     count = len(trainable)
     points = torch.zeros(count, 2, dtype=torch.float64, requires_grad=True)
     points.grad = torch.from_numpy(rng.exponential(2e-4, (count, 2)))
@@ -50,7 +55,9 @@ def observe(
     probe = torch.zeros(count, 3, 3, dtype=torch.float64, requires_grad=True)
     probe.grad = torch.zeros_like(probe)
     empty = torch.empty(0)
-    densifier.observe(step, RenderOutput(empty, empty, radii, points, points.grad, splitting_probe=probe))
+    densifier.observe(
+        step, RenderOutput(empty, empty, radii, points, points.grad, splitting_probe=probe)
+    )
     return points.grad.numpy(), radii.numpy()
 
 
@@ -59,8 +66,13 @@ def to_rows(trainable: TrainableGaussians) -> list[restatement.Row]:
     rows = []
     for i in range(len(trainable)):
         row = {name: tensor[i].detach().numpy().copy() for name, tensor in tensors.items()}
-        row |= {"first " + name: state.first[i].numpy().copy() for name, state in trainable.adam.items()}
-        row |= {"second " + name: state.second[i].numpy().copy() for name, state in trainable.adam.items()}
+        row |= {
+            "first " + name: state.first[i].numpy().copy() for name, state in trainable.adam.items()
+        }
+        row |= {
+            "second " + name: state.second[i].numpy().copy()
+            for name, state in trainable.adam.items()
+        }
         rows.append(row)
     return rows
 
@@ -68,7 +80,11 @@ def to_rows(trainable: TrainableGaussians) -> list[restatement.Row]:
 def noise_of(seed: int, counts: list[int]) -> list[np.ndarray]:
     """The normal draws of the real code: one batch of [2 S, 3] per rule that splits S parents."""
     rng = torch.Generator().manual_seed(seed)
-    return [row for s in counts for row in torch.randn(2 * s, 3, generator=rng, dtype=torch.float64).numpy()]
+    return [
+        row
+        for s in counts
+        for row in torch.randn(2 * s, 3, generator=rng, dtype=torch.float64).numpy()
+    ]
 
 
 def assert_same(trainable: TrainableGaussians, rows: list[restatement.Row]) -> None:
@@ -77,7 +93,9 @@ def assert_same(trainable: TrainableGaussians, rows: list[restatement.Row]) -> N
     for real, expected in zip(found, rows, strict=True):
         assert real.keys() == expected.keys()
         for name in real:
-            np.testing.assert_allclose(real[name], expected[name], rtol=1e-5, atol=1e-7, err_msg=name)
+            np.testing.assert_allclose(
+                real[name], expected[name], rtol=1e-5, atol=1e-7, err_msg=name
+            )
             apart = np.abs(real[name] - expected[name]) / np.maximum(1, np.abs(expected[name]))
             restatement.DIFFERENCES.append(float(apart.max(initial=0)))
 
@@ -108,7 +126,9 @@ def test_absgrad_round(seed: int) -> None:
     rows, expected = to_rows(trainable), {}
     event = densifier.refine(600, trainable, torch.Generator().manual_seed(seed))
     noise = iter(noise_of(seed, [event.split_gradient]))
-    rows = restatement.prune(restatement.adc_growth(rows, gradient, EXTENT, noise, expected), 600, EXTENT, expected)
+    rows = restatement.prune(
+        restatement.adc_growth(rows, gradient, EXTENT, noise, expected), 600, EXTENT, expected
+    )
     assert_same(trainable, rows)
     assert expected == {name: getattr(event, name) for name in expected}
 
@@ -126,7 +146,9 @@ def test_revised_round(seed: int) -> None:
             opacity = 1 - np.sqrt(1 - 1 / (1 + np.exp(-row["opacity_logits"])))
             row["opacity_logits"] = np.log(opacity / (1 - opacity))
             row["first opacity_logits"], row["second opacity_logits"] = np.zeros(()), np.zeros(())
-    rows = restatement.prune(restatement.adc_growth(rows, gradient, EXTENT, noise, expected), 600, EXTENT, expected)
+    rows = restatement.prune(
+        restatement.adc_growth(rows, gradient, EXTENT, noise, expected), 600, EXTENT, expected
+    )
     assert_same(trainable, rows)
     assert expected == {name: getattr(event, name) for name in expected}
 
@@ -147,7 +169,9 @@ def test_volumetric_once_round(seed: int) -> None:
         if 4 / 3 * np.pi * s.prod() > 0.03 >= 4 / 3 * np.pi * child.prod():
             chosen.append(i)
             scales[i] = np.log(child)
-    rows = restatement.prune(restatement.split_all(rows, chosen, scales, noise), 600, EXTENT, expected)
+    rows = restatement.prune(
+        restatement.split_all(rows, chosen, scales, noise), 600, EXTENT, expected
+    )
     assert_same(trainable, rows)
     assert event.split_volume == len(chosen) > 0
 
@@ -178,7 +202,8 @@ def test_volumes_may_be_split_before_the_gradient_rule(seed: int, step: int) -> 
     event = densifier.refine(step, trainable, torch.Generator().manual_seed(seed))
     noise = iter(noise_of(seed, [event.split_volume, event.split_gradient]))
     rows = restatement.volume_growth(rows, 0.03, noise, expected)
-    gradient = np.concatenate([gradient[~large], np.zeros(2 * large.sum())])  # nobody has seen the children yet
+    # nobody has seen the children yet
+    gradient = np.concatenate([gradient[~large], np.zeros(2 * large.sum())])
     rows = restatement.adc_growth(rows, gradient, EXTENT, noise, expected)
     rows = restatement.prune(rows, step, EXTENT, expected)
     assert_same(trainable, rows)
@@ -226,7 +251,8 @@ SWITCHES: dict[str, list[object]] = {
 
 @pytest.mark.parametrize("seed", range(80))
 def test_any_combination_of_switches_goes_through_several_rounds(seed: int) -> None:
-    """A pairwise-covering draw of the switches; every round balances, stays finite and keeps to an exact cap."""
+    """A pairwise-covering draw of the switches; every round balances, stays finite and keeps to an
+    exact cap."""
     rng = np.random.default_rng(seed)
     options = {name: values[rng.integers(len(values))] for name, values in SWITCHES.items()}
     if options["cap"] == "curve":
@@ -240,7 +266,12 @@ def test_any_combination_of_switches_goes_through_several_rounds(seed: int) -> N
         assert event is not None
         grown = event.cloned + event.split_gradient + event.split_volume
         assert event.after == event.before + grown - event.pruned_opacity - event.pruned_size
-        assert event.after == len(trainable) == len(densifier.lineage.ids) == len(densifier.statistics["gradient_sum"])
+        assert (
+            event.after
+            == len(trainable)
+            == len(densifier.lineage.ids)
+            == len(densifier.statistics["gradient_sum"])
+        )
         assert all(torch.isfinite(tensor).all() for tensor in trainable.values.tensors().values())
         if options["max_gaussians"] is not None and options["cap"] != "soft":
             assert len(trainable) <= 90
@@ -283,7 +314,8 @@ def test_opacity_reset_zeroes_the_opacity_moments_only() -> None:
 
 
 def test_refinements_of_the_paper_schedule() -> None:
-    """144 refinements at 600, 700 ... 14,900 and resets at 3000, 6000, 9000, 12,000 (the baseline's own count)."""
+    """144 refinements at 600, 700 ... 14,900 and resets at 3000, 6000, 9000, 12,000 (the baseline's
+    own count)."""
     densifier = ADC()
     gaussians = random_gaussians(4)
     gaussians = Gaussians(**gaussians.tensors())
@@ -309,7 +341,9 @@ def test_windows_are_those_of_a_training() -> None:
 
 
 @pytest.mark.parametrize(("white", "resets"), [(False, [3000, 6000]), (True, [500, 3000, 6000])])
-def test_before_a_white_background_opacities_are_reset_at_the_start_too(white: bool, resets: list[int]) -> None:
+def test_before_a_white_background_opacities_are_reset_at_the_start_too(
+    white: bool, resets: list[int]
+) -> None:
     densifier = ADC(stop=9000)
     trainable, _ = prepared(densifier, 0, count=3)
     densifier.context = DensifyContext(EXTENT, white_background=white)
@@ -327,7 +361,9 @@ def test_gradients_and_radii_are_gathered_until_the_window_ends() -> None:
     for step, radii in shown:
         points = torch.zeros(3, 2, dtype=torch.float64, requires_grad=True)
         points.grad = torch.tensor([[3.0, 4.0]] * 3, dtype=torch.float64)
-        densifier.observe(step, RenderOutput(torch.empty(0), torch.empty(0), torch.tensor(radii).int(), points))
+        densifier.observe(
+            step, RenderOutput(torch.empty(0), torch.empty(0), torch.tensor(radii).int(), points)
+        )
     assert densifier.statistics["max_radii"].tolist() == [4, 5, 2]
     assert densifier.statistics["visible_count"].tolist() == [2, 1, 2]
     assert densifier.statistics["gradient_sum"].tolist() == [10.0, 5.0, 10.0]
@@ -339,6 +375,7 @@ def test_the_huge_are_pruned_after_the_first_reset_by_size_or_by_radius() -> Non
     densifier.begin(random_gaussians(4), DensifyContext(EXTENT))
     densifier.statistics["max_radii"] = torch.tensor([0, 20, 21, 0], dtype=torch.int32)
     log_scales = torch.tensor([[-9.0, -9.0, 0.39], [-9.0] * 3, [-9.0] * 3, [-9.0, 0.41, -9.0]])
-    log_scales[[0, 3], [2, 1]] = log_scales[[0, 3], [2, 1]].log()  # of 0.1 times the extent of 4: just below and above
+    # of 0.1 times the extent of 4: just below and above
+    log_scales[[0, 3], [2, 1]] = log_scales[[0, 3], [2, 1]].log()
     assert densifier.huge(3000, log_scales).tolist() == [False] * 4
     assert densifier.huge(3001, log_scales).tolist() == [False, False, True, True]

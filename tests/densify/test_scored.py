@@ -19,7 +19,8 @@ from tests.densify.test_scores import BLACK, COUNT, Room, alphas, at, started
 
 
 def counted(values: Gaussians, threshold: float) -> tuple[np.ndarray, np.ndarray]:
-    """Over the three views: the mean number of bad pixels, rounded down, and loss times number, scaled to [0, 1]."""
+    """Over the three views: the mean number of bad pixels, rounded down, and loss times number,
+    scaled to [0, 1]."""
     room, total, weighted = Room(), np.zeros(COUNT), np.zeros(COUNT)
     for view, camera in enumerate(room.cameras):
         image = ReferenceRasterizer().render(values, camera, 0, BLACK).image.detach()
@@ -57,13 +58,19 @@ def test_fast_gs_round(seed: int, step: int) -> None:
     splits = several & (absolute >= 1.2e-3)  # .0004 in the restatement of AbsGS
     clones = several & (signed >= 2e-4)
     large = np.array([np.exp(row["log_scales"]).max() > 0.001 * EXTENT for row in rows])
-    drawn = torch.randn(2 * int((splits & large).sum()), 3, generator=rng, dtype=torch.float64).numpy()
-    grown, cloned, split = absgs_growth(rows, np.where(clones, 1.0, 0), np.where(splits, 1.0, 0), iter(drawn))
+    drawn = torch.randn(
+        2 * int((splits & large).sum()), 3, generator=rng, dtype=torch.float64
+    ).numpy()
+    grown, cloned, split = absgs_growth(
+        rows, np.where(clones, 1.0, 0), np.where(splits, 1.0, 0), iter(drawn)
+    )
     assert (event.cloned, event.split_gradient) == (cloned, split)
     assert split > 0
 
     faint = np.array([1 / (1 + np.exp(-row["opacity_logits"])) < 0.005 for row in grown])
-    huge = np.array([np.exp(row["log_scales"]).max() > 0.1 * EXTENT for row in grown]) & (step > 3000)
+    huge = np.array([np.exp(row["log_scales"]).max() > 0.1 * EXTENT for row in grown]) & (
+        step > 3000
+    )
     scores = np.delete(counts[1].astype(np.float32), np.nonzero(splits & large)[0])
     weights = np.zeros(len(grown), np.float32)
     weights[: len(scores)] = 1 / (np.float32(1e-6) + np.float32(1) - scores)
@@ -88,7 +95,9 @@ def test_after_the_window_the_rather_faint_and_those_that_err_most_go() -> None:
     rows, (_, scores) = to_rows(trainable), counted(trainable.values.detach(), 0.1)
     event = densifier.refine(18_000, trainable, torch.Generator())
     opacities = np.array([1 / (1 + np.exp(-row["opacity_logits"])) for row in rows])
-    assert_same(trainable, [row for i, row in enumerate(rows) if opacities[i] >= 0.1 and scores[i] <= 0.9])
+    assert_same(
+        trainable, [row for i, row in enumerate(rows) if opacities[i] >= 0.1 and scores[i] <= 0.9]
+    )
     assert event.pruned_opacity == (opacities < 0.1).sum() >= 5
     assert event.pruned_size == ((scores > 0.9) & (opacities >= 0.1)).sum() > 0
     assert event.balances()
@@ -103,8 +112,12 @@ def test_without_bad_pixels_nobody_grows() -> None:
     assert event.cloned == event.split_gradient == 0
     rules = densifier.rules(at(600, trainable, torch.Generator()))
     assert [rule.__name__ for rule in rules] == [
-        "score", "grow_by_gradient", "prune", "lower_opacity", "reset_statistics"
-    ]  # fmt: skip
+        "score",
+        "grow_by_gradient",
+        "prune",
+        "lower_opacity",
+        "reset_statistics",
+    ]
     over, _ = densifier.candidates(at(700, trainable, torch.Generator()))
     assert not over.any()
 

@@ -1,4 +1,5 @@
-"""Edge maps, sums over pixels, draws, and the two densifiers that use them, against restatements in numpy."""
+"""Edge maps, sums over pixels, draws, and the two densifiers that use them, against restatements in
+numpy."""
 
 from __future__ import annotations
 
@@ -17,7 +18,13 @@ from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.paper_values import LearningRates
 from gsbench.gaussians.trainable import TrainableGaussians
 from gsbench.raster.base import RenderOutput
-from gsbench.raster.reference import ReferenceRasterizer, bin_gaussians, blending_weights, project, tile_rectangles
+from gsbench.raster.reference import (
+    ReferenceRasterizer,
+    bin_gaussians,
+    blending_weights,
+    project,
+    tile_rectangles,
+)
 from gsbench.scene.types import Camera
 from gsbench.train.loss import torch_photometric_loss
 from tests.densify import restatement
@@ -35,7 +42,9 @@ class Room:
     def __init__(self) -> None:
         rng = np.random.default_rng(0)
         self.cameras = [front_camera(WIDTH, HEIGHT, (5.0 * k, -3.0 * k)) for k in range(3)]
-        self.images = [torch.from_numpy(rng.integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8)) for _ in range(3)]
+        self.images = [
+            torch.from_numpy(rng.integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8)) for _ in range(3)
+        ]
 
     def __len__(self) -> int:
         return len(self.images)
@@ -57,13 +66,18 @@ def alphas(gaussians: Gaussians, camera: Camera) -> np.ndarray:
     """alpha T of every Gaussian in every pixel, [N, H, W], taken apart from all sums."""
     found = np.zeros((len(gaussians), HEIGHT, WIDTH))
     projected = project(gaussians, camera)
-    for tile, members in bin_gaussians(projected.depths, *tile_rectangles(projected, camera, 16), 3):
+    for tile, members in bin_gaussians(
+        projected.depths, *tile_rectangles(projected, camera, 16), 3
+    ):
         for y in range(tile // 3 * 16, min(tile // 3 * 16 + 16, HEIGHT)):
             for x in range(tile % 3 * 16, min(tile % 3 * 16 + 16, WIDTH)):
                 index = projected.index[members]
                 pixel = torch.tensor([[x, y]], dtype=torch.float64)
                 weights = blending_weights(
-                    pixel, projected.means[members][None], projected.conics[members], gaussians.opacities[index]
+                    pixel,
+                    projected.means[members][None],
+                    projected.conics[members],
+                    gaussians.opacities[index],
                 )
                 found[index.numpy(), y, x] = weights[0].numpy()
     return found
@@ -71,7 +85,9 @@ def alphas(gaussians: Gaussians, camera: Camera) -> np.ndarray:
 
 def find_edges(image: torch.Tensor) -> np.ndarray:
     """By Pillow, with the outermost pixels taken away."""
-    edges = np.array(Image.fromarray(image.numpy()).convert("L").filter(ImageFilter.FIND_EDGES), np.float64)
+    edges = np.array(
+        Image.fromarray(image.numpy()).convert("L").filter(ImageFilter.FIND_EDGES), np.float64
+    )
     edges[[0, -1]], edges[:, [0, -1]] = 0, 0
     return (edges - edges.min()) / (edges.max() - edges.min())
 
@@ -98,7 +114,9 @@ def test_edges_are_those_that_pillow_finds(seed: int) -> None:
 def test_blended_sums_are_sums_of_alpha_and_transmittance() -> None:
     gaussians, room = random_gaussians(COUNT, 3, log_scale=(-3.5, -0.5)), Room()
     gaussians.sh_dc[:] = -9.0  # all black: their own colours have no gradient
-    weights = torch.rand(HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    weights = torch.rand(
+        HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64
+    )
     with torch.no_grad():  # as in a refinement
         sums, _ = blended_sums(room, 1, gaussians, 1, weights)
     expected = np.einsum("nyx,yxc->nc", alphas(gaussians, room.cameras[1]), weights.numpy())
@@ -115,7 +133,8 @@ def test_by_median_leaves_out_what_is_not_positive() -> None:
 
 
 def test_draws_are_in_proportion_and_without_replacement() -> None:
-    """Of four, two are drawn: the chance of each pair is known (first one, then one of the rest, by score)."""
+    """Of four, two are drawn: the chance of each pair is known (first one, then one of the rest, by
+    score)."""
     scores = torch.tensor([9.0, 1.0, 2.0, 0.0, 3.0])
     candidates = torch.tensor([False, True, True, True, True])
     rng, counts = torch.Generator().manual_seed(0), np.zeros(5)
@@ -125,11 +144,14 @@ def test_draws_are_in_proportion_and_without_replacement() -> None:
         assert drawn.sum() == 2
         counts += drawn.numpy()
     weight = {1: 1 / 6, 2: 2 / 6, 4: 3 / 6}
-    expected = {i: w + sum(v * w / (1 - v) for j, v in weight.items() if j != i) for i, w in weight.items()}
+    expected = {
+        i: w + sum(v * w / (1 - v) for j, v in weight.items() if j != i) for i, w in weight.items()
+    }
     assert counts[0] == counts[3] == 0
     for i, chance in expected.items():
         assert abs(counts[i] / rounds - chance) < 5 * np.sqrt(chance * (1 - chance) / rounds)
-    assert draw(candidates, scores, 4, rng).tolist() == candidates.tolist()  # the one without a score comes last
+    # the one without a score comes last
+    assert draw(candidates, scores, 4, rng).tolist() == candidates.tolist()
     assert draw(candidates, scores, 9, rng).tolist() == candidates.tolist()
     assert not draw(candidates, scores, 0, rng).any()
     assert not draw(candidates, scores, -1, rng).any()
@@ -158,14 +180,19 @@ def at(step: int, trainable: TrainableGaussians, rng: torch.Generator) -> Refine
 def taming_scores(trainable: TrainableGaussians, gradient: np.ndarray) -> np.ndarray:
     """The score over all three views, term by term."""
     room, values = Room(), trainable.values.detach()
-    scales, opacities = np.exp(values.log_scales.numpy()), 1 / (1 + np.exp(-values.opacity_logits.numpy()))
+    scales, opacities = (
+        np.exp(values.log_scales.numpy()),
+        1 / (1 + np.exp(-values.opacity_logits.numpy())),
+    )
     total = np.zeros(COUNT)
     for view, camera in enumerate(room.cameras):
         weights = alphas(values, camera)
         render = ReferenceRasterizer().render(values, camera, 0, BLACK)
         photograph = room.images[view].numpy() / 255
         error = np.abs(render.image.detach().numpy() - photograph).mean(-1)
-        pixels = 50 * (error - error.min()) / (error.max() - error.min()) + 50 * find_edges(room.images[view])
+        pixels = 50 * (error - error.min()) / (error.max() - error.min()) + 50 * find_edges(
+            room.images[view]
+        )
         local = values.means.numpy() @ camera.rotation.T + camera.translation
         x = camera.fx * local[:, 0] / local[:, 2] + camera.cx - 0.5
         y = camera.fy * local[:, 1] / local[:, 2] + camera.cy - 0.5
@@ -206,7 +233,10 @@ def test_taming_round(seed: int) -> None:
     large = np.array([np.exp(row["log_scales"]).max() > 0.01 * EXTENT for row in rows])
     over = gradient >= 2e-4
     event = densifier.refine(600, trainable, torch.Generator().manual_seed(seed))
-    small_share, large_share = 12 * (over & ~large).sum() // over.sum(), 12 * (over & large).sum() // over.sum()
+    small_share, large_share = (
+        12 * (over & ~large).sum() // over.sum(),
+        12 * (over & large).sum() // over.sum(),
+    )
     assert (event.cloned, event.split_gradient) == (small_share, large_share)
     assert event.blocked_by_cap == over.sum() - small_share - large_share
 
@@ -216,7 +246,9 @@ def test_taming_round(seed: int) -> None:
     cloned = draw(torch.from_numpy(over & ~large), given, small_share, rng).numpy()
     split = draw(torch.from_numpy(over & large), given, large_share, rng).numpy()
     noise = iter(torch.randn(2 * large_share, 3, generator=rng, dtype=torch.float64).numpy())
-    grown = restatement.adc_growth(rows, np.where(cloned | split, 1.0, 0.0), EXTENT, noise, expected)
+    grown = restatement.adc_growth(
+        rows, np.where(cloned | split, 1.0, 0.0), EXTENT, noise, expected
+    )
     faint = np.array([1 / (1 + np.exp(-row["opacity_logits"])) < 0.005 for row in grown])
     assert not faint.any()  # nothing to prune yet
     assert_same(trainable, grown)
@@ -240,7 +272,9 @@ def test_taming_prunes_half_as_many_draws_as_there_are_to_prune() -> None:
     assert 0 < event.pruned_opacity <= 20
     trainable, _ = started(densifier, 1)
     trainable.values.opacity_logits.data[:40] = -9.0
-    assert densifier.refine(500 + 2700, trainable, torch.Generator().manual_seed(0)).pruned_opacity > 0
+    assert (
+        densifier.refine(500 + 2700, trainable, torch.Generator().manual_seed(0)).pruned_opacity > 0
+    )
     trainable, _ = started(densifier, 1)
     trainable.values.opacity_logits.data[:40] = -9.0
     late = densifier.refine(600 + 2700, trainable, torch.Generator().manual_seed(0))
@@ -258,7 +292,9 @@ def test_taming_prunes_rather_those_of_low_score() -> None:
     refinement = at(600, trainable, torch.Generator().manual_seed(0))
     before = trainable.values.means.detach().clone()
     densifier.prune(refinement)
-    gone = [row for row in range(COUNT) if not (trainable.values.means == before[row]).all(-1).any()]
+    gone = [
+        row for row in range(COUNT) if not (trainable.values.means == before[row]).all(-1).any()
+    ]
     assert gone
     assert all(row % 2 == 1 and row < 40 for row in gone)
     assert refinement.event.pruned_opacity == len(gone) <= 20
@@ -280,7 +316,9 @@ def test_taming_follows_its_curve_and_ends_at_the_budget() -> None:
     trainable, _ = started(densifier, 2)
     counts, rng = [], torch.Generator().manual_seed(0)
     for step in range(600, 1500, 100):
-        densifier.statistics["gradient_sum"] = torch.rand(len(trainable), generator=rng, dtype=torch.float64) + 0.1
+        densifier.statistics["gradient_sum"] = (
+            torch.rand(len(trainable), generator=rng, dtype=torch.float64) + 0.1
+        )
         densifier.statistics["visible_count"][:] = 1
         counts.append(densifier.refine(step, trainable, rng).after)
     progress = np.arange(1, 10) / 10

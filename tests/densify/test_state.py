@@ -1,4 +1,5 @@
-"""What the base keeps for every densifier: statistics that follow edits, lineage, saving, and the table of causes."""
+"""What the base keeps for every densifier: statistics that follow edits, lineage, saving, and the
+table of causes."""
 
 from __future__ import annotations
 
@@ -9,7 +10,16 @@ import numpy as np
 import pytest
 import torch
 
-from gsbench.densify import ADC, Cause, Densifier, DensifyContext, Lineage, RefineEvent, Refinement, Volumetric
+from gsbench.densify import (
+    ADC,
+    Cause,
+    Densifier,
+    DensifyContext,
+    Lineage,
+    RefineEvent,
+    Refinement,
+    Volumetric,
+)
 from gsbench.densify.base import standard_normal
 from gsbench.gaussians.paper_values import LearningRates
 from gsbench.gaussians.trainable import TrainableGaussians
@@ -56,7 +66,9 @@ def test_statistics_and_lineage_follow_every_edit(seed: int) -> None:
     assert saved["causes"].tolist() == [Cause.INITIAL] * 12 + [Cause.CLONE] * born
     assert saved["steps"].tolist() == [0] * 12 + [7] * born
     assert sum(densifier.lineage.causes_of_living().values()) == len(rows)
-    assert densifier.lineage.causes_of_living()[Cause.CLONE.key] == sum(row[0] >= 12 for row in rows)
+    assert densifier.lineage.causes_of_living()[Cause.CLONE.key] == sum(
+        row[0] >= 12 for row in rows
+    )
     assert len(refinement.gaussians) == len(rows)
 
 
@@ -79,7 +91,11 @@ def test_the_count_of_the_initial_cloud_survives_growth_and_saving() -> None:
     refinement = started(densifier, 4)
     densifier.clone(refinement, torch.tensor([True, False, True, True]))
     densifier.edit(refinement, keep=torch.arange(7) > 2)
-    assert Lineage.from_state(densifier.lineage.state_dict()).initial_count == densifier.lineage.initial_count == 4
+    assert (
+        Lineage.from_state(densifier.lineage.state_dict()).initial_count
+        == densifier.lineage.initial_count
+        == 4
+    )
 
 
 def test_a_subclass_adds_to_the_statistics_of_its_base() -> None:
@@ -92,7 +108,9 @@ def test_a_subclass_adds_to_the_statistics_of_its_base() -> None:
 
 
 @pytest.mark.parametrize(
-    ("order", "place"), [("before_adc", 0), ("after_adc", 1), ("after_prune", 2)], ids=lambda value: str(value)
+    ("order", "place"),
+    [("before_adc", 0), ("after_adc", 1), ("after_prune", 2)],
+    ids=lambda value: str(value),
 )
 def test_the_order_of_the_volumetric_rule_is_its_place_in_the_round(order: str, place: int) -> None:
     densifier = Volumetric(volume_order=order)  # type: ignore[arg-type]
@@ -115,7 +133,16 @@ def test_every_cause_has_words_and_a_colour_of_its_own() -> None:
 
 
 def test_an_event_that_does_not_add_up_says_so() -> None:
-    event = RefineEvent(600, before=10, after=13, cloned=2, split_gradient=2, added=1, pruned_opacity=1, pruned_size=1)
+    event = RefineEvent(
+        600,
+        before=10,
+        after=13,
+        cloned=2,
+        split_gradient=2,
+        added=1,
+        pruned_opacity=1,
+        pruned_size=1,
+    )
     assert event.balances()
     event.cloned += 1
     assert not event.balances()
@@ -124,10 +151,14 @@ def test_an_event_that_does_not_add_up_says_so() -> None:
 def test_normal_draws_on_the_cpu_are_those_of_the_generator() -> None:
     like = torch.zeros(1, dtype=torch.float64)
     drawn = standard_normal((4, 3), torch.Generator().manual_seed(3), like)
-    assert torch.equal(drawn, torch.randn(4, 3, generator=torch.Generator().manual_seed(3), dtype=torch.float64))
+    assert torch.equal(
+        drawn, torch.randn(4, 3, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    )
 
 
-def test_normal_draws_on_another_device_are_seeded_by_the_generator(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_normal_draws_on_another_device_are_seeded_by_the_generator(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     rng, again = (torch.Generator().manual_seed(3) for _ in range(2))
     seeds = []
 
@@ -140,7 +171,9 @@ def test_normal_draws_on_another_device_are_seeded_by_the_generator(monkeypatch:
             return self
 
     monkeypatch.setattr(torch, "Generator", There)
-    monkeypatch.setattr(torch, "randn", lambda shape, generator, dtype, device: (shape, dtype, device.type))
+    monkeypatch.setattr(
+        torch, "randn", lambda shape, generator, dtype, device: (shape, dtype, device.type)
+    )
     drawn = standard_normal((4, 3), rng, torch.zeros(1, device="meta", dtype=torch.float64))
     assert drawn == ((4, 3), torch.float64, "meta")
     assert seeds == [int(torch.randint(2**62, (1,), generator=again))]
@@ -155,15 +188,20 @@ def test_a_keyword_that_no_base_takes_is_refused() -> None:
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 def test_state_goes_through_a_checkpoint_on_a_gpu() -> None:
-    """As the trainer does: everything in the checkpoint is moved to the GPU; the lineage belongs on the CPU."""
+    """As the trainer does: everything in the checkpoint is moved to the GPU; the lineage belongs on
+    the CPU."""
     cuda = torch.device("cuda")
     densifier = Gathering()
-    gaussians = TrainableGaussians(random_gaussians(6).map(lambda tensor: tensor.to(cuda)), LearningRates(), 1.0)
+    gaussians = TrainableGaussians(
+        random_gaussians(6).map(lambda tensor: tensor.to(cuda)), LearningRates(), 1.0
+    )
     densifier.begin(gaussians.values.detach(), DensifyContext(1.0, device=cuda))
     refinement = Refinement(7, gaussians, torch.Generator().manual_seed(0), RefineEvent(7, 6))
     densifier.clone(refinement, torch.arange(6, device=cuda) % 2 == 0)
     saved = densifier.state_dict()
-    moved = {group: {name: tensor.to(cuda) for name, tensor in saved[group].items()} for group in saved}
+    moved = {
+        group: {name: tensor.to(cuda) for name, tensor in saved[group].items()} for group in saved
+    }
     again = Gathering()
     again.load_state_dict(moved, DensifyContext(1.0, device=cuda))
     assert again.statistics["sum"].device.type == "cuda"

@@ -27,8 +27,8 @@ def test_isotropic_keeps_its_size() -> None:
 
 
 def test_elongated_by_two() -> None:
-    """Axes 2, 1, 1: kappa = 4; eigenvalues 4, 1, 1 become 1, 1/4, 1/4; axes 1, 1/2, 1/2; volume divided by 8 =
-    4^1.5."""
+    """Axes 2, 1, 1: kappa = 4; eigenvalues 4, 1, 1 become 1, 1/4, 1/4; axes 1, 1/2, 1/2; volume
+    divided by 8 = 4^1.5."""
     parent = scales((2.0, 1.0, 1.0))
     assert math.exp(log_condition(parent)) == pytest.approx(4)
     child = Volumetric().child_log_scales(parent)
@@ -37,16 +37,21 @@ def test_elongated_by_two() -> None:
     as_adc = Volumetric(condition_of="nothing").child_log_scales(parent)  # no eq. 7
     torch.testing.assert_close(as_adc.exp(), parent.exp() / 1.6)
     in_scales = Volumetric(condition_of="scales").child_log_scales(parent)  # s / kappa
-    torch.testing.assert_close(in_scales.exp(), torch.tensor([[0.5, 0.25, 0.25]], dtype=torch.float64))
+    torch.testing.assert_close(
+        in_scales.exp(), torch.tensor([[0.5, 0.25, 0.25]], dtype=torch.float64)
+    )
 
 
 def test_needle_vanishes_and_the_limit_prevents_it() -> None:
     needle = scales((1.0, 1e-3, 1e-3))  # kappa = 1e6
     torch.testing.assert_close(
-        Volumetric().child_log_scales(needle).exp(), torch.tensor([[1e-3, 1e-6, 1e-6]], dtype=torch.float64)
+        Volumetric().child_log_scales(needle).exp(),
+        torch.tensor([[1e-3, 1e-6, 1e-6]], dtype=torch.float64),
     )
     limited = Volumetric(max_condition=4.0).child_log_scales(needle)
-    torch.testing.assert_close(limited.exp(), torch.tensor([[0.5, 5e-4, 5e-4]], dtype=torch.float64))
+    torch.testing.assert_close(
+        limited.exp(), torch.tensor([[0.5, 5e-4, 5e-4]], dtype=torch.float64)
+    )
 
 
 def test_volume_does_not_underflow() -> None:
@@ -87,15 +92,20 @@ def test_isotropic_gaussians_are_split_again_and_again() -> None:
     assert len(trainable) == 32
     trainable, events, _ = run_volume_rule(scales((0.5, 0.5, 0.5)), rounds=5, split_isotropic=False)
     assert len(trainable) == 1
-    trainable, events, _ = run_volume_rule(scales((0.5, 0.5, 0.5)), rounds=8, max_gaussians=11, cap="hard")
+    trainable, events, _ = run_volume_rule(
+        scales((0.5, 0.5, 0.5)), rounds=8, max_gaussians=11, cap="hard"
+    )
     assert len(trainable) == 11
     assert events[-1].blocked_by_cap == 11
-    trainable, events, _ = run_volume_rule(scales((0.5, 0.5, 0.5)), rounds=8, max_gaussians=11, cap="soft")
+    trainable, events, _ = run_volume_rule(
+        scales((0.5, 0.5, 0.5)), rounds=8, max_gaussians=11, cap="soft"
+    )
     assert len(trainable) == 16  # 8 is not over the cap, so one more round; 16 is
 
 
 def test_vanishing_needles_are_reported() -> None:
-    shapes = scales((30.0, 30.0, 1e-4), (0.6, 0.5, 0.4))  # children of the disc have axes of 1e-4 and less
+    # children of the disc have axes of 1e-4 and less
+    shapes = scales((30.0, 30.0, 1e-4), (0.6, 0.5, 0.4))
     _, (event,), _ = run_volume_rule(shapes)
     assert event.split_volume == 2
     assert event.vanished == 1  # below 1e-4 of the extent of 10
@@ -111,10 +121,17 @@ def test_threshold_modes() -> None:
         return run_volume_rule(log_scales, **options)[1][0].split_volume
 
     assert selected(threshold_mode="absolute") == int((volumes.exp() > 0.03).sum())
-    assert selected(threshold_mode="extent_relative", volume_threshold=3e-5) == int((volumes.exp() > 0.03).sum())
+    assert selected(threshold_mode="extent_relative", volume_threshold=3e-5) == int(
+        (volumes.exp() > 0.03).sum()
+    )
     assert selected(threshold_mode="quantile", volume_quantile=0.99) == 10
-    outlier = torch.cat([log_scales, torch.full((3, 3), 2.0, dtype=torch.float64) + torch.tensor([0.0, 0.1, 0.2])])
-    third, first = torch.quantile(log_volume(outlier), 0.75), torch.quantile(log_volume(outlier), 0.25)
+    outlier = torch.cat(
+        [log_scales, torch.full((3, 3), 2.0, dtype=torch.float64) + torch.tensor([0.0, 0.1, 0.2])]
+    )
+    third, first = (
+        torch.quantile(log_volume(outlier), 0.75),
+        torch.quantile(log_volume(outlier), 0.25),
+    )
     expected = int((log_volume(outlier) > third + 1.5 * (third - first)).sum())
     assert run_volume_rule(outlier, threshold_mode="auto")[1][0].split_volume == expected >= 3
 
@@ -123,7 +140,8 @@ def test_auto_threshold_does_not_depend_on_the_gauge() -> None:
     log_scales = random_gaussians(500, log_scale=(-5, 0.5)).log_scales
     log_scales[:5] += 2.5
     counts = {
-        run_volume_rule(log_scales + math.log(k), threshold_mode="auto")[1][0].split_volume for k in (0.01, 1, 50)
+        run_volume_rule(log_scales + math.log(k), threshold_mode="auto")[1][0].split_volume
+        for k in (0.01, 1, 50)
     }
     assert len(counts) == 1
     assert counts.pop() > 0
@@ -161,7 +179,12 @@ def test_admit_takes_the_best_and_says_how_many_it_refused() -> None:
 
 def test_the_volume_rule_can_have_a_window_of_its_own() -> None:
     own = Volumetric(volume_start=1000, volume_stop=2000, volume_interval=200)
-    assert [step for step in range(100, 3000, 100) if own.volume_due(step)] == [1200, 1400, 1600, 1800]
+    assert [step for step in range(100, 3000, 100) if own.volume_due(step)] == [
+        1200,
+        1400,
+        1600,
+        1800,
+    ]
     as_adc = Volumetric(start=1000, stop=1400)
     assert [step for step in range(50, 3000, 50) if as_adc.volume_due(step)] == [1100, 1200, 1300]
 
@@ -175,5 +198,7 @@ def test_limits_by_hand() -> None:
     assert [allowance(12, 10, cap) for cap in ("hard", "curve", "soft")] == [0, 0, 0]  # type: ignore[arg-type]
     assert [allowance(12, 10, cap) for cap in ("freeze", "governor")] == [None, None]  # type: ignore[arg-type]
     assert allowance(5, None, "hard") is None
-    admitted, refused = admit(torch.ones(4, dtype=torch.bool), torch.tensor([1.0, 2.0, 3.0, 4.0]), 2, 5)
+    admitted, refused = admit(
+        torch.ones(4, dtype=torch.bool), torch.tensor([1.0, 2.0, 3.0, 4.0]), 2, 5
+    )
     assert (admitted.tolist(), refused) == ([False, False, True, True], 2)

@@ -1,4 +1,5 @@
-"""Commands, settings and files that the documents name are there: verbs, their options, groups, choices and keys.
+"""Commands, settings and files that the documents name are there: verbs, their options, groups,
+choices and keys.
 
 Read from the text, not run; values other than choices are checked where commands run.
 """
@@ -39,8 +40,10 @@ SPAN = re.compile(r"`([^`]+)`")
 COMMAND = re.compile(r"^ {4,}((?:[A-Z_]+=\S+ )*gsbench(?: .*)?)$", re.MULTILINE)
 SETTING = re.compile(r"^([+~]*)([a-z_][\w.]*)=(.*)$")
 FILE = re.compile(r"^[\w.-]+(/[\w.-]+)+\.(py|yaml|md|sh)$")
-OUR_FILES = ("src/", "conf/", "docs/", "tests/")  # other names with a slash may be of other programs' files
-VERBATIM = re.compile(r"^[\w/]+$")  # a choice that is a name, and no placeholder, pattern or expression
+# other names with a slash may be of other programs' files
+OUR_FILES = ("src/", "conf/", "docs/", "tests/")
+# a choice that is a name, and no placeholder, pattern or expression
+VERBATIM = re.compile(r"^[\w/]+$")
 OWN = {"mine", "mycluster", "NAME"}  # names that examples give to a reader's own
 TOP = {"name", "seed", "device", "threads", "runs", "allow_targets"}
 CLASSES: dict[str, tuple[type, ...]] = {
@@ -58,14 +61,17 @@ NO_SETTINGS = {"key", "stable", "grow_grad2d"}  # words of Hydra's grammar, of t
 
 @cache
 def keys_of(group: str) -> frozenset[str]:
-    """The settings of a group: those of its dataclass, of its files, and of the classes that these name."""
+    """The settings of a group: those of its dataclass, of its files, and of the classes that these
+    name."""
     known = {field.name for kind in CLASSES.get(group, ()) for field in dataclasses.fields(kind)}
     for file in (ROOT / "conf" / group).rglob("*.yaml"):
         content: dict[str, Any] = yaml.safe_load(file.read_text(encoding="utf-8"))
         known |= {str(key) for key in content}
         module, _, name = str(content.get("_target_", "")).rpartition(".")
         if module and name != External.__name__:  # which stands there for a class of another room
-            known |= set(inspect.signature(getattr(importlib.import_module(module), name)).parameters)
+            known |= set(
+                inspect.signature(getattr(importlib.import_module(module), name)).parameters
+            )
     return frozenset(known)
 
 
@@ -77,7 +83,8 @@ def options_of(verb: str) -> frozenset[str]:
 
 
 def fault_of_setting(word: str) -> str:
-    """The reason why a word ``key=value`` can be no setting of gsbench's own; "" where it can, or is no such word."""
+    """The reason why a word ``key=value`` can be no setting of gsbench's own; "" where it can, or
+    is no such word."""
     match = SETTING.match(word.strip("'\","))
     if match is None or match[2] in NO_SETTINGS:
         return ""
@@ -87,7 +94,11 @@ def fault_of_setting(word: str) -> str:
         return ""
     if not rest and key in GROUPS:
         choices = {*options(key), *OWN}
-        given = [choice for choice in re.split(r"[,|]", value.replace("\\", "")) if VERBATIM.match(choice)]
+        given = [
+            choice
+            for choice in re.split(r"[,|]", value.replace("\\", ""))
+            if VERBATIM.match(choice)
+        ]
         missing = sorted(set(given) - choices)
         return f"{key} has no choice {', '.join(missing)}" if missing else ""
     if sign.startswith("+"):
@@ -117,8 +128,11 @@ def faults_of_command(command: str) -> Iterator[str]:
 def faults_of(text: str) -> list[str]:
     """The faults of a document, each with its line."""
     text = FENCED.sub(lambda found: "\n" * found[0].count("\n"), text)
-    joined = re.sub(r"\\\n +", lambda found: " " * (len(found[0]) - 1) + "\0", text)  # a command goes on in a line
-    found = [(match.start(1), match[1]) for match in (*COMMAND.finditer(joined), *SPAN.finditer(joined))]
+    # a command goes on in a line
+    joined = re.sub(r"\\\n +", lambda found: " " * (len(found[0]) - 1) + "\0", text)
+    found = [
+        (match.start(1), match[1]) for match in (*COMMAND.finditer(joined), *SPAN.finditer(joined))
+    ]
     faults = []
     for start, words in sorted(found):
         line = joined[:start].count("\n") + joined[:start].count("\0") + 1
@@ -126,8 +140,12 @@ def faults_of(text: str) -> list[str]:
         if re.match(r"(?:[A-Z_]+=\S+ )*gsbench( |$)", words):
             faults += [f"{line}: {fault}: {words}" for fault in faults_of_command(words)]
         else:
-            named = [word for word in words.split() if "." in word.partition("=")[0] or word == words]
-            faults += [f"{line}: {fault}: {words}" for word in named if (fault := fault_of_setting(word))]
+            named = [
+                word for word in words.split() if "." in word.partition("=")[0] or word == words
+            ]
+            faults += [
+                f"{line}: {fault}: {words}" for word in named if (fault := fault_of_setting(word))
+            ]
         if FILE.match(words) and words.startswith(OUR_FILES) and Path(words).stem not in OWN:
             faults += [] if (ROOT / words).is_file() else [f"{line}: no file {words}"]
     return faults
@@ -143,7 +161,9 @@ def test_every_file_of_the_house_is_there() -> None:
     spans = SPAN.findall((ROOT / "docs" / "architecture.md").read_text(encoding="utf-8"))
     named = [span for span in spans if FILE.match(span)]
     assert len(named) > 15
-    places = [(ROOT / folder / name for folder in ("", "src", "src/gsbench", "docs")) for name in named]
+    places = [
+        (ROOT / folder / name for folder in ("", "src", "src/gsbench", "docs")) for name in named
+    ]
     found = [any(place.is_file() for place in places_of) for places_of in places]
     assert [name for name, there in zip(named, found, strict=True) if not there] == []
 
@@ -156,7 +176,10 @@ def test_every_file_of_the_house_is_there() -> None:
         ("    gsbench -m --dryrun seed=0,1", "a trial has no option --dryrun"),
         ("    A=/x gsbench scene=gardn", "scene has no choice gardn"),
         ("    gsbench -m densify=adc,volumetrik", "densify has no choice volumetrik"),
-        ("    gsbench -m densify=adc \\\n        train.iteration=5", "train has no setting iteration"),
+        (
+            "    gsbench -m densify=adc \\\n        train.iteration=5",
+            "train has no setting iteration",
+        ),
         ("`densify=adc|absgrd`", "densify has no choice absgrd"),
         ("one `densify.volume_treshold=0.5`", "densify has no setting volume_treshold"),
         ("one `points_form=train`", "no setting is called points_form"),

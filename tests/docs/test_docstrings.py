@@ -1,4 +1,5 @@
-"""The examples in docstrings are true, what users extend has one, and docstrings begin with a verb or a noun."""
+"""The examples in docstrings are true, what users extend has one, and docstrings begin with a verb
+or a noun."""
 
 from __future__ import annotations
 
@@ -25,7 +26,8 @@ SOURCES = {
     for path in sorted((ROOT / "src" / "gsbench").rglob("*.py"))
     if PROMPT.search(path.read_text(encoding="utf-8"))
 }
-# First words that are neither verb nor noun, nor lead to a noun: question words, pronouns, prepositions, conjunctions.
+# First words that are neither verb nor noun, nor lead to a noun: question words, pronouns,
+# prepositions, conjunctions.
 UNPLAIN = frozenset(
     re.findall(
         r"\w+",
@@ -39,7 +41,8 @@ TITLED = (*(ROOT / "conf").rglob("*.yaml"), *(ROOT / "src").rglob("*.yaml"))
 
 
 def public_docstrings(tree: ast.Module) -> Iterator[tuple[int, str]]:
-    """Line and text of a module's public docstrings: its own, and those of classes, functions and methods."""
+    """Line and text of a module's public docstrings: its own, and those of classes, functions and
+    methods."""
     pending: list[ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef] = [tree]
     while pending:
         node = pending.pop()
@@ -56,7 +59,8 @@ def public_docstrings(tree: ast.Module) -> Iterator[tuple[int, str]]:
 
 
 def comments(text: str) -> Iterator[tuple[int, str]]:
-    """Line and text of the comments that have lines of their own; of a block only the first line."""
+    """Line and text of the comments that have lines of their own; of a block only the first
+    line."""
     block = False
     for number, line in enumerate(text.splitlines(), 1):
         stripped = line.lstrip()
@@ -74,8 +78,15 @@ def unplain(path: Path) -> list[str]:
     found = [] if path.suffix == ".yaml" else [*public_docstrings(ast.parse(text))]
     bad = [(line, words) for line, words in found if first_word(words) in UNPLAIN]
     # A comment may say when or for what something is; as a title it names it.
-    bad += [(line, words) for line, words in comments(text) if first_word(words) in {"what", "whether", "how", "which"}]
-    return [f"{path.relative_to(ROOT)}:{line}: {words.strip().splitlines()[0]}" for line, words in sorted(bad)]
+    bad += [
+        (line, words)
+        for line, words in comments(text)
+        if first_word(words) in {"what", "whether", "how", "which"}
+    ]
+    return [
+        f"{path.relative_to(ROOT)}:{line}: {words.strip().splitlines()[0]}"
+        for line, words in sorted(bad)
+    ]
 
 
 def test_docstrings_and_titles_begin_with_a_verb_or_a_noun() -> None:
@@ -91,12 +102,17 @@ def test_docstrings_and_titles_begin_with_a_verb_or_a_noun() -> None:
         ('def run():\n    """Whether it runs."""', [2]),
         ('async def run():\n    """``how`` it runs."""', []),
         ('class A:\n    """Nobody."""\n    def a(self):\n        """\n        Of all."""', [2, 4]),
-        ('class _A:\n    """What."""\n    def a(self):\n        """What."""\ndef _b():\n    """What."""', []),
+        (
+            'class _A:\n    """What."""\n    def a(self):\n        """What."""\ndef _b():\n    """What."""',
+            [],
+        ),
         ('"""The file.\n\nWhat it holds."""\n# What is next\n# Which\na = 1  # what', [4]),
     ],
 )
 def test_unplain_words_are_found(source: str, lines: list[int]) -> None:
-    found = [line for line, words in public_docstrings(ast.parse(source)) if first_word(words) in UNPLAIN]
+    found = [
+        line for line, words in public_docstrings(ast.parse(source)) if first_word(words) in UNPLAIN
+    ]
     found += [line for line, words in comments(source) if first_word(words) in UNPLAIN]
     assert sorted(found) == lines
 
@@ -106,7 +122,8 @@ def test_examples(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     result = doctest.testmod(importlib.import_module(name))
     assert result.failed == 0, capsys.readouterr().out
     written = len(PROMPT.findall(SOURCES[name].read_text(encoding="utf-8")))
-    assert result.attempted == written  # none stands where doctest does not look, such as in a decorated function
+    # none stands where doctest does not look, such as in a decorated function
+    assert result.attempted == written
 
 
 @pytest.mark.parametrize(
@@ -124,5 +141,7 @@ def test_what_users_extend_has_an_example(extended: type, word: str) -> None:
 
 def test_examples_are_sections_so_that_the_site_shows_them_as_code() -> None:
     for path in SOURCES.values():
-        for before, line in re.findall(r"^( *)>>> (.*)$", path.read_text(encoding="utf-8"), re.MULTILINE):
+        for before, line in re.findall(
+            r"^( *)>>> (.*)$", path.read_text(encoding="utf-8"), re.MULTILINE
+        ):
             assert len(before) >= 8, f"{path.name}: {line} stands in no section Examples:"

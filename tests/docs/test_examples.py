@@ -26,7 +26,8 @@ FILE = re.compile(r"# (\w+\.py)\n")  # a block that starts so is a file of that 
 
 
 def run_blocks(document: Path, folder: Path) -> dict[str, Any]:
-    """Write the blocks that are files into ``folder``, run the others there, and return their variables."""
+    """Write the blocks that are files into ``folder``, run the others there, and return their
+    variables."""
     text = document.read_text(encoding="utf-8")
     variables: dict[str, Any] = {"__name__": "document"}
     for match in BLOCK.finditer(text):
@@ -42,7 +43,8 @@ def run_blocks(document: Path, folder: Path) -> dict[str, Any]:
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """An empty working folder, from which modules can be imported; what was imported from it is forgotten."""
+    """An empty working folder, from which modules can be imported; what was imported from it is
+    forgotten."""
     for key in os.environ:
         if key.startswith(("GSBENCH_", "MLFLOW_")):
             monkeypatch.delenv(key)
@@ -84,7 +86,9 @@ def test_metric(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     found = run_blocks(ROOT / "docs" / "metric.md", folder)
     shown = capsys.readouterr()
     assert found["status"] == 0, shown.err
-    trials = sorted(path.parent for path in Path("runs").glob("gradients/courtyard/*/*/results.json"))
+    trials = sorted(
+        path.parent for path in Path("runs").glob("gradients/courtyard/*/*/results.json")
+    )
     assert len(trials) == 4
     for trial in trials:
         results = json.loads((trial / "results.json").read_text())
@@ -94,14 +98,23 @@ def test_metric(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
             rows = {row["view"]: float(row["gradients"]) for row in csv.DictReader(stream)}
         assert results["metrics"]["gradients"] == pytest.approx(np.mean(list(rows.values())))
         for view, value in rows.items():  # again, from the pictures that the trial left
-            pair = [np.asarray(Image.open(trial / kind / view)).astype(float) for kind in ("renders", "ground_truth")]
-            sides = [np.abs(np.diff(pair[0], axis=axis) - np.diff(pair[1], axis=axis)).mean() for axis in (0, 1)]
+            pair = [
+                np.asarray(Image.open(trial / kind / view)).astype(float)
+                for kind in ("renders", "ground_truth")
+            ]
+            sides = [
+                np.abs(np.diff(pair[0], axis=axis) - np.diff(pair[1], axis=axis)).mean()
+                for axis in (0, 1)
+            ]
             assert value == pytest.approx(np.mean(sides), rel=1e-5)
     assert "gradient error (levels) ↓" in shown.out
-    assert "**" in shown.out.split("gradient error")[1]  # a direction is known, so the best is marked
+    # a direction is known, so the best is marked
+    assert "**" in shown.out.split("gradient error")[1]
     assert run(["report", "gradients"]) == 0
     report = Path("runs/gradients/report.html").read_text()
-    assert "gradient error: left of zero is better" in report.replace("gradient error (levels)", "gradient error")
+    assert "gradient error: left of zero is better" in report.replace(
+        "gradient error (levels)", "gradient error"
+    )
 
 
 def test_initialiser(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -124,16 +137,24 @@ def test_densifier_of_the_document_is_repeatable_and_resumes_to_the_bit(folder: 
     from gsbench.raster.base import RenderOutput
     from tests.gaussians.helpers import random_gaussians
 
-    (code,) = (b for b in BLOCK.findall((ROOT / "docs" / "densifier.md").read_text()) if b.startswith("# largest.py"))
+    (code,) = (
+        b
+        for b in BLOCK.findall((ROOT / "docs" / "densifier.md").read_text())
+        if b.startswith("# largest.py")
+    )
     (folder / "largest.py").write_text(code)
     import largest  # type: ignore[import-not-found]
 
     def rounds(state: Any, first: int, last: int) -> Any:
         """Refinements ``first`` to ``last`` of a made-up training that goes on from ``state``."""
-        densifier = largest.SplitLargest(start=0, stop=100, interval=1, share=0.1, prune_opacity=0.3)
+        densifier = largest.SplitLargest(
+            start=0, stop=100, interval=1, share=0.1, prune_opacity=0.3
+        )
         context, rates = DensifyContext(2.0), LearningRates()
         if state is None:
-            gaussians = TrainableGaussians(random_gaussians(60, seed=1, dtype=torch.float32), rates, 2.0)
+            gaussians = TrainableGaussians(
+                random_gaussians(60, seed=1, dtype=torch.float32), rates, 2.0
+            )
             densifier.begin(gaussians.values, context)
             rng = torch.Generator().manual_seed(5)
         else:
@@ -143,10 +164,18 @@ def test_densifier_of_the_document_is_repeatable_and_resumes_to_the_bit(folder: 
             rng.set_state(state[2])
         for step in range(first, last + 1):
             n = len(gaussians)
-            radii = torch.randint(0, 3, (n,), generator=torch.Generator().manual_seed(step), dtype=torch.int32)
-            densifier.observe(step, RenderOutput(torch.zeros(1), torch.zeros(1), radii, torch.zeros(n, 2)))
+            radii = torch.randint(
+                0, 3, (n,), generator=torch.Generator().manual_seed(step), dtype=torch.int32
+            )
+            densifier.observe(
+                step, RenderOutput(torch.zeros(1), torch.zeros(1), radii, torch.zeros(n, 2))
+            )
             event = densifier.refine(step, gaussians, rng)
-            assert event.after == event.before + event.split_volume - event.pruned_opacity == len(gaussians)
+            assert (
+                event.after
+                == event.before + event.split_volume - event.pruned_opacity
+                == len(gaussians)
+            )
             assert len(densifier.lineage.ids) == len(gaussians)
             assert len(densifier.statistics["seen"]) == len(gaussians)
         return gaussians.state_dict(), densifier.state_dict(), rng.get_state()
@@ -165,7 +194,11 @@ def test_governed_class_of_the_document_ends_at_its_limit(folder: Path) -> None:
     from gsbench.gaussians.trainable import TrainableGaussians
     from tests.gaussians.helpers import random_gaussians
 
-    (code,) = (b for b in BLOCK.findall((ROOT / "docs" / "densifier.md").read_text()) if b.startswith("# opaque.py"))
+    (code,) = (
+        b
+        for b in BLOCK.findall((ROOT / "docs" / "densifier.md").read_text())
+        if b.startswith("# opaque.py")
+    )
     (folder / "opaque.py").write_text(code)
     import opaque  # type: ignore[import-not-found]
 
@@ -179,7 +212,9 @@ def test_governed_class_of_the_document_ends_at_its_limit(folder: Path) -> None:
     assert abs(event.after - 150) <= 3
 
 
-@pytest.mark.parametrize("document", ["README.md", *(f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md"))])
+@pytest.mark.parametrize(
+    "document", ["README.md", *(f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md"))]
+)
 def test_links_between_documents_lead_somewhere(document: str) -> None:
     path = ROOT / document
     for target in re.findall(r"\]\(([^)#]+?)(?:#[^)]*)?\)", path.read_text(encoding="utf-8")):

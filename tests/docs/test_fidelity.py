@@ -30,7 +30,8 @@ def test_the_largest_difference_is_no_larger_than_the_page_says(arm: str) -> Non
 
 
 def test_a_difference_would_be_seen(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The measure is of the numbers themselves, and the tests behind it fail beyond their tolerance."""
+    """The measure is of the numbers themselves, and the tests behind it fail beyond their
+    tolerance."""
     from tests.densify import restatement
 
     correct = restatement.rotation
@@ -43,9 +44,16 @@ def test_a_difference_would_be_seen(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_sources_are_named_by_commit() -> None:
     for name, arm in fidelity.ARMS.items():
-        named = re.search(r"\b[0-9a-f]{7}\b|arXiv \d{4}\.\d{5}|^ours|pull request \d+|absgrad", arm.source)
+        named = re.search(
+            r"\b[0-9a-f]{7}\b|arXiv \d{4}\.\d{5}|^ours|pull request \d+|absgrad", arm.source
+        )
         assert named, name
 
 
 def test_differences_are_rounded_up() -> None:
-    assert [fidelity.bound(d) for d in (0.0, 2e-9, 1e-12, 9.9e-16)] == ["0", "1e-8", "1e-12", "1e-15"]
+    assert [fidelity.bound(d) for d in (0.0, 2e-9, 1e-12, 9.9e-16)] == [
+        "0",
+        "1e-8",
+        "1e-12",
+        "1e-15",
+    ]

@@ -20,7 +20,8 @@ from tests.processes import heed_interrupts
 
 Run = Callable[..., "subprocess.CompletedProcess[str]"]
 
-# A whole trial in seconds: a small courtyard, its exact cameras, a random cloud, few iterations, nothing downloaded.
+# A whole trial in seconds: a small courtyard, its exact cameras, a random cloud, few iterations,
+# nothing downloaded.
 SMALL = [
     "scene=courtyard",
     "scene.views=12",
@@ -50,11 +51,19 @@ def common_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def finished_runs(environment: dict[str, str], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A runs folder with an experiment of four trials, trained once for all workers of the tests: not to be changed."""
+    """A runs folder with an experiment of four trials, trained once for all workers of the tests:
+    not to be changed."""
     runs = common_folder(tmp_path_factory) / "finished-runs"
     with FileLock(f"{runs}.lock"):
         if not (runs / "complete").exists():
-            sweep = ["-m", *SMALL, f"name={FINISHED}", "densify=adc,volumetric", "seed=0,1", "tracking=none"]
+            sweep = [
+                "-m",
+                *SMALL,
+                f"name={FINISHED}",
+                "densify=adc,volumetric",
+                "seed=0,1",
+                "tracking=none",
+            ]
             done = subprocess.run(
                 [sys.executable, "-m", "gsbench.cli", *sweep],
                 env=environment | {"GSBENCH_RUNS": str(runs)},
@@ -80,8 +89,13 @@ def runs(finished_runs: Path, tmp_path: Path) -> Path:
 
 @pytest.fixture(scope="session")
 def environment(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """The environment of the program: no weights, its own runs folder, the shared cache of compiled kernels."""
-    kept = {key: value for key, value in os.environ.items() if not key.startswith(("GSBENCH_", "MLFLOW_"))}
+    """The environment of the program: no weights, its own runs folder, the shared cache of compiled
+    kernels."""
+    kept = {
+        key: value
+        for key, value in os.environ.items()
+        if not key.startswith(("GSBENCH_", "MLFLOW_"))
+    }
     return kept | {
         "GSBENCH_RUNS": str(tmp_path_factory.mktemp("runs")),
         "TORCH_HOME": str(common_folder(tmp_path_factory) / "hub"),  # its name is in results
@@ -110,19 +124,24 @@ def gsbench(environment: dict[str, str], tmp_path: Path) -> Run:
 
 def trial_of(settings: Sequence[str], runs: Path, capture: Path, *words: str) -> Path:
     """Run one trial of the capture in a folder within this process; returns the trial's folder."""
-    assert run([*settings, f"scene.path={capture}", f"runs={runs}", f"name={capture.name}", *words]) == 0
+    assert (
+        run([*settings, f"scene.path={capture}", f"runs={runs}", f"name={capture.name}", *words])
+        == 0
+    )
     (folder,) = {path.parent for path in (runs / capture.name).glob("*/*/*/results.json")}
     return folder
 
 
-# What differs between two runs of the same trial: times, and where and when the files that it was made of were written.
+# What differs between two runs of the same trial: times, and where and when the files that it was
+# made of were written.
 CLOCKED = ("seconds", "peak_memory_mb", "measured", "made_of")
 
 
 def start(
     environment: dict[str, str], cwd: Path, runs: Path, *arguments: str, new_group: bool = False
 ) -> subprocess.Popen[str]:
-    """The program, started; with ``new_group``, as from a terminal: with what it starts it can be sent Ctrl-C."""
+    """The program, started; with ``new_group``, as from a terminal: with what it starts it can be
+    sent Ctrl-C."""
     return subprocess.Popen(
         [sys.executable, "-m", "gsbench.cli", *arguments],
         cwd=cwd,
@@ -136,15 +155,24 @@ def start(
 
 
 def results_of(runs: Path, name: str) -> dict[str, Any]:
-    """Everything that a sweep found out: results without times, and checksums of models, pictures and tables."""
+    """Everything that a sweep found out: results without times, and checksums of models, pictures
+    and tables."""
     found: dict[str, Any] = {}
     for path in sorted(runs.glob(f"{name}/*/*/*/results.json")):
-        results = {key: value for key, value in json.loads(path.read_text()).items() if key not in CLOCKED}
+        results = {
+            key: value for key, value in json.loads(path.read_text()).items() if key not in CLOCKED
+        }
         results["init_report"].pop("seconds", None)
         results.pop("experiment")
-        files = [path.parent / "point_cloud.ply", path.parent / "per_view.csv", path.parent / "events.jsonl"]
+        files = [
+            path.parent / "point_cloud.ply",
+            path.parent / "per_view.csv",
+            path.parent / "events.jsonl",
+        ]
         files += sorted(path.parent.glob("renders/*.png"))
-        results["files"] = {file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in files}
+        results["files"] = {
+            file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in files
+        }
         found[f"{path.parent.parent.name}/{path.parent.name}"] = results
     return found
 
@@ -152,4 +180,8 @@ def results_of(runs: Path, name: str) -> dict[str, Any]:
 @pytest.fixture
 def undisturbed(finished_runs: Path) -> dict[str, Any]:
     """The finished trials of ``SWEEP``, which nobody disturbed."""
-    return {trial: found for trial, found in results_of(finished_runs, FINISHED).items() if trial.endswith("seed0")}
+    return {
+        trial: found
+        for trial, found in results_of(finished_runs, FINISHED).items()
+        if trial.endswith("seed0")
+    }

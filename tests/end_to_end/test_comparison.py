@@ -1,4 +1,5 @@
-"""What a comparison says of its arms, from real trials: gsbench's own, and one from a file outside."""
+"""What a comparison says of its arms, from real trials: gsbench's own, and one from a file
+outside."""
 
 from __future__ import annotations
 
@@ -19,9 +20,28 @@ from gsbench.densify import ADC
 class Patient(ADC):
     patience: int = 3
 """
-TINY = [*SMALL, "train.iterations=2", "scene.views=9", "scene.width=48", "scene.height=36", "init.count=200"]
-TINY += ["raster=reference", "eval.lpips=[]", "eval.flip=false", "tracking=none", "seed=0,1", "name=arms"]
-OWN = ["densify=adc", "densify._target_=patient_arm.Patient", "densify.name=patient", "+densify.patience=4"]
+TINY = [
+    *SMALL,
+    "train.iterations=2",
+    "scene.views=9",
+    "scene.width=48",
+    "scene.height=36",
+    "init.count=200",
+]
+TINY += [
+    "raster=reference",
+    "eval.lpips=[]",
+    "eval.flip=false",
+    "tracking=none",
+    "seed=0,1",
+    "name=arms",
+]
+OWN = [
+    "densify=adc",
+    "densify._target_=patient_arm.Patient",
+    "densify.name=patient",
+    "+densify.patience=4",
+]
 
 
 def test_arms_of_any_origin_are_told_apart_and_those_that_come_late_cost_the_declaration_its_place(
@@ -45,7 +65,9 @@ def test_arms_of_any_origin_are_told_apart_and_those_that_come_late_cost_the_dec
     assert run(["-m", *TINY, *OWN, "densify.interval=40", "allow_targets=[patient_arm]"]) == 0
     notes = tables()
     assert "but 2 of the 6 trials were added after the first result" in notes
-    assert "random-patient differs from random-adc by rule patient_arm.Patient and schedule" in notes
+    assert (
+        "random-patient differs from random-adc by rule patient_arm.Patient and schedule" in notes
+    )
     sheet = tables("--layout", "fairness", "--format", "latex")
     assert "densify.patience & -- & 4" in sheet
     assert "patient\\_arm.Patient" in sheet

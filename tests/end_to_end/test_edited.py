@@ -33,7 +33,8 @@ def test_an_edited_loss_is_trained_with(gsbench: Run, tmp_path: Path) -> None:
     changes = {"PYTHONPATH": str(copy.parent), "GSBENCH_RUNS": str(tmp_path / "runs")}
 
     def train(*words: str) -> str:
-        done = gsbench(*QUICK, *words, timeout=900, **changes)  # where kernels have to be compiled first
+        # where kernels have to be compiled first
+        done = gsbench(*QUICK, *words, timeout=900, **changes)
         assert done.returncode == 0, done.stderr
         return done.stdout + done.stderr
 

@@ -29,8 +29,19 @@ def trained(tmp_path_factory: pytest.TempPathFactory, environment: dict[str, str
     """A runs folder with two trials of one arm."""
     runs = tmp_path_factory.mktemp("trained")
     changed = environment | {"GSBENCH_RUNS": str(runs)}
-    command = [sys.executable, "-m", "gsbench.cli", "-m", *SMALL, "name=small", "densify=adc", "seed=0,1"]
-    done = subprocess.run(command, cwd=runs, env=changed, capture_output=True, text=True, timeout=400, check=False)
+    command = [
+        sys.executable,
+        "-m",
+        "gsbench.cli",
+        "-m",
+        *SMALL,
+        "name=small",
+        "densify=adc",
+        "seed=0,1",
+    ]
+    done = subprocess.run(
+        command, cwd=runs, env=changed, capture_output=True, text=True, timeout=400, check=False
+    )
     assert done.returncode == 0, done.stderr
     return runs
 
@@ -55,19 +66,34 @@ def views(folder: Path) -> dict[str, dict[str, str]]:
 
 
 def better_renders(runs: Path, folder: Path, seed: int) -> Path:
-    """Renders nearer to the photographs than those of our arm, under the names that another program gives."""
+    """Renders nearer to the photographs than those of our arm, under the names that another program
+    gives."""
     folder.mkdir()
     own = trial(runs, seed=seed)
     for file in (own / "renders").glob("*.png"):
-        mixed = Image.blend(Image.open(file), Image.open(own / "ground_truth" / file.name), 0.5 + 0.05 * seed)
+        mixed = Image.blend(
+            Image.open(file), Image.open(own / "ground_truth" / file.name), 0.5 + 0.05 * seed
+        )
         mixed.save(folder / f"render_{int(file.stem)}.png")
     return folder
 
 
 def test_a_trials_own_renders_have_its_metrics_to_the_last_digit(gsbench: Run, runs: Path) -> None:
     own = trial(runs)
-    for truth, settings in ((str(own), []), ("small:courtyard:adc:0", []), ("courtyard", SCENE + EVAL)):
-        done = gsbench("evaluate", str(own / "renders"), "--truth", truth, *settings, "--json", GSBENCH_RUNS=str(runs))
+    for truth, settings in (
+        (str(own), []),
+        ("small:courtyard:adc:0", []),
+        ("courtyard", SCENE + EVAL),
+    ):
+        done = gsbench(
+            "evaluate",
+            str(own / "renders"),
+            "--truth",
+            truth,
+            *settings,
+            "--json",
+            GSBENCH_RUNS=str(runs),
+        )
         assert done.returncode == 0, done.stderr
         found = json.loads(done.stdout)
         assert found["metrics"] == results(own)["metrics"]
@@ -75,8 +101,15 @@ def test_a_trials_own_renders_have_its_metrics_to_the_last_digit(gsbench: Run, r
         for view, row in views(own).items():
             metrics = {key: value for key, value in row.items() if key not in (ANGLE, DISTANCE)}
             assert {key: repr(value) for key, value in found["views"][view].items()} == metrics
-    shown = gsbench("evaluate", str(own / "renders"), "--truth", str(own / "ground_truth"), "--protocol", "standard",
-                    GSBENCH_RUNS=str(runs))  # fmt: skip
+    shown = gsbench(
+        "evaluate",
+        str(own / "renders"),
+        "--truth",
+        str(own / "ground_truth"),
+        "--protocol",
+        "standard",
+        GSBENCH_RUNS=str(runs),
+    )
     assert "protocol standard-1" in shown.stdout
 
 
@@ -90,9 +123,16 @@ def test_renders_stand_in_the_table_with_a_verdict(
     for seed in (0, 1):
         folder = better_renders(runs, tmp_path / f"theirs{seed}", seed)
         done = gsbench(
-            "evaluate", str(folder), "--truth", "courtyard", "--as", "small:theirs", "--seed", str(seed),
+            "evaluate",
+            str(folder),
+            "--truth",
+            "courtyard",
+            "--as",
+            "small:theirs",
+            "--seed",
+            str(seed),
             GSBENCH_RUNS=str(runs),
-        )  # fmt: skip
+        )
         assert done.returncode == 0, done.stderr
         assert "names matched apart from leading zeros" in done.stdout
     entered = trial(runs, "random-theirs", 1)
@@ -101,13 +141,15 @@ def test_renders_stand_in_the_table_with_a_verdict(
     assert found["num_gaussians"] is None
     assert list(views(entered)) == list(views(trial(runs)))
     picture = np.asarray(Image.open(entered / "renders" / "0008.png"))
-    np.testing.assert_array_equal(picture, np.asarray(Image.open(tmp_path / "theirs1" / "render_8.png")))
+    np.testing.assert_array_equal(
+        picture, np.asarray(Image.open(tmp_path / "theirs1" / "render_8.png"))
+    )
 
     table = gsbench("tables", "small", GSBENCH_RUNS=str(runs))
     assert table.returncode == 0, table.stderr
     assert (
-        "Renders of another program, measured as they are (its conditions are not known): random-theirs."
-        in table.stdout
+        "Renders of another program, measured as they are (its conditions are not known): "
+        "random-theirs." in table.stdout
     )
     row = next(line for line in table.stdout.splitlines() if "theirs" in line)
     assert row.count("n/a") == 3  # LPIPS (not asked for), Gaussians, time
@@ -120,7 +162,11 @@ def test_renders_stand_in_the_table_with_a_verdict(
     assert "by a training elsewhere, which left no record" in text
     monkeypatch.setenv("GSBENCH_RUNS", str(runs))
     (runs / "mlflow.db").unlink()  # a copy of a runs folder has the database of where it was
-    for words in (["status", "small"], ["explain", "small:courtyard:psnr:theirs"], ["sync", "small"]):
+    for words in (
+        ["status", "small"],
+        ["explain", "small:courtyard:psnr:theirs"],
+        ["sync", "small"],
+    ):
         assert run(words) == 0
     for words in (["view"], ["export", "--out", "x.ply"]):
         capsys.readouterr()
@@ -132,7 +178,10 @@ def test_entered_twice_is_entered_once_and_a_place_is_taken_once(
     runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("GSBENCH_RUNS", str(runs))
-    first, other = better_renders(runs, tmp_path / "first", 0), better_renders(runs, tmp_path / "other", 1)
+    first, other = (
+        better_renders(runs, tmp_path / "first", 0),
+        better_renders(runs, tmp_path / "other", 1),
+    )
     words = ["--truth", "small:courtyard:adc:0", "--as", "small:theirs"]
     for _ in range(2):
         assert run(["evaluate", str(first), *words]) == 0
@@ -149,7 +198,22 @@ def test_two_folders_and_no_trial_at_all(
     monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "empty"))
     for arm, seed in (("ours", 0), ("theirs", 1)):
         folder = better_renders(runs, tmp_path / arm, seed)
-        assert run(["evaluate", str(folder), "--truth", str(truth), "--as", f"new:{arm}", "--scene", "toy", *EVAL]) == 0
+        assert (
+            run(
+                [
+                    "evaluate",
+                    str(folder),
+                    "--truth",
+                    str(truth),
+                    "--as",
+                    f"new:{arm}",
+                    "--scene",
+                    "toy",
+                    *EVAL,
+                ]
+            )
+            == 0
+        )
     capsys.readouterr()
     assert run(["tables", "new"]) == 0
     assert "| toy | renders | theirs | **" in capsys.readouterr().out
@@ -161,12 +225,21 @@ def test_two_folders_and_no_trial_at_all(
         (["RENDERS", "--truth", "nowhere"], "is no folder, no trial"),
         (["RENDERS", "--truth", "gardn"], "did you mean garden?"),
         (["nowhere", "--truth", "small:courtyard:adc"], "nowhere is not a folder of renders"),
-        (["RENDERS", "--truth", "small:courtyard:adc", "scene.views=3"], "only eval.… can be set here"),
+        (
+            ["RENDERS", "--truth", "small:courtyard:adc", "scene.views=3"],
+            "only eval.… can be set here",
+        ),
         (["RENDERS", "--truth", "PHOTOGRAPHS", "--as", "small:x"], "give it with --scene"),
         (["RENDERS", "--truth", "small:courtyard:adc", "--as", "small"], "is not EXPERIMENT:ARM"),
-        (["RENDERS", "--truth", "PHOTOGRAPHS", "--as", "small:x", "--scene", "courtyard"], "on other photographs"),
+        (
+            ["RENDERS", "--truth", "PHOTOGRAPHS", "--as", "small:x", "--scene", "courtyard"],
+            "on other photographs",
+        ),
         (["SMALLER", "--truth", "small:courtyard:adc"], "sizes are never changed"),
-        (["FEWER", "--truth", "small:courtyard:adc"], "1 of 2 photographs have no picture of their name (0008.png)"),
+        (
+            ["FEWER", "--truth", "small:courtyard:adc"],
+            "1 of 2 photographs have no picture of their name (0008.png)",
+        ),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else None,
 )
@@ -178,7 +251,9 @@ def test_bad_requests_are_one_line(
     words: list[str],
     said: str,
 ) -> None:
-    folders = {name: tmp_path / name.lower() for name in ("RENDERS", "PHOTOGRAPHS", "SMALLER", "FEWER")}
+    folders = {
+        name: tmp_path / name.lower() for name in ("RENDERS", "PHOTOGRAPHS", "SMALLER", "FEWER")
+    }
     for folder in folders.values():
         shutil.copytree(trial(runs) / "renders", folder)
     for file in folders["SMALLER"].glob("*.png"):
@@ -192,11 +267,20 @@ def test_bad_requests_are_one_line(
 
 
 def test_somebodys_model(gsbench: Run, runs: Path, tmp_path: Path) -> None:
-    """train=none init=ply: a PLY from anywhere, rendered here; our own gives our own numbers back."""
+    """train=none init=ply: a PLY from anywhere, rendered here; our own gives our own numbers
+    back."""
     model = tmp_path / "theirs.ply"
     shutil.copyfile(trial(runs) / "point_cloud.ply", model)
     scene = [word for word in SMALL if word.startswith(("scene", "eval"))]
-    words = [*scene, "init=ply", "init.name=random", f"init.path={model}", "train=none", "densify=none", "name=small"]
+    words = [
+        *scene,
+        "init=ply",
+        "init.name=random",
+        f"init.path={model}",
+        "train=none",
+        "densify=none",
+        "name=small",
+    ]
     done = gsbench(*words, "densify.name=model", GSBENCH_RUNS=str(runs))
     assert done.returncode == 0, done.stderr
     found = results(trial(runs, "random-model"))

@@ -1,4 +1,5 @@
-"""The program where something fails: a full disk, a folder that cannot be written to, a trial that raises."""
+"""The program where something fails: a full disk, a folder that cannot be written to, a trial that
+raises."""
 
 from __future__ import annotations
 
@@ -22,7 +23,9 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
     disk = tmp_path / "disk"
     disk.mkdir()
     mounted = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=3m", "tmpfs", str(disk)], capture_output=True, check=False
+        ["mount", "-t", "tmpfs", "-o", "size=3m", "tmpfs", str(disk)],
+        capture_output=True,
+        check=False,
     )
     if mounted.returncode != 0:
         pytest.skip("needs the right to mount a small tmpfs (root)")
@@ -39,7 +42,8 @@ def test_full_disk_ends_the_sweep_in_one_line_and_more_space_mends_it(
     assert "Traceback" not in done.stderr
     lines = [line for line in done.stderr.strip().splitlines() if line.startswith("gsbench:")]
     assert lines == [
-        f"gsbench: the disk of {small_disk} is full: free some space, then give the same command again: it continues"
+        f"gsbench: the disk of {small_disk} is full: free some space, then give the same command "
+        "again: it continues"
     ]
     subprocess.run(["mount", "-o", "remount,size=200m", str(small_disk)], check=True)
     done = gsbench(*sweep, "densify=adc", GSBENCH_RUNS=str(small_disk))
@@ -59,10 +63,13 @@ def test_read_only_runs_folder_is_bad_input(gsbench: Run, small_disk: Path) -> N
     assert os.listdir(small_disk) == []
 
 
-def test_a_failed_trial_does_not_stop_the_others_and_retry_mends_it(gsbench: Run, tmp_path: Path) -> None:
+def test_a_failed_trial_does_not_stop_the_others_and_retry_mends_it(
+    gsbench: Run, tmp_path: Path
+) -> None:
     """One densifier is the user's own and fails while a file is absent."""
     (tmp_path / "mine.py").write_text(
-        "from dataclasses import dataclass\nfrom pathlib import Path\nfrom gsbench.densify import ADC\n\n\n"
+        "from dataclasses import dataclass\nfrom pathlib import Path\nfrom gsbench.densify import "
+        "ADC\n\n\n"
         "@dataclass\nclass Mine(ADC):\n    def begin(self, gaussians, context):\n"
         "        if not Path('mended').exists():\n            raise RuntimeError('not yet')\n"
         "        super().begin(gaussians, context)\n"

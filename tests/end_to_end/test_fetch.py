@@ -1,4 +1,5 @@
-"""A fresh machine: one command brings the data, and nothing of the paper's sweep is missing any more."""
+"""A fresh machine: one command brings the data, and nothing of the paper's sweep is missing any
+more."""
 
 from __future__ import annotations
 
@@ -41,7 +42,9 @@ def test_fetch_then_table1_misses_nothing(gsbench: Run, server: Server, tmp_path
     before = gsbench("+experiment=table1", "--dry-run")
     assert before.stdout.count("does not exist") == 13
     advice = before.stdout.splitlines()[-1]
-    commands = [words.split()[1:] for words in advice.split("`") if words.startswith("gsbench fetch")]
+    commands = [
+        words.split()[1:] for words in advice.split("`") if words.startswith("gsbench fetch")
+    ]
     assert len(commands) == 2
     for command in commands:
         done = gsbench(*command, GSBENCH_MIRROR=server.url)
@@ -54,7 +57,9 @@ def test_fetch_then_table1_misses_nothing(gsbench: Run, server: Server, tmp_path
     assert (tmp_path / "data" / "tandt" / "truck" / "images" / "IMG_0001.JPG").is_file()
 
 
-def test_killed_and_started_again(server: Server, tmp_path: Path, environment: dict[str, str], gsbench: Run) -> None:
+def test_killed_and_started_again(
+    server: Server, tmp_path: Path, environment: dict[str, str], gsbench: Run
+) -> None:
     def slowly(_: str, __: int, body: bytes) -> bytes:
         time.sleep(0.05)
         return body
@@ -63,7 +68,9 @@ def test_killed_and_started_again(server: Server, tmp_path: Path, environment: d
     command = [sys.executable, "-m", "gsbench.cli", "fetch", "mipnerf360", "--mirror", server.url]
     process = subprocess.Popen(command, cwd=tmp_path, env=environment, stdout=subprocess.DEVNULL)
     deadline = time.monotonic() + 60
-    while not list((tmp_path / "data" / ".fetch").glob("*/*/*.JPG")) and time.monotonic() < deadline:
+    while (
+        not list((tmp_path / "data" / ".fetch").glob("*/*/*.JPG")) and time.monotonic() < deadline
+    ):
         time.sleep(0.01)
     os.kill(process.pid, signal.SIGKILL)
     process.wait()

@@ -1,4 +1,5 @@
-"""Versions of a densifier, trained for real: the gate's exit codes, and the commit that bisect finds."""
+"""Versions of a densifier, trained for real: the gate's exit codes, and the commit that bisect
+finds."""
 
 from __future__ import annotations
 
@@ -30,9 +31,28 @@ class Mine(ADC):
             self.remove(refinement, torch.arange(len(refinement.gaussians)) % 2 == 0)
 """
 WORDS = [
-    *(*SMALL, "train.iterations=60", "train.densify_start=10", "train.densify_interval=10", "train.densify_stop=55"),
-    *("init.count=800", "scene.width=64", "scene.height=48", "eval.lpips=[]", "eval.flip=false", "tracking=none"),
-    *("densify=adc", "densify.name=mine", "densify._target_=mine.Mine", "allow_targets=[mine]", "raster=cpu"),
+    *(
+        *SMALL,
+        "train.iterations=60",
+        "train.densify_start=10",
+        "train.densify_interval=10",
+        "train.densify_stop=55",
+    ),
+    *(
+        "init.count=800",
+        "scene.width=64",
+        "scene.height=48",
+        "eval.lpips=[]",
+        "eval.flip=false",
+        "tracking=none",
+    ),
+    *(
+        "densify=adc",
+        "densify.name=mine",
+        "densify._target_=mine.Mine",
+        "allow_targets=[mine]",
+        "raster=cpu",
+    ),
 ]
 
 
@@ -52,7 +72,8 @@ def test_a_gate_passes_what_is_equal_and_stops_what_is_worse(gsbench: Run, tmp_p
     same = do("gate", "good.zip", *WORDS)
     assert same.returncode == 0, same.stderr
     assert "passed: equal to the last bit in all 2 pairs of trials" in same.stdout
-    write_class(tmp_path, 1, worse=True)  # in the same runs folder: what was trained before is of another version
+    # in the same runs folder: what was trained before is of another version
+    write_class(tmp_path, 1, worse=True)
     worse = do("gate", "good.zip", *WORDS)
     assert worse.returncode == 1, worse.stdout + worse.stderr
     assert "worse in PSNR (dB): −" in worse.stdout
@@ -74,7 +95,16 @@ def test_bisect_finds_the_commit_goes_on_where_it_was_and_leaves_the_checkout_al
     home.mkdir(parents=True)
 
     def git(*words: str) -> str:
-        command = ["git", "-C", str(home.parent), "-c", "user.name=x", "-c", "user.email=x@y", *words]
+        command = [
+            "git",
+            "-C",
+            str(home.parent),
+            "-c",
+            "user.name=x",
+            "-c",
+            "user.email=x@y",
+            *words,
+        ]
         return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
 
     git("init", "-q", "-b", "main")
@@ -89,19 +119,32 @@ def test_bisect_finds_the_commit_goes_on_where_it_was_and_leaves_the_checkout_al
         file.write_text(f"#!/bin/sh\ntouch {ran}\n")
         file.chmod(0o755)
     write_class(home, 99, worse=False)  # an edit that was not committed
-    before = git("status", "--porcelain"), git("worktree", "list"), sorted(os.listdir(home.parent / ".git"))
+    before = (
+        git("status", "--porcelain"),
+        git("worktree", "list"),
+        sorted(os.listdir(home.parent / ".git")),
+    )
 
     def bisect() -> subprocess.CompletedProcess[str]:
         words = ["HEAD~12", "HEAD", *WORDS, "--least", "0.2", "--seeds", "3"]
-        return gsbench("bisect", *words, cwd=home, timeout=1500, GSBENCH_RUNS=str(tmp_path / "runs"))
+        return gsbench(
+            "bisect", *words, cwd=home, timeout=1500, GSBENCH_RUNS=str(tmp_path / "runs")
+        )
 
     done = bisect()
     assert done.returncode == 0, done.stdout + done.stderr
     found = git("log", "-1", "--format=%h", "--abbrev=10", "HEAD~5")
     assert f"It became worse with {found}" in done.stdout
     assert "Commit 7" in done.stdout.splitlines()[-1]
-    assert done.stdout.count("not tried") == 12 - done.stdout.count("passed") - done.stdout.count("worse in")
+    assert done.stdout.count("not tried") == 12 - done.stdout.count("passed") - done.stdout.count(
+        "worse in"
+    )
     assert not ran.exists()
-    assert (git("status", "--porcelain"), git("worktree", "list"), sorted(os.listdir(home.parent / ".git"))) == before
+    assert (
+        git("status", "--porcelain"),
+        git("worktree", "list"),
+        sorted(os.listdir(home.parent / ".git")),
+    ) == before
     again = bisect()
-    assert (again.returncode, again.stdout, again.stderr) == (0, done.stdout, "")  # nothing is trained
+    # nothing is trained
+    assert (again.returncode, again.stdout, again.stderr) == (0, done.stdout, "")

@@ -14,8 +14,22 @@ pytestmark = pytest.mark.slow
 SECONDS = 900  # a trial of three iterations on a machine that has much else to do
 
 TINY = [
-    *("scene=courtyard", "scene.views=6", "scene.width=64", "scene.height=48", "init=random", "init.count=300"),
-    *("densify=none", "train.iterations=3", "raster=reference", "device=cpu", "threads=1", "tracking=none"),
+    *(
+        "scene=courtyard",
+        "scene.views=6",
+        "scene.width=64",
+        "scene.height=48",
+        "init=random",
+        "init.count=300",
+    ),
+    *(
+        "densify=none",
+        "train.iterations=3",
+        "raster=reference",
+        "device=cpu",
+        "threads=1",
+        "tracking=none",
+    ),
     *("eval.download=false", "eval.lpips=[]"),
 ]
 CALLBACK = """
@@ -63,7 +77,14 @@ def test_an_experiment_file_has_all_of_hydra(gsbench: Run, tmp_path: Path) -> No
     (tmp_path / "conf" / "experiment").mkdir(parents=True)
     (tmp_path / "conf" / "experiment" / "own.yaml").write_text(EXPERIMENT)
     (tmp_path / "notes.py").write_text(CALLBACK)
-    words = ["--config-dir", "conf", "+experiment=own", *TINY, "hydra/launcher=basic", "allow_targets=[notes]"]
+    words = [
+        "--config-dir",
+        "conf",
+        "+experiment=own",
+        *TINY,
+        "hydra/launcher=basic",
+        "allow_targets=[notes]",
+    ]
     listed = gsbench(*words, "--dry-run", GSBENCH_RUNS="runs", timeout=SECONDS)
     assert "2 trials: 2 missing" in listed.stdout, listed.stderr
     assert not (tmp_path / "notes.txt").exists()  # where nothing runs, no callback is called
@@ -79,9 +100,12 @@ def test_an_experiment_file_has_all_of_hydra(gsbench: Run, tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize(
-    ("package", "launcher"), [("hydra_joblib_launcher", "joblib"), ("hydra_submitit_launcher", "submitit_local")]
+    ("package", "launcher"),
+    [("hydra_joblib_launcher", "joblib"), ("hydra_submitit_launcher", "submitit_local")],
 )
-def test_another_launcher_runs_a_trial_a_job(gsbench: Run, tmp_path: Path, package: str, launcher: str) -> None:
+def test_another_launcher_runs_a_trial_a_job(
+    gsbench: Run, tmp_path: Path, package: str, launcher: str
+) -> None:
     if find_spec(f"hydra_plugins.{package}") is None:
         pytest.skip(f"needs {package.replace('_', '-')} (group dev)")
     words = ["-m", *TINY, f"hydra/launcher={launcher}", "name=x", "seed=0,1"]
@@ -95,7 +119,9 @@ def test_another_launcher_runs_a_trial_a_job(gsbench: Run, tmp_path: Path, packa
     assert [path.stat().st_mtime_ns for path in results] == written  # nothing is done twice
 
 
-def test_a_failed_trial_of_another_launcher_is_one_line_and_exit_code_1(gsbench: Run, tmp_path: Path) -> None:
+def test_a_failed_trial_of_another_launcher_is_one_line_and_exit_code_1(
+    gsbench: Run, tmp_path: Path
+) -> None:
     (tmp_path / "own.py").write_text(
         "from gsbench.densify import NoDensifier\n"
         "class Own(NoDensifier):\n"
@@ -116,4 +142,6 @@ def test_a_failed_trial_of_another_launcher_is_one_line_and_exit_code_1(gsbench:
     assert "Traceback" not in done.stderr
     failed = [line for line in done.stderr.splitlines() if line.startswith("gsbench: failed")]
     assert len(failed) == 2
-    assert "2 trials: 2 failed" in gsbench("status", "x", GSBENCH_RUNS="runs", timeout=SECONDS).stdout
+    assert (
+        "2 trials: 2 failed" in gsbench("status", "x", GSBENCH_RUNS="runs", timeout=SECONDS).stdout
+    )

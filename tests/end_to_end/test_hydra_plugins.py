@@ -1,7 +1,8 @@
-"""Plug-ins of others for Hydra, through the real program: sweepers that search, and Ray; and Hydra's own files.
+"""Plug-ins of others for Hydra, through the real program: sweepers that search, and Ray; and
+Hydra's own files.
 
-Two of them need older packages than gsbench's own search and tracker, so ``make test-hydra-plugins`` installs them
-into a folder of their own. Without it these tests are skipped.
+Two of them need older packages than gsbench's own search and tracker, so ``make
+test-hydra-plugins`` installs them into a folder of their own. Without it these tests are skipped.
 """
 
 from __future__ import annotations
@@ -33,10 +34,19 @@ def need(package: str) -> None:
 
 
 @pytest.mark.parametrize("direction", ["minimize", "maximize"])
-def test_optunas_sweeper_looks_for_the_best_mean_over_seeds(gsbench: Run, tmp_path: Path, direction: str) -> None:
+def test_optunas_sweeper_looks_for_the_best_mean_over_seeds(
+    gsbench: Run, tmp_path: Path, direction: str
+) -> None:
     need("hydra_optuna_sweeper")
     small = [word for word in TINY if not word.startswith("init.count")]
-    words = ["-m", *small, "name=x", "seed=0,1", "init.count=int(interval(100,400))", "hydra/sweeper=optuna"]
+    words = [
+        "-m",
+        *small,
+        "name=x",
+        "seed=0,1",
+        "init.count=int(interval(100,400))",
+        "hydra/sweeper=optuna",
+    ]
     words += ["hydra.sweeper.n_trials=3", f"hydra.sweeper.direction={direction}"]
     look = gsbench(*words, "--dry-run", GSBENCH_RUNS="runs", timeout=SECONDS)
     assert "hydra/sweeper=optuna searches: it proposes 3 trials" in look.stdout, look.stderr
@@ -59,7 +69,9 @@ def test_optunas_sweeper_looks_for_the_best_mean_over_seeds(gsbench: Run, tmp_pa
 def test_what_a_sweeper_does_not_understand_is_one_line(gsbench: Run, tmp_path: Path) -> None:
     need("hydra_optuna_sweeper")
     for words in (["hydra.sweeper.params=3"], ["hydra.sweeper.direction=up", "seed=0,1"]):
-        done = gsbench("-m", *TINY, "hydra/sweeper=optuna", *words, GSBENCH_RUNS="runs", timeout=SECONDS)
+        done = gsbench(
+            "-m", *TINY, "hydra/sweeper=optuna", *words, GSBENCH_RUNS="runs", timeout=SECONDS
+        )
         assert done.returncode == 2
         assert "Traceback" not in done.stderr
         assert done.stderr.splitlines()[-1].startswith("gsbench: ")
@@ -68,8 +80,19 @@ def test_what_a_sweeper_does_not_understand_is_one_line(gsbench: Run, tmp_path: 
 def test_a_strangers_texts_for_a_sweeper_are_refused(gsbench: Run, tmp_path: Path) -> None:
     need("hydra_optuna_sweeper")
     (tmp_path / "bomb.py").write_text("open('exploded', 'w')\ndef bomb(*rest): ...\n")
-    for word in ("hydra.sweeper.custom_search_space=bomb.bomb", "hydra.sweeper.storage=sqlite:///exploded"):
-        done = gsbench("-m", *TINY, "hydra/sweeper=optuna", "seed=0,1", word, GSBENCH_RUNS="runs", timeout=SECONDS)
+    for word in (
+        "hydra.sweeper.custom_search_space=bomb.bomb",
+        "hydra.sweeper.storage=sqlite:///exploded",
+    ):
+        done = gsbench(
+            "-m",
+            *TINY,
+            "hydra/sweeper=optuna",
+            "seed=0,1",
+            word,
+            GSBENCH_RUNS="runs",
+            timeout=SECONDS,
+        )
         assert done.returncode == 2
         assert "allow_targets=[hydra.sweeper]" in done.stderr
     assert not (tmp_path / "exploded").exists()
@@ -106,8 +129,13 @@ def test_ray_runs_a_sweep_on_two_nodes_and_a_killed_worker_costs_nothing(
     cluster: Any, environment: dict[str, str], tmp_path: Path, gsbench: Run
 ) -> None:
     words = ["-m", *TINY, "name=x", "seed=0,1,2,3,4,5,6,7", "hydra/launcher=ray"]
-    words += ["hydra.launcher.ray.init.address=auto", "+hydra.launcher.ray.init.object_store_memory=null"]
-    program = start(environment | {"RAY_ADDRESS": cluster.address}, tmp_path, tmp_path / "runs", *words)
+    words += [
+        "hydra.launcher.ray.init.address=auto",
+        "+hydra.launcher.ray.init.object_store_memory=null",
+    ]
+    program = start(
+        environment | {"RAY_ADDRESS": cluster.address}, tmp_path, tmp_path / "runs", *words
+    )
     at_once, killed = 0, 0
     until = time.monotonic() + SECONDS
     while program.poll() is None and time.monotonic() < until:
@@ -120,7 +148,9 @@ def test_ray_runs_a_sweep_on_two_nodes_and_a_killed_worker_costs_nothing(
     out, _ = program.communicate(timeout=SECONDS)
     assert (program.returncode, at_once, bool(killed)) == (0, 2, True), out
     assert "8 of 8 trials done" in out
-    assert sorted(result["seed"] for result in results_below(tmp_path / "runs" / "x")) == list(range(8))
+    assert sorted(result["seed"] for result in results_below(tmp_path / "runs" / "x")) == list(
+        range(8)
+    )
 
 
 # ---- Hydra's own files and logs
@@ -133,13 +163,17 @@ def test_hydra_writes_its_files_where_it_is_told(gsbench: Run, tmp_path: Path) -
     (result,) = (tmp_path / "runs" / "x").rglob("results.json")  # and not below own/
     assert f"paths still start in {tmp_path}" in done.stderr
     assert yaml.safe_load((tmp_path / "own" / ".hydra" / "config.yaml").read_text())["name"] == "x"
-    assert f"the trial's folder is {result.parent}" in (tmp_path / "own" / "gsbench.log").read_text()
+    assert (
+        f"the trial's folder is {result.parent}" in (tmp_path / "own" / "gsbench.log").read_text()
+    )
 
     sweep = ["-m", *TINY, "name=x", "seed=0,1", "hydra.sweep.dir=many", "hydra.output_subdir=h"]
     done = gsbench(*sweep, GSBENCH_RUNS="runs", timeout=SECONDS)
     assert done.returncode == 0, done.stderr
     for job in ("0", "1"):
-        assert yaml.safe_load((tmp_path / "many" / job / "h" / "config.yaml").read_text())["seed"] == int(job)
+        assert yaml.safe_load((tmp_path / "many" / job / "h" / "config.yaml").read_text())[
+            "seed"
+        ] == int(job)
     assert len(list((tmp_path / "runs" / "x").rglob("results.json"))) == 2
 
 
@@ -165,6 +199,13 @@ def test_debug_lines_are_shown_if_they_are_asked_for(gsbench: Run, tmp_path: Pat
         ("all", "hydra.verbose=true", (True, False)),
         ("one", "hydra.verbose=[other]", (False, True)),
     ):
-        done = gsbench(*words, f"name={name}", word, "train.iterations=2", GSBENCH_RUNS=f"runs-{name}", timeout=SECONDS)
+        done = gsbench(
+            *words,
+            f"name={name}",
+            word,
+            "train.iterations=2",
+            GSBENCH_RUNS=f"runs-{name}",
+            timeout=SECONDS,
+        )
         assert done.returncode == 0, done.stderr
         assert ("a detail" in done.stderr, "another detail" in done.stderr) == shown, name

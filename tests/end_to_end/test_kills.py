@@ -1,4 +1,5 @@
-"""The program killed by signals, or run twice at once: it goes on, and ends as if nothing had happened."""
+"""The program killed by signals, or run twice at once: it goes on, and ends as if nothing had
+happened."""
 
 from __future__ import annotations
 
@@ -21,13 +22,19 @@ from tests.end_to_end.conftest import SMALL, SWEEP, Run, results_of, start
 from tests.launch.test_declare import TINY
 from tests.processes import bytes_written
 
-pytestmark = [pytest.mark.slow, pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs SIGKILL")]
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs SIGKILL"),
+]
 
 TRIALS = 2
-PATIENCE = 240.0  # seconds for a trial of two iterations, on a machine that is busy with other things
+# seconds for a trial of two iterations, on a machine that is busy with other things
+PATIENCE = 240.0
 
 
-def wait_for(runs: Path, pattern: str, process: subprocess.Popen[str], seconds: float = 120) -> None:
+def wait_for(
+    runs: Path, pattern: str, process: subprocess.Popen[str], seconds: float = 120
+) -> None:
     deadline = time.monotonic() + seconds
     while not list(runs.glob(pattern)) and process.poll() is None and time.monotonic() < deadline:
         time.sleep(0.02)
@@ -43,7 +50,11 @@ def test_killed_stopped_and_damaged_the_sweep_ends_as_undisturbed(
 ) -> None:
     runs = tmp_path / "runs"
     rng = random.Random(4)
-    moments = ["store/*/.*.partial", "store/train/.*.partial/checkpoint-*.pt", "attacked/*/*/*/results.json"]
+    moments = [
+        "store/*/.*.partial",
+        "store/train/.*.partial/checkpoint-*.pt",
+        "attacked/*/*/*/results.json",
+    ]
     for moment in moments:
         process = start(environment, tmp_path, runs, *SWEEP)
         wait_for(runs, moment, process)
@@ -53,14 +64,16 @@ def test_killed_stopped_and_damaged_the_sweep_ends_as_undisturbed(
     if len(results_of(runs, "attacked")) < TRIALS:  # the last kill may have come after the end
         before = now = training_log_size(runs)
         process = start(environment, tmp_path, runs, *SWEEP)
-        while now <= before and process.poll() is None:  # a log that begins again shrinks before it grows
+        # a log that begins again shrinks before it grows
+        while now <= before and process.poll() is None:
             time.sleep(0.02)
             before, now = now, training_log_size(runs)
         process.send_signal(signal.SIGTERM)
         output, _ = process.communicate(timeout=300)
         assert process.returncode == 128 + signal.SIGTERM, output
         assert (
-            output.strip().splitlines()[-1] == "gsbench: stopped by SIGTERM; to continue, give the same command again"
+            output.strip().splitlines()[-1]
+            == "gsbench: stopped by SIGTERM; to continue, give the same command again"
         )
         assert "Traceback" not in output
         assert list(runs.glob("store/train/.*.partial/checkpoint-*.pt")), output
@@ -68,7 +81,11 @@ def test_killed_stopped_and_damaged_the_sweep_ends_as_undisturbed(
     output, _ = process.communicate(timeout=300)
     assert process.returncode == 0, output
     assert results_of(runs, "attacked") == undisturbed
-    left = [path for path in runs.rglob("*") if ".tmp" in path.name or path.name.endswith((".partial", ".removed"))]
+    left = [
+        path
+        for path in runs.rglob("*")
+        if ".tmp" in path.name or path.name.endswith((".partial", ".removed"))
+    ]
     assert left == []
 
     one, other = sorted(runs.glob("attacked/*/*/*/results.json"))
@@ -94,12 +111,21 @@ def test_two_sweeps_at_once_share_the_work(
     outputs = [process.communicate(timeout=300)[0] for process in both]
     assert [process.returncode for process in both] == [0, 0], outputs
     assert results_of(runs, "attacked") == undisturbed
-    trained = [len(re.findall(r"train: iteration (\d+)/\1 ", output)) for output in outputs]  # said once, at the end
+    # said once, at the end
+    trained = [len(re.findall(r"train: iteration (\d+)/\1 ", output)) for output in outputs]
     assert sum(trained) == TRIALS, outputs
     assert min(trained) >= 1
 
 
-LOCAL = ["-m", *SMALL, "name=local", "densify=adc", "launch=local", "launch.parallel=2", "tracking=none"]
+LOCAL = [
+    "-m",
+    *SMALL,
+    "name=local",
+    "densify=adc",
+    "launch=local",
+    "launch.parallel=2",
+    "tracking=none",
+]
 
 
 def holders(runs: Path) -> dict[str, int]:
@@ -117,7 +143,9 @@ def test_ctrl_c_stops_trials_in_processes_of_their_own_with_checkpoints(
 ) -> None:
     """A terminal sends Ctrl-C to every process of the command."""
     runs = tmp_path / "runs"
-    process = start(environment, tmp_path, runs, *LOCAL, "seed=0,1", "train.iterations=100000", new_group=True)
+    process = start(
+        environment, tmp_path, runs, *LOCAL, "seed=0,1", "train.iterations=100000", new_group=True
+    )
     wait_for(runs, "store/train/.*.partial/metrics.jsonl", process)
     os.killpg(process.pid, signal.SIGINT)
     output, _ = process.communicate(timeout=300)
@@ -135,7 +163,8 @@ def test_one_killed_trial_harms_no_other_and_the_next_command_mends_it(
     deadline = time.monotonic() + 120
     killed, most = "", 0
     while process.poll() is None and time.monotonic() < deadline:
-        running = {trial: pid for trial, pid in holders(runs).items() if trial != killed}  # its file outlives it
+        # its file outlives it
+        running = {trial: pid for trial, pid in holders(runs).items() if trial != killed}
         most = max(most, len(running))
         training = list(runs.glob("store/train/.*.partial/metrics.jsonl"))
         if not killed and training and running:
@@ -163,14 +192,20 @@ TUNED = [
 
 def views(arm: Path) -> set[str]:
     """The views that judge the trials of an arm."""
-    return {line.split(",")[0] for file in arm.glob("*/per_view.csv") for line in file.read_text().splitlines()[1:]}
+    return {
+        line.split(",")[0]
+        for file in arm.glob("*/per_view.csv")
+        for line in file.read_text().splitlines()[1:]
+    }
 
 
 def test_a_killed_tuning_goes_on_and_its_values_are_trained(
     gsbench: Run, environment: dict[str, str], tmp_path: Path
 ) -> None:
     program = [sys.executable, "-m", "gsbench.cli", *TUNED]
-    with subprocess.Popen(program, cwd=tmp_path, env=environment, stderr=subprocess.PIPE, text=True) as first:
+    with subprocess.Popen(
+        program, cwd=tmp_path, env=environment, stderr=subprocess.PIPE, text=True
+    ) as first:
         assert first.stderr is not None
         for line in first.stderr:
             if "point 1 of 2" in line:
@@ -183,17 +218,23 @@ def test_a_killed_tuning_goes_on_and_its_values_are_trained(
     done = gsbench(*TUNED, "launch=local", "launch.parallel=2")  # by another launcher, too
     assert done.returncode == 0, done.stderr
     assert "trials done; the table: gsbench tables small\n" in done.stderr
-    arms = sorted(path.name.removeprefix("small-tune-") for path in home.parent.glob("small-tune-*"))
+    arms = sorted(
+        path.name.removeprefix("small-tune-") for path in home.parent.glob("small-tune-*")
+    )
     assert len(arms) == 2
     for arm in arms:
-        points = json.loads((home.parent / f"small-tune-{arm}" / "tuning.json").read_text())["points"]
+        points = json.loads((home.parent / f"small-tune-{arm}" / "tuning.json").read_text())[
+            "points"
+        ]
         assert len(points) == 2
         best = max(points, key=lambda point: point["value"])
         (results,) = home.glob(f"courtyard/{arm}/*/results.json")
         text = results.read_text()
         assert all(str(value) in text for value in best["settings"].values())
         assert views(home / "courtyard" / arm)
-        assert not views(home / "courtyard" / arm) & views(home.parent / f"small-tune-{arm}" / "courtyard" / arm)
+        assert not views(home / "courtyard" / arm) & views(
+            home.parent / f"small-tune-{arm}" / "courtyard" / arm
+        )
 
     sheet = gsbench("tables", "small", "--layout", "fairness")
     assert sheet.stdout.count("is the best of 2 points by psnr of validation views") == 2
@@ -201,7 +242,8 @@ def test_a_killed_tuning_goes_on_and_its_values_are_trained(
 
 
 def page_of(runs: Path) -> list[str]:
-    """The page without the minute in which its claims were declared, and without what is measured of a machine."""
+    """The page without the minute in which its claims were declared, and without what is measured
+    of a machine."""
     lines = (runs / "check_it" / "claims.html").read_text().splitlines()
     assert sum(" were declared " in line for line in lines) == 1
     measured = (" were declared ", "seconds of training</th>", "memory (MB)</th>")
@@ -219,10 +261,14 @@ def test_a_killed_check_goes_on_and_ends_with_the_same_page(tmp_path: Path) -> N
     claim = content()["claims"][0] | {"baseline": "few", "arm": "many"}
     arms = {"few": {"init.count": 200}, "many": {"init.count": 300}}
     claims = tmp_path / "claims.yaml"
-    claims.write_text(json.dumps(content() | {"settings": settings, "arms": arms, "claims": [claim], "seeds": 2}))
+    claims.write_text(
+        json.dumps(content() | {"settings": settings, "arms": arms, "claims": [claim], "seeds": 2})
+    )
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     check = [sys.executable, "-m", "gsbench.cli", "check", str(claims)]
-    subprocess.run(check, env=os.environ | {"GSBENCH_RUNS": str(whole)}, check=True, timeout=2 * PATIENCE)
+    subprocess.run(
+        check, env=os.environ | {"GSBENCH_RUNS": str(whole)}, check=True, timeout=2 * PATIENCE
+    )
 
     for trials in (1, 3):  # in the middle of the first look, and once more before its last trial
         process = subprocess.Popen(check, env=os.environ | {"GSBENCH_RUNS": str(killed)})
@@ -234,7 +280,9 @@ def test_a_killed_check_goes_on_and_ends_with_the_same_page(tmp_path: Path) -> N
         assert count_done(killed) >= trials
         assert not (killed / "check_it" / "claims.html").exists()
     before = {path: path.read_bytes() for path in killed.glob("check_it/*/*/*/results.json")}
-    subprocess.run(check, env=os.environ | {"GSBENCH_RUNS": str(killed)}, check=True, timeout=2 * PATIENCE)
+    subprocess.run(
+        check, env=os.environ | {"GSBENCH_RUNS": str(killed)}, check=True, timeout=2 * PATIENCE
+    )
     assert page_of(killed) == page_of(whole)
     assert all(path.read_bytes() == content for path, content in before.items())  # done once
     assert len((killed / "check_it" / "declared.jsonl").read_text().splitlines()) == 1

@@ -1,4 +1,5 @@
-"""Masks in whole trials: not one bit of an ignored pixel enters one, an edited mask makes a new one."""
+"""Masks in whole trials: not one bit of an ignored pixel enters one, an edited mask makes a new
+one."""
 
 from __future__ import annotations
 
@@ -28,16 +29,31 @@ pytestmark = pytest.mark.slow
 
 SIZE = 192, 144
 QUICK = [
-    "scene=colmap", "densify=adc", "train.iterations=80", "train.densify_start=20", "train.densify_interval=20",
-    "train.densify_stop=70", "eval.download=false", "eval.lpips=[]", "tracking=none", "device=cpu", "scene.masks=masks",
-]  # fmt: skip
-SIFT = ["init=sfm", "init.first_octave=0", "init.max_num_features=1500", "init.two_view_tracks=true"]
+    "scene=colmap",
+    "densify=adc",
+    "train.iterations=80",
+    "train.densify_start=20",
+    "train.densify_interval=20",
+    "train.densify_stop=70",
+    "eval.download=false",
+    "eval.lpips=[]",
+    "tracking=none",
+    "device=cpu",
+    "scene.masks=masks",
+]
+SIFT = [
+    "init=sfm",
+    "init.first_octave=0",
+    "init.max_num_features=1500",
+    "init.two_view_tracks=true",
+]
 SAME = ("point_cloud.ply", "events.jsonl", "lineage.npz", "per_view.csv")
 
 
 @pytest.fixture(scope="module")
 def captures(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """A COLMAP folder with masks of a disc that wanders and of a margin, and the same with noise below them."""
+    """A COLMAP folder with masks of a disc that wanders and of a margin, and the same with noise
+    below them."""
     folder = tmp_path_factory.mktemp("masked")
     clean, noisy = folder / "clean", folder / "noisy"
     width, height = SIZE
@@ -47,7 +63,9 @@ def captures(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     names = sorted(path.name for path in (clean / "images").iterdir())
     for place, name in enumerate(names):
         ignored = ((rows - 70) ** 2 + (columns - 40 - 10 * place) ** 2 < 30**2) | (rows > 130)
-        Image.fromarray(np.where(ignored, 0, 255).astype(np.uint8)).save(clean / "masks" / f"{name}.png")
+        Image.fromarray(np.where(ignored, 0, 255).astype(np.uint8)).save(
+            clean / "masks" / f"{name}.png"
+        )
     shutil.copytree(clean, noisy)
     rng = np.random.default_rng(0)
     for name in names:
@@ -62,7 +80,14 @@ trial = partial(trial_of, QUICK)
 
 
 def bits(folder: Path) -> dict[str, str]:
-    names = [*SAME, *(f"{kind}/{file.name}" for kind in ("renders", "masks") for file in (folder / kind).iterdir())]
+    names = [
+        *SAME,
+        *(
+            f"{kind}/{file.name}"
+            for kind in ("renders", "masks")
+            for file in (folder / kind).iterdir()
+        ),
+    ]
     return {name: hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in names}
 
 
@@ -78,11 +103,15 @@ def bits(folder: Path) -> dict[str, str]:
     ],
     ids=["sfm", "kornia", "smaller", "taming", "fastgs", "schedule"],
 )
-def test_not_one_bit_under_a_mask_enters_a_trial(captures: tuple[Path, Path], tmp_path: Path, words: list[str]) -> None:
+def test_not_one_bit_under_a_mask_enters_a_trial(
+    captures: tuple[Path, Path], tmp_path: Path, words: list[str]
+) -> None:
     folders = [trial(tmp_path, capture, *words) for capture in captures]
     assert bits(folders[0]) == bits(folders[1])
     clean, noisy = (json.loads((folder / "results.json").read_text()) for folder in folders)
-    assert clean["hashes"]["data"] != noisy["hashes"]["data"], "the photographs differ, and results say so"
+    assert clean["hashes"]["data"] != noisy["hashes"]["data"], (
+        "the photographs differ, and results say so"
+    )
     for key in ("metrics", "num_init_points", "num_gaussians", "causes", "events"):
         assert clean.get(key) == noisy.get(key), key
     clouds = [_points(folder) for folder in folders]
@@ -102,7 +131,10 @@ def _points(folder: Path) -> dict[str, str]:
 def test_without_masks_the_noise_is_seen(captures: tuple[Path, Path], tmp_path: Path) -> None:
     """So the test above can fail."""
     clean, noisy = (trial(tmp_path, capture, *SIFT, "scene.masks=null") for capture in captures)
-    digests = [hashlib.sha256((folder / "point_cloud.ply").read_bytes()).hexdigest() for folder in (clean, noisy)]
+    digests = [
+        hashlib.sha256((folder / "point_cloud.ply").read_bytes()).hexdigest()
+        for folder in (clean, noisy)
+    ]
     assert digests[0] != digests[1]
     assert "counted" not in (clean / "per_view.csv").read_text()
     assert not (clean / "masks").exists()
@@ -151,25 +183,51 @@ def test_bad_masks_end_in_one_line_before_any_work(
     assert f"{mask}: the mask is 20x20 px" in said("init=random")
     mask.unlink()
     assert f"add {mask.name}" in said("init=random")
-    assert "no such folder; set scene.masks to one of: images, masks, sparse" in said("init=random", "scene.masks=msk")
+    assert "no such folder; set scene.masks to one of: images, masks, sparse" in said(
+        "init=random", "scene.masks=msk"
+    )
 
 
-def test_another_program_is_refused_with_masks(captures: tuple[Path, Path], tmp_path: Path, capfd) -> None:
+def test_another_program_is_refused_with_masks(
+    captures: tuple[Path, Path], tmp_path: Path, capfd
+) -> None:
     words = ["init=random", "densify=external/program", "densify.command='echo {data} {output}'"]
-    words += ["allow_targets=[echo]", "densify.version=1", "densify.result=point_cloud.ply", f"runs={tmp_path}"]
-    assert run([*[word for word in QUICK if "densify" not in word], f"scene.path={captures[0]}", *words]) != 0
+    words += [
+        "allow_targets=[echo]",
+        "densify.version=1",
+        "densify.result=point_cloud.ply",
+        f"runs={tmp_path}",
+    ]
+    assert (
+        run(
+            [
+                *[word for word in QUICK if "densify" not in word],
+                f"scene.path={captures[0]}",
+                *words,
+            ]
+        )
+        != 0
+    )
     assert "another program gets no masks" in capfd.readouterr().err
 
 
 @pytest.mark.parametrize("make", [Sfm, SiftKornia, Dim])
 def test_no_keypoint_is_on_an_ignored_pixel(
-    captures: tuple[Path, Path], tmp_path: Path, make: type[ColmapInitializer], request: pytest.FixtureRequest
+    captures: tuple[Path, Path],
+    tmp_path: Path,
+    make: type[ColmapInitializer],
+    request: pytest.FixtureRequest,
 ) -> None:
     """Without `prepare`, so that there is something to be found below the masks."""
     options = {"init": {"first_octave": 0, "max_num_features": 1500}, "net": {"max_keypoints": 500}}
     words = options["init" if make is Sfm else "net"] | {"two_view_tracks": True}
     if make is Dim:
-        words |= {"extractor": "aliked", "matcher": "mutual_nearest", "aliked_model": "t16", "download": False}
+        words |= {
+            "extractor": "aliked",
+            "matcher": "mutual_nearest",
+            "aliked_model": "t16",
+            "download": False,
+        }
         words |= {"weights": request.getfixturevalue("shared") / "weights"}
     capture = read_colmap("masked", captures[0], masks="masks")
     work = tmp_path / "work"

@@ -1,7 +1,8 @@
-"""What leaves a capture as it is must leave its result: place, scale, rotation, names, formats, order.
+"""What leaves a capture as it is must leave its result: place, scale, rotation, names, formats,
+order.
 
-A similarity may change a result as another seed does. Other names, or another format of the same values, may not
-change one bit.
+A similarity may change a result as another seed does. Other names, or another format of the same
+values, may not change one bit.
 """
 
 from __future__ import annotations
@@ -34,10 +35,19 @@ from tests.end_to_end.conftest import trial_of
 pytestmark = pytest.mark.slow
 
 QUICK = [
-    "densify=adc", "train.iterations=400", "train.position_steps=400", "train.densify_start=100",
-    "train.densify_interval=100", "train.densify_stop=350", "eval.lpips=[]", "eval.flip=false", "tracking=none",
-    "threads=1", "raster=cpu", "init=dataset",
-]  # fmt: skip
+    "densify=adc",
+    "train.iterations=400",
+    "train.position_steps=400",
+    "train.densify_start=100",
+    "train.densify_interval=100",
+    "train.densify_stop=350",
+    "eval.lpips=[]",
+    "eval.flip=false",
+    "tracking=none",
+    "threads=1",
+    "raster=cpu",
+    "init=dataset",
+]
 train = partial(trial_of, QUICK)
 COLMAP = "scene=colmap"
 VIEWS, WIDTH, HEIGHT = 14, 96, 72
@@ -47,7 +57,8 @@ Change = Callable[[Path, pycolmap.Reconstruction], None]
 
 @pytest.fixture(scope="module")
 def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A COLMAP folder of the courtyard with exact cameras, and a cloud in the photographs' colours."""
+    """A COLMAP folder of the courtyard with exact cameras, and a cloud in the photographs'
+    colours."""
     folder = tmp_path_factory.mktemp("made") / "good"
     render_courtyard(folder, VIEWS, WIDTH, HEIGHT)
     cameras = courtyard_cameras(VIEWS, WIDTH, HEIGHT)
@@ -57,7 +68,8 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def surroundings(cameras: dict[str, Camera], images: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Points [P, 3] of the ground, z = 0, and of a round wall, in the colours of a camera with them in view."""
+    """Points [P, 3] of the ground, z = 0, and of a round wall, in the colours of a camera with them
+    in view."""
     random = np.random.default_rng(0)
     angles, heights = random.uniform(0, 2 * np.pi, 1500), random.uniform(0, 6, 1500)
     wall = np.stack([7 * np.cos(angles), 7 * np.sin(angles), heights], axis=1)
@@ -66,7 +78,13 @@ def surroundings(cameras: dict[str, Camera], images: Path) -> tuple[np.ndarray, 
     for name, camera in cameras.items():
         x, y, z = camera.rotation @ points.T + camera.translation[:, None]
         columns, rows = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
-        inside = (z > 0.5) & (columns > 0) & (columns < camera.width) & (rows > 0) & (rows < camera.height)
+        inside = (
+            (z > 0.5)
+            & (columns > 0)
+            & (columns < camera.width)
+            & (rows > 0)
+            & (rows < camera.height)
+        )
         picture = np.asarray(Image.open(images / name))
         colors[inside] = picture[rows[inside].astype(int), columns[inside].astype(int)]
     return points, colors
@@ -117,19 +135,28 @@ def require_given_coordinates(
     trial: Path, untouched: Path, similarity: pycolmap.Sim3d, exported: Path, capture: Path
 ) -> None:
     """Check that the trial's Gaussians and cameras lie where the given model lies."""
-    own, before = (PlyData.read(str(one / "point_cloud.ply"))["vertex"].data for one in (trial, untouched))
+    own, before = (
+        PlyData.read(str(one / "point_cloud.ply"))["vertex"].data for one in (trial, untouched)
+    )
     back = similarity.inverse()
-    positions, positions_before = (np.column_stack([table[axis] for axis in "xyz"]) for table in (own, before))
+    positions, positions_before = (
+        np.column_stack([table[axis] for axis in "xyz"]) for table in (own, before)
+    )
     restored = np.array([back * point for point in positions.astype(np.float64)])
-    # Trainings differ as two seeds do, so their clouds have the same middle and spread, within a tenth of a unit.
+    # Trainings differ as two seeds do, so their clouds have the same middle and spread, within a
+    # tenth of a unit.
     for share in (0.1, 0.5, 0.9):
         np.testing.assert_allclose(
-            np.quantile(restored, share, axis=0), np.quantile(positions_before, share, axis=0), atol=0.5
+            np.quantile(restored, share, axis=0),
+            np.quantile(positions_before, share, axis=0),
+            atol=0.5,
         )
     sizes, sizes_before = (np.median(table["scale_0"]) for table in (own, before))
     assert sizes - math.log(similarity.scale) == pytest.approx(sizes_before, abs=0.5)
     assert run(["export", "init", str(trial), "--out", str(exported)]) == 0
-    given_model, exported_model = (pycolmap.Reconstruction(folder / "sparse/0") for folder in (capture, exported))
+    given_model, exported_model = (
+        pycolmap.Reconstruction(folder / "sparse/0") for folder in (capture, exported)
+    )
     resolution = 1e-8 * similarity.scale + 1e-15 * np.abs(similarity.translation).max()
     for image in given_model.images.values():
         center = exported_model.find_image_with_name(image.name).projection_center()
@@ -148,7 +175,9 @@ def rename(folder: Path, model: pycolmap.Reconstruction) -> None:
 def convert(suffix: str, folder: Path, model: pycolmap.Reconstruction) -> None:
     """Write each photograph in another lossless format; the model keeps its names."""
     for file in sorted((folder / "images").iterdir()):
-        Image.open(file).save(file.with_suffix(suffix), **({"lossless": True} if suffix == ".webp" else {}))
+        Image.open(file).save(
+            file.with_suffix(suffix), **({"lossless": True} if suffix == ".webp" else {})
+        )
         file.unlink()
 
 
@@ -163,7 +192,10 @@ def as_distorted(name: str, zeros: int, folder: Path, model: pycolmap.Reconstruc
     """Write cameras with one focal length under a model with zero coefficients."""
     for camera in model.cameras.values():
         fx, _, cx, cy = camera.params
-        camera.model, camera.params = pycolmap.CameraModelId.__members__[name], [fx, cx, cy, *[0.0] * zeros]
+        camera.model, camera.params = (
+            pycolmap.CameraModelId.__members__[name],
+            [fx, cx, cy, *[0.0] * zeros],
+        )
 
 
 def other_place(folder: Path, model: pycolmap.Reconstruction) -> None:
@@ -195,7 +227,9 @@ def test_another_name_or_format_changes_no_bit(
     assert [file_sha256(file) for file in renders] == [file_sha256(file) for file in before]
 
 
-def test_transforms_json_gives_the_result_of_the_colmap_model(good: Path, original: list[Path], tmp_path: Path) -> None:
+def test_transforms_json_gives_the_result_of_the_colmap_model(
+    good: Path, original: list[Path], tmp_path: Path
+) -> None:
     folder = tmp_path / "frames"
     shutil.copytree(good / "images", folder / "images")
     model = pycolmap.Reconstruction(good / "sparse/0")
@@ -207,6 +241,14 @@ def test_transforms_json_gives_the_result_of_the_colmap_model(good: Path, origin
         frames.append({"file_path": f"images/{image.name}", "transform_matrix": matrix.tolist()})
     fx, fy, cx, cy = next(iter(model.cameras.values())).params
     model.export_PLY(folder / "points.ply")
-    shared = {"w": WIDTH, "h": HEIGHT, "fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, "ply_file_path": "points.ply"}
+    shared = {
+        "w": WIDTH,
+        "h": HEIGHT,
+        "fl_x": fx,
+        "fl_y": fy,
+        "cx": cx,
+        "cy": cy,
+        "ply_file_path": "points.ply",
+    }
     (folder / "transforms.json").write_text(json.dumps(shared | {"frames": frames}))
     require_same_up_to_a_seed(train(tmp_path / "runs", folder, "scene=transforms"), original)

@@ -1,4 +1,5 @@
-"""OpenSplat as an arm, where it is installed: its model lies where the photographs were taken, and it grows."""
+"""OpenSplat as an arm, where it is installed: its model lies where the photographs were taken, and
+it grows."""
 
 from __future__ import annotations
 
@@ -19,18 +20,43 @@ SHIFT = 3  # px
 
 pytestmark = [
     pytest.mark.slow,
-    pytest.mark.skipif(shutil.which(PROGRAM) is None, reason=f"{PROGRAM} is not on the PATH (docs/other_trainers.md)"),
+    pytest.mark.skipif(
+        shutil.which(PROGRAM) is None,
+        reason=f"{PROGRAM} is not on the PATH (docs/other_trainers.md)",
+    ),
 ]
 
 
 @pytest.fixture(scope="module")
 def trial(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of a trial of OpenSplat on a small courtyard, with a schedule of growth as short as the training."""
+    """The folder of a trial of OpenSplat on a small courtyard, with a schedule of growth as short
+    as the training."""
     runs = tmp_path_factory.mktemp("runs")
-    scene = ["scene.views=16", "scene.width=128", "scene.height=96", "init=random", "init.count=3000"]
-    growth = ["densify_from=50", "densify_until=200", "refine_every=50", "loss_threshold=0.02", "sh_degree_interval=50"]
-    words = [f"densify=external/{PROGRAM}", f"densify.version={VERSION}", *(f"densify.options.{one}" for one in growth)]
-    words += [f"allow_targets=[{PROGRAM}]", f"train.iterations={ITERATIONS}", "tracking=none", "eval.lpips=[]"]
+    scene = [
+        "scene.views=16",
+        "scene.width=128",
+        "scene.height=96",
+        "init=random",
+        "init.count=3000",
+    ]
+    growth = [
+        "densify_from=50",
+        "densify_until=200",
+        "refine_every=50",
+        "loss_threshold=0.02",
+        "sh_degree_interval=50",
+    ]
+    words = [
+        f"densify=external/{PROGRAM}",
+        f"densify.version={VERSION}",
+        *(f"densify.options.{one}" for one in growth),
+    ]
+    words += [
+        f"allow_targets=[{PROGRAM}]",
+        f"train.iterations={ITERATIONS}",
+        "tracking=none",
+        "eval.lpips=[]",
+    ]
     assert run([*scene, *words, f"runs={runs}"]) == 0
     return next(runs.glob("default/courtyard/*/*-seed0"))
 
@@ -40,7 +66,8 @@ def error(picture: np.ndarray, truth: np.ndarray) -> float:
 
 
 def test_its_renders_are_neither_turned_nor_shifted(trial: Path) -> None:
-    """Each held-out photograph is nearer to its render than to the render mirrored, or moved by some pixels."""
+    """Each held-out photograph is nearer to its render than to the render mirrored, or moved by
+    some pixels."""
     files = sorted((trial / "renders").glob("*.png"))
     assert len(files) == 2
     for file in files:
@@ -55,5 +82,9 @@ def test_it_grows_on_the_schedule_that_it_is_given(trial: Path) -> None:
     results = json.loads((trial / "results.json").read_text())
     assert results["num_gaussians"] > results["num_init_points"]
     assert VERSION in results["trained_by"]["said"]
-    rounds = [line for line in (trial / "trainer.log").read_text().splitlines() if line.startswith("Densify ")]
+    rounds = [
+        line
+        for line in (trial / "trainer.log").read_text().splitlines()
+        if line.startswith("Densify ")
+    ]
     assert [line.split(":")[0] for line in rounds] == ["Densify 100", "Densify 150"]

@@ -1,4 +1,5 @@
-"""Another program as an arm: it trains on what it is given, and what it leaves stands in the tables."""
+"""Another program as an arm: it trains on what it is given, and what it leaves stands in the
+tables."""
 
 from __future__ import annotations
 
@@ -49,8 +50,16 @@ command: ["{{python}}", {TRAINER}, --data, "{{data}}", --output, "{{output}}", -
   --seed, "{{seed}}", --mode, "{{mode}}", --cameras, "{{test_cameras}}"]
 result: renders/*.png
 """
-QUICK = ["init=random", "init.count=2000", "train.iterations=40", "train.densify_start=500", "tracking=none",
-         "eval.lpips=[squeeze]", "eval.download=false", f"allow_targets=['{sys.executable}',PAINTER]"]  # fmt: skip
+QUICK = [
+    "init=random",
+    "init.count=2000",
+    "train.iterations=40",
+    "train.densify_start=500",
+    "tracking=none",
+    "eval.lpips=[squeeze]",
+    "eval.download=false",
+    f"allow_targets=['{sys.executable}',PAINTER]",
+]
 COURTYARD = ["scene.views=12", "scene.width=96", "scene.height=72", *QUICK]
 
 
@@ -65,8 +74,11 @@ def trainers(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def home(tmp_path_factory: pytest.TempPathFactory, environment: dict[str, str], trainers: Path) -> Path:
-    """A folder with a fetched scene, and a sweep over it of one arm of ours and two of other programs."""
+def home(
+    tmp_path_factory: pytest.TempPathFactory, environment: dict[str, str], trainers: Path
+) -> Path:
+    """A folder with a fetched scene, and a sweep over it of one arm of ours and two of other
+    programs."""
     home = tmp_path_factory.mktemp("home")
     courtyard = home / "courtyard"
     render_courtyard(courtyard, views=12, width=96, height=72, seed=0)
@@ -79,14 +91,27 @@ def home(tmp_path_factory: pytest.TempPathFactory, environment: dict[str, str], 
             content.write(file, f"{archive.scenes['garden']}/{name}")
     with serve(archives) as server:
         program(environment, home, "fetch", "mipnerf360", "garden", "--mirror", server.url)
-    sweep = ["densify=adc,cloud,painter", "seed=0,1", "name=three", "scene=garden", "eval.maps=true"]
+    sweep = [
+        "densify=adc,cloud,painter",
+        "seed=0,1",
+        "name=three",
+        "scene=garden",
+        "eval.maps=true",
+    ]
     program(environment, home, "--config-dir", str(trainers), "-m", *QUICK, *sweep)
     return home
 
 
 def program(environment: dict[str, str], home: Path, *words: str) -> str:
-    done = subprocess.run([sys.executable, "-m", "gsbench.cli", *words], cwd=home, capture_output=True, text=True,
-                          env=environment | {"GSBENCH_RUNS": str(home / "runs")}, timeout=500, check=False)  # fmt: skip
+    done = subprocess.run(
+        [sys.executable, "-m", "gsbench.cli", *words],
+        cwd=home,
+        capture_output=True,
+        text=True,
+        env=environment | {"GSBENCH_RUNS": str(home / "runs")},
+        timeout=500,
+        check=False,
+    )
     assert done.returncode == 0, done.stderr
     return done.stdout
 
@@ -119,20 +144,35 @@ def test_two_programs_and_a_folder_of_renders_in_one_table(
     capsys.readouterr()
     assert run(["tables", "three"]) == 0
     table = capsys.readouterr().out
-    rows = {arm: next(line for line in table.splitlines() if f"| {arm} |" in line)
-            for arm in ("adc", "cloud", "painter", "folder")}  # fmt: skip
+    rows = {
+        arm: next(line for line in table.splitlines() if f"| {arm} |" in line)
+        for arm in ("adc", "cloud", "painter", "folder")
+    }
     assert "2.0" in rows["cloud"]  # thousand Gaussians: one a point
-    assert [row.count("n/a") for row in rows.values()] == [1, 1, 2, 3]  # LPIPS; Gaussians of renders; their time
-    assert "its model rendered by gsbench (its time is that of the whole program, and it sets its own budget): " \
-        "random-cloud (version 1.2.3)." in table  # fmt: skip
+    # LPIPS; Gaussians of renders; their time
+    assert [row.count("n/a") for row in rows.values()] == [1, 1, 2, 3]
+    assert (
+        "its model rendered by gsbench (its time is that of the whole program, and it sets its "
+        "own budget): "
+        "random-cloud (version 1.2.3)." in table
+    )
     assert "its own renders measured as they are (its time" in table
-    assert "Renders of another program, measured as they are (its conditions are not known): random-folder." in table
+    assert (
+        "Renders of another program, measured as they are (its conditions are not known): "
+        "random-folder." in table
+    )
     assert run(["report", "three"]) == 0
     report = (home / "runs" / "three" / "report.html").read_text()
     for arm in ("cloud", "painter", "folder"):
-        assert re.search(rf"random-{arm} against random-adc, on this scene: (better|worse)", report), arm
-    for words in (["status", "three"], ["explain", "three:garden:psnr:cloud"], ["explain", "three:garden:psnr:painter"],
-                  ["sync", "three"]):  # fmt: skip
+        assert re.search(
+            rf"random-{arm} against random-adc, on this scene: (better|worse)", report
+        ), arm
+    for words in (
+        ["status", "three"],
+        ["explain", "three:garden:psnr:cloud"],
+        ["explain", "three:garden:psnr:painter"],
+        ["sync", "three"],
+    ):
         assert run(words) == 0, words
     said = capsys.readouterr().out
     assert "6 done" in said or "8 done" in said
@@ -168,11 +208,16 @@ def test_what_is_recorded(home: Path) -> None:
 
 @pytest.mark.parametrize("arm", ["cloud", "painter"])
 def test_no_test_photograph_reaches_it(home: Path, arm: str) -> None:
-    """The trainer walked everything beside and below its input, links followed, and told what it found."""
+    """The trainer walked everything beside and below its input, links followed, and told what it
+    found."""
     log = (trial(home, arm) / "trainer.log").read_text()
     seen = dict(line.split()[1:] for line in log.splitlines() if line.startswith("saw "))
-    held_out = {file.name: pixels(file) for file in (trial(home, arm) / "ground_truth").glob("*.png")}
-    photographs = {file.name: pixels(file) for file in (home / "data" / "garden" / "images_4").iterdir()}
+    held_out = {
+        file.name: pixels(file) for file in (trial(home, arm) / "ground_truth").glob("*.png")
+    }
+    photographs = {
+        file.name: pixels(file) for file in (home / "data" / "garden" / "images_4").iterdir()
+    }
     training = photographs.keys() - held_out.keys()
     assert len(held_out) == 2
     assert len(training) == 10
@@ -182,7 +227,9 @@ def test_no_test_photograph_reaches_it(home: Path, arm: str) -> None:
     }
     assert not set(seen.values()) & set(held_out.values())
     models = {str(Path(name).parent) for name in seen if "sparse" in name}
-    assert models == ({"data/sparse/0"} if arm == "cloud" else {"data/sparse/0", "test_cameras/sparse/0"})
+    assert models == (
+        {"data/sparse/0"} if arm == "cloud" else {"data/sparse/0", "test_cameras/sparse/0"}
+    )
     assert ("test_cameras/transforms.json" in seen) == (arm == "painter")
     assert "observations 0" in log
     assert "environment [] good" in log
@@ -193,11 +240,26 @@ def test_done_is_done_and_another_version_is_another_result(
 ) -> None:
     monkeypatch.setenv("GSBENCH_RUNS", str(home / "runs"))
     monkeypatch.chdir(home)
-    words = ["--config-dir", str(trainers), *QUICK, "scene=garden", "densify=cloud", "name=three", "eval.maps=true"]
-    before = {path: path.stat().st_mtime_ns for path in (home / "runs" / "store").glob("*/*/manifest.json")}
+    words = [
+        "--config-dir",
+        str(trainers),
+        *QUICK,
+        "scene=garden",
+        "densify=cloud",
+        "name=three",
+        "eval.maps=true",
+    ]
+    before = {
+        path: path.stat().st_mtime_ns
+        for path in (home / "runs" / "store").glob("*/*/manifest.json")
+    }
     assert run(words) == 0
-    assert run([*words, "name=again", "densify.time_limit_minutes=7"]) == 0  # the limit makes no other result
-    assert {path: path.stat().st_mtime_ns for path in (home / "runs" / "store").glob("*/*/manifest.json")} == before
+    # the limit makes no other result
+    assert run([*words, "name=again", "densify.time_limit_minutes=7"]) == 0
+    assert {
+        path: path.stat().st_mtime_ns
+        for path in (home / "runs" / "store").glob("*/*/manifest.json")
+    } == before
     capsys.readouterr()
     assert run([*words, "densify.version=9", "--dry-run"]) == 0
     planned = capsys.readouterr().out
@@ -211,7 +273,8 @@ BAD = {
     "nothing": "left no point_cloud/iteration_40/*.ply (densify.result); it wrote notes.txt; log: ",
     "torn": "it is cut short: its header promises",
     "nan": "f_dc_1 is not a finite number everywhere",
-    "two": "2 files fit densify.result (point_cloud/iteration_40/point_cloud.ply, point_cloud/iteration_40/second.ply)",
+    "two": "2 files fit densify.result (point_cloud/iteration_40/point_cloud.ply, "
+    "point_cloud/iteration_40/second.ply)",
 }
 BAD_RENDERS = {
     "fewer": "1 of 2 photographs have no picture of their name (0008.png)",
@@ -244,16 +307,30 @@ def test_bad_programs_end_in_a_line_each_and_lose_nothing_else(
 
 
 def test_one_that_hangs_is_ended(
-    trainers: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    trainers: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     """With its child, though both are deaf to SIGTERM."""
     monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path))
-    words = ["--config-dir", str(trainers), *COURTYARD, "densify=cloud", "densify.options.mode=hang"]
+    words = [
+        "--config-dir",
+        str(trainers),
+        *COURTYARD,
+        "densify=cloud",
+        "densify.options.mode=hang",
+    ]
     assert run([*words, "densify.time_limit_minutes=0.25"]) == 1
     said = capsys.readouterr().err.splitlines()[-1]
     assert "python still ran after 15 s (densify.time_limit_minutes); its last lines: " in said
     log = Path(said.rpartition("log: ")[2]).read_text()
-    pids = [int(word) for line in log.splitlines() if line.startswith("pids ") for word in line.split()[1:]]
+    pids = [
+        int(word)
+        for line in log.splitlines()
+        if line.startswith("pids ")
+        for word in line.split()[1:]
+    ]
     assert len(pids) == 2
     assert not any(map(is_running, pids))
 
@@ -262,19 +339,33 @@ def test_one_that_hangs_is_ended(
 def hanging(
     environment: dict[str, str], trainers: Path, tmp_path: Path
 ) -> Iterator[tuple[subprocess.Popen[str], list[int]]]:
-    """gsbench with a trainer that hangs, deaf to SIGTERM, and the trainer's and its child's process ids."""
-    words = ["--config-dir", str(trainers), *COURTYARD, "densify=cloud", "densify.options.mode=hang"]
+    """gsbench with a trainer that hangs, deaf to SIGTERM, and the trainer's and its child's process
+    ids."""
+    words = [
+        "--config-dir",
+        str(trainers),
+        *COURTYARD,
+        "densify=cloud",
+        "densify.options.mode=hang",
+    ]
     process = subprocess.Popen(
         [sys.executable, "-m", "gsbench.cli", *words],
-        cwd=tmp_path, env=environment | {"GSBENCH_RUNS": str(tmp_path / "runs")},
-        stderr=subprocess.PIPE, text=True, preexec_fn=heed_interrupts,
-    )  # fmt: skip
+        cwd=tmp_path,
+        env=environment | {"GSBENCH_RUNS": str(tmp_path / "runs")},
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=heed_interrupts,
+    )
     pids: list[int] = []
     deadline = time.monotonic() + 300
     while not pids and process.poll() is None and time.monotonic() < deadline:
         for log in (tmp_path / "runs" / "store" / "train").glob(".*/trainer.log"):
-            pids = [int(word) for line in log.read_text().splitlines() if line.startswith("pids ")
-                    for word in line.split()[1:]]  # fmt: skip
+            pids = [
+                int(word)
+                for line in log.read_text().splitlines()
+                if line.startswith("pids ")
+                for word in line.split()[1:]
+            ]
         time.sleep(0.05)
     yield process, pids
     process.kill()
@@ -285,7 +376,9 @@ def hanging(
     "signum",
     [signal.SIGINT, *(signum for signum in (signal.SIGTERM, signal.SIGKILL))],
 )
-def test_it_ends_with_gsbench(hanging: tuple[subprocess.Popen[str], list[int]], signum: int) -> None:
+def test_it_ends_with_gsbench(
+    hanging: tuple[subprocess.Popen[str], list[int]], signum: int
+) -> None:
     process, pids = hanging
     assert len(pids) == 2
     assert all(map(is_running, pids))
@@ -309,7 +402,10 @@ def test_it_ends_with_gsbench(hanging: tuple[subprocess.Popen[str], list[int]], 
         (["densify.command='{python} x'"], "has no {data}"),
         (["densify.version=???"], "densify.version is not set"),
         (["densify.options.mode=???"], "densify.options.mode is not set"),
-        (["+densify.options.seed=1"], "densify.options.seed: an option is one value with a name of its own"),
+        (
+            ["+densify.options.seed=1"],
+            "densify.options.seed: an option is one value with a name of its own",
+        ),
         (["eval.at=[10]"], "shows its model only at the end"),
         (["train.max_seconds=10"], "cannot be stopped early"),
         (["train.resolution_schedule=pictures"], "has its own sizes"),

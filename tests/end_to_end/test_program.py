@@ -1,4 +1,5 @@
-"""The program from outside: a sweep, its files and its table; bad input; and the installed wheel."""
+"""The program from outside: a sweep, its files and its table; bad input; and the installed
+wheel."""
 
 from __future__ import annotations
 
@@ -36,33 +37,66 @@ def test_help_is_quick_to_load(gsbench: Run) -> None:
         "import sys, gsbench.cli as c; c.run(['--help']); "
         "sys.exit(any(m in sys.modules for m in ('torch', 'mlflow', 'numba')))"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=300, check=False
+    )
     assert done.returncode == 0, done.stderr
     assert "volumetric" in done.stdout
 
 
-def test_wheel_runs_a_trial_outside_the_checkout(environment: dict[str, str], tmp_path: Path) -> None:
-    pytest.importorskip("hatchling", reason="building the wheel offline needs hatchling (group dev)")
-    build = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(tmp_path / "dist"), str(ROOT)]
+def test_wheel_runs_a_trial_outside_the_checkout(
+    environment: dict[str, str], tmp_path: Path
+) -> None:
+    pytest.importorskip(
+        "hatchling", reason="building the wheel offline needs hatchling (group dev)"
+    )
+    build = [
+        sys.executable,
+        "-m",
+        "build",
+        "--wheel",
+        "--no-isolation",
+        "--outdir",
+        str(tmp_path / "dist"),
+        str(ROOT),
+    ]
     subprocess.run(build, check=True, capture_output=True, timeout=300)
     (wheel,) = (tmp_path / "dist").glob("gsbench_3dgs-*.whl")
     home = tmp_path / "clean"
     venv.create(home, with_pip=False)
     python = home / "bin" / "python"
     packages = next((home / "lib").glob("python*/site-packages"))
-    # The dependencies come from this environment, after the wheel's own files; gsbench itself from the wheel alone.
+    # The dependencies come from this environment, after the wheel's own files; gsbench itself from
+    # the wheel alone.
     dependencies = Path(pytest.__file__).resolve().parents[1]
     (packages / "zz_dependencies.pth").write_text(f"{dependencies}\n")
     subprocess.run(
-        [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--target", str(packages), str(wheel)],
+        [
+            sys.executable,
+            "-m",
+            "pip",
+            "install",
+            "--quiet",
+            "--no-deps",
+            "--target",
+            str(packages),
+            str(wheel),
+        ],
         check=True,
     )
-    clean = {key: value for key, value in environment.items() if key != "PYTHONPATH"}  # not the checkout's modules
-    where = "import gsbench, gsbench.system.install as c; print(gsbench.__file__); print(c.conf_dir())"
-    found = subprocess.run([python, "-c", where], cwd=tmp_path, env=clean, capture_output=True, text=True, check=True)
+    # not the checkout's modules
+    clean = {key: value for key, value in environment.items() if key != "PYTHONPATH"}
+    where = (
+        "import gsbench, gsbench.system.install as c; print(gsbench.__file__); print(c.conf_dir())"
+    )
+    found = subprocess.run(
+        [python, "-c", where], cwd=tmp_path, env=clean, capture_output=True, text=True, check=True
+    )
     assert all(line.startswith(str(packages)) for line in found.stdout.split())
     hint = "from gsbench.system.install import install_command; print(install_command('view'))"
-    found = subprocess.run([python, "-c", hint], cwd=tmp_path, env=clean, capture_output=True, text=True, check=True)
+    found = subprocess.run(
+        [python, "-c", hint], cwd=tmp_path, env=clean, capture_output=True, text=True, check=True
+    )
     assert found.stdout == "pip install 'gsbench-3dgs[view]'\n"
     arguments = [*SMALL, "train.iterations=10", "tracking=none"]
     runs = tmp_path / "runs"

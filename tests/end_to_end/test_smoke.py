@@ -1,4 +1,5 @@
-"""The program as a user runs it, one short test for each thing that it is used for: part of ``make test``."""
+"""The program as a user runs it, one short test for each thing that it is used for: part of ``make
+test``."""
 
 from __future__ import annotations
 
@@ -57,7 +58,10 @@ def test_a_sweep_leaves_complete_trials(finished_runs: Path) -> None:
         assert record["machine"]["cpu"]
     assert len({record["hashes"]["cloud"] for record in records}) == 1
     trial = trials["volumetric-0"]
-    wanted = "config.yaml per_view.csv metrics.jsonl events.jsonl renders ground_truth point_cloud.ply log.txt"
+    wanted = (
+        "config.yaml per_view.csv metrics.jsonl events.jsonl renders ground_truth "
+        "point_cloud.ply log.txt"
+    )
     assert set(wanted.split()) <= {path.name for path in trial.iterdir()}
     with (trial / "per_view.csv").open() as stream:
         rows = list(csv.DictReader(stream))
@@ -65,14 +69,24 @@ def test_a_sweep_leaves_complete_trials(finished_runs: Path) -> None:
     picture = np.asarray(Image.open(trial / "renders" / "0000.png")).astype(float)
     truth = np.asarray(Image.open(trial / "ground_truth" / "0000.png")).astype(float)
     assert picture.shape == truth.shape == (72, 96, 3)
-    assert 10 * np.log10(255**2 / ((picture - truth) ** 2).mean()) == pytest.approx(float(rows[0]["psnr"]), abs=1e-6)
+    assert 10 * np.log10(255**2 / ((picture - truth) ** 2).mean()) == pytest.approx(
+        float(rows[0]["psnr"]), abs=1e-6
+    )
     flipped = ((picture[::-1] - truth) ** 2).mean()
-    assert ((picture - truth) ** 2).mean() < 0.6 * flipped  # a PSNR alone would not show a flipped picture
+    # a PSNR alone would not show a flipped picture
+    assert ((picture - truth) ** 2).mean() < 0.6 * flipped
 
 
 def test_the_same_command_again_computes_nothing(gsbench: Run, runs: Path) -> None:
     written = [path.stat().st_mtime_ns for path in sorted(runs.rglob("results.json"))]
-    sweep = ["-m", *SMALL, f"name={FINISHED}", "densify=adc,volumetric", "seed=0,1", "tracking=none"]
+    sweep = [
+        "-m",
+        *SMALL,
+        f"name={FINISHED}",
+        "densify=adc,volumetric",
+        "seed=0,1",
+        "tracking=none",
+    ]
     done = gsbench(*sweep, GSBENCH_RUNS=str(runs))
     assert done.returncode == 0, done.stderr
     assert [path.stat().st_mtime_ns for path in sorted(runs.rglob("results.json"))] == written
@@ -91,7 +105,12 @@ def test_tables_and_report(gsbench: Run, runs: Path) -> None:
 
 def test_a_killed_trial_goes_on_to_the_same_bits(gsbench: Run, runs: Path, tmp_path: Path) -> None:
     (tmp_path / "mortal.py").write_text(MORTAL)
-    own = ["densify=adc", "densify._target_=mortal.Mortal", "densify.name=mortal", "allow_targets=[mortal]"]
+    own = [
+        "densify=adc",
+        "densify._target_=mortal.Mortal",
+        "densify.name=mortal",
+        "allow_targets=[mortal]",
+    ]
     command = [*SMALL, "name=killed", "tracking=none", *own]
     killed = gsbench(*command, GSBENCH_RUNS=str(runs))
     assert killed.returncode == -9
@@ -106,10 +125,24 @@ def test_a_killed_trial_goes_on_to_the_same_bits(gsbench: Run, runs: Path, tmp_p
 
 
 def test_the_readmes_own_densifier_acts(gsbench: Run, runs: Path, tmp_path: Path) -> None:
-    (code,) = re.findall(r"```python\n(# mine\.py\n.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    (code,) = re.findall(
+        r"```python\n(# mine\.py\n.*?)```", (ROOT / "README.md").read_text(), re.DOTALL
+    )
     (tmp_path / "mine.py").write_text(code)
-    own = ["densify=adc", "densify._target_=mine.Solid", "densify.name=solid", "allow_targets=[mine]"]
-    done = gsbench(*SMALL, "name=own", "tracking=none", *own, "+densify.min_opacity=0.3", GSBENCH_RUNS=str(runs))
+    own = [
+        "densify=adc",
+        "densify._target_=mine.Solid",
+        "densify.name=solid",
+        "allow_targets=[mine]",
+    ]
+    done = gsbench(
+        *SMALL,
+        "name=own",
+        "tracking=none",
+        *own,
+        "+densify.min_opacity=0.3",
+        GSBENCH_RUNS=str(runs),
+    )
     assert done.returncode == 0, done.stderr
     counts = [
         json.loads((trial / "results.json").read_text())["num_gaussians"]
@@ -120,7 +153,13 @@ def test_the_readmes_own_densifier_acts(gsbench: Run, runs: Path, tmp_path: Path
 
 def test_a_claims_file_and_its_archive(gsbench: Run, runs: Path, tmp_path: Path) -> None:
     settings = {word.split("=", 1)[0]: yaml.safe_load(word.split("=", 1)[1]) for word in TINY[1:]}
-    claim = {"id": "points", "says": "More points help.", "where": "Table 1", "baseline": "few", "arm": "many"}
+    claim = {
+        "id": "points",
+        "says": "More points help.",
+        "where": "Table 1",
+        "baseline": "few",
+        "arm": "many",
+    }
     claim |= {"metric": "psnr", "direction": "higher", "least": 0.01, "refuted_if": "it is worse"}
     content = {
         "name": "check_it",
@@ -136,12 +175,23 @@ def test_a_claims_file_and_its_archive(gsbench: Run, runs: Path, tmp_path: Path)
     assert checked.returncode == 0, checked.stderr
     assert " points: " in checked.stdout
     page = (runs / "check_it" / "claims.html").read_text()
-    exported = gsbench("export", "--results", "check_it", "--out", "published.zip", GSBENCH_RUNS=str(runs))
+    exported = gsbench(
+        "export", "--results", "check_it", "--out", "published.zip", GSBENCH_RUNS=str(runs)
+    )
     assert exported.returncode == 0, exported.stderr
-    again = gsbench("check", "claims.yaml", "--from", "published.zip", "--out", "again.html", GSBENCH_RUNS="elsewhere")
+    again = gsbench(
+        "check",
+        "claims.yaml",
+        "--from",
+        "published.zip",
+        "--out",
+        "again.html",
+        GSBENCH_RUNS="elsewhere",
+    )
     assert again.returncode == 0, again.stderr
     headlines = [
-        re.findall(r"<h2>.*?</h2>|<p>PSNR .*?</p>", text) for text in (page, (tmp_path / "again.html").read_text())
+        re.findall(r"<h2>.*?</h2>|<p>PSNR .*?</p>", text)
+        for text in (page, (tmp_path / "again.html").read_text())
     ]
     assert headlines[0] == headlines[1] != []
     assert not (tmp_path / "elsewhere").exists()
@@ -149,9 +199,15 @@ def test_a_claims_file_and_its_archive(gsbench: Run, runs: Path, tmp_path: Path)
 
 @pytest.mark.parametrize(
     ("word", "hint"),
-    [("densify=volumetrik", "volumetric"), ("densify.grad_threshold=1", "gradient_threshold"), ("tabels", "tables")],
+    [
+        ("densify=volumetrik", "volumetric"),
+        ("densify.grad_threshold=1", "gradient_threshold"),
+        ("tabels", "tables"),
+    ],
 )
-def test_a_misspelt_word_is_one_line_with_the_right_one(gsbench: Run, tmp_path: Path, word: str, hint: str) -> None:
+def test_a_misspelt_word_is_one_line_with_the_right_one(
+    gsbench: Run, tmp_path: Path, word: str, hint: str
+) -> None:
     done = gsbench(word, GSBENCH_RUNS=str(tmp_path / "runs"))
     assert done.returncode == 2
     (line,) = done.stderr.strip().splitlines()
@@ -164,22 +220,36 @@ def test_a_misspelt_word_is_one_line_with_the_right_one(gsbench: Run, tmp_path: 
 def test_a_mirror_in_mlflow(gsbench: Run, runs: Path) -> None:
     done = gsbench("sync", FINISHED, GSBENCH_RUNS=str(runs))
     assert done.returncode == 0, done.stderr
-    wanted = [json.loads((trial / "results.json").read_text())["metrics"]["psnr"] for trial in trials_of(runs).values()]
+    wanted = [
+        json.loads((trial / "results.json").read_text())["metrics"]["psnr"]
+        for trial in trials_of(runs).values()
+    ]
     with sqlite3.connect(runs / "mlflow.db") as database:  # without MLflow's own code
-        sent = [value for (value,) in database.execute("SELECT value FROM latest_metrics WHERE key = 'eval/psnr_dB'")]
+        sent = [
+            value
+            for (value,) in database.execute(
+                "SELECT value FROM latest_metrics WHERE key = 'eval/psnr_dB'"
+            )
+        ]
     assert sorted(sent) == pytest.approx(sorted(wanted))
 
 
 @pytest.mark.skipif(os.name != "posix", reason="Slurm's commands are scripts of a shell here")
 def test_slurms_job_command_runs_the_trial(gsbench: Run, runs: Path, tmp_path: Path) -> None:
-    """``sbatch`` keeps the script; its command is then run as Slurm would run one task of the array."""
+    """``sbatch`` keeps the script; its command is then run as Slurm would run one task of the
+    array."""
     bin_folder = tmp_path / "bin"
     bin_folder.mkdir()
     for name in ("sbatch", "srun", "squeue"):
         (bin_folder / name).write_text('#!/bin/sh\ncp "$1" "$KEPT"\necho Submitted batch job 7\n')
         (bin_folder / name).chmod(0o755)
     kept, path = tmp_path / "kept.sh", f"{bin_folder}{os.pathsep}{os.environ['PATH']}"
-    cluster = ["launch=slurm", "launch.wait=false", "launch.gpus_per_trial=0", "launch.cpus_per_trial=1"]
+    cluster = [
+        "launch=slurm",
+        "launch.wait=false",
+        "launch.gpus_per_trial=0",
+        "launch.cpus_per_trial=1",
+    ]
     done = gsbench(
         *("-m", *TINY, "name=x", "seed=0,1", "densify=none", *cluster),
         PATH=path,
@@ -192,11 +262,22 @@ def test_slurms_job_command_runs_the_trial(gsbench: Run, runs: Path, tmp_path: P
     assert "#SBATCH --array=0-1" in script
     assert "#SBATCH --cpus-per-task=1" in script
     command = script[script.index(sys.executable) :].split()
-    task = {"SLURM_JOB_ID": "7", "SLURM_ARRAY_JOB_ID": "7", "SLURM_ARRAY_TASK_ID": "1", "SUBMITIT_EXECUTOR": "slurm"}
+    task = {
+        "SLURM_JOB_ID": "7",
+        "SLURM_ARRAY_JOB_ID": "7",
+        "SLURM_ARRAY_TASK_ID": "1",
+        "SUBMITIT_EXECUTOR": "slurm",
+    }
     task |= {"SLURM_JOB_NUM_NODES": "1", "SLURM_NTASKS": "1"}
     task |= {f"SLURM_{name}": "0" for name in ("PROCID", "LOCALID", "NODEID")}
     ran = subprocess.run(
-        command, cwd=tmp_path, env=os.environ | task, capture_output=True, text=True, timeout=240, check=False
+        command,
+        cwd=tmp_path,
+        env=os.environ | task,
+        capture_output=True,
+        text=True,
+        timeout=240,
+        check=False,
     )
     assert ran.returncode == 0, ran.stderr
     assert list(trials_of(runs, "x")) == ["none-1"]

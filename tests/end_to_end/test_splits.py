@@ -1,4 +1,5 @@
-"""Splits in whole trials: not one bit of a held-out photograph enters a training, and a search never sees one."""
+"""Splits in whole trials: not one bit of a held-out photograph enters a training, and a search
+never sees one."""
 
 from __future__ import annotations
 
@@ -23,25 +24,38 @@ from tests.end_to_end.conftest import trial_of
 pytestmark = pytest.mark.slow
 
 QUICK = [
-    "scene=colmap", "densify=adc", "train.iterations=120", "train.densify_start=20", "train.densify_interval=20",
-    "train.densify_stop=100", "eval.lpips=[]", "eval.flip=false", "tracking=none", "device=cpu",
-]  # fmt: skip
+    "scene=colmap",
+    "densify=adc",
+    "train.iterations=120",
+    "train.densify_start=20",
+    "train.densify_interval=20",
+    "train.densify_stop=100",
+    "eval.lpips=[]",
+    "eval.flip=false",
+    "tracking=none",
+    "device=cpu",
+]
 TRAINED = ("point_cloud.ply", "events.jsonl", "lineage.npz")
 
 
 @pytest.fixture(scope="module")
 def captures(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """A COLMAP folder with points that all views made, and the same with noise in place of every eighth photograph."""
+    """A COLMAP folder with points that all views made, and the same with noise in place of every
+    eighth photograph."""
     folder = tmp_path_factory.mktemp("captures")
     clean, noisy = folder / "clean", folder / "noisy"
     render_courtyard(clean, views=12, width=192, height=144)
-    Sfm(threads=1, first_octave=0, max_num_features=1500).run(read_colmap("courtyard", clean), folder / "sfm")
+    Sfm(threads=1, first_octave=0, max_num_features=1500).run(
+        read_colmap("courtyard", clean), folder / "sfm"
+    )
     shutil.rmtree(clean / "sparse")
     shutil.copytree(folder / "sfm" / MODEL_FOLDER, clean / "sparse" / "0")
     shutil.copytree(clean, noisy)
     rng = np.random.default_rng(0)
     for name in sorted(path.name for path in (noisy / "images").iterdir())[::8]:
-        Image.fromarray(rng.integers(0, 256, (144, 192, 3), dtype=np.uint8)).save(noisy / "images" / name)
+        Image.fromarray(rng.integers(0, 256, (144, 192, 3), dtype=np.uint8)).save(
+            noisy / "images" / name
+        )
     return clean, noisy
 
 
@@ -59,27 +73,49 @@ def bits(folder: Path) -> dict[str, str]:
 def test_not_one_bit_of_a_test_photograph_enters_a_trial(
     captures: tuple[Path, Path], tmp_path: Path, init: str, choice: str
 ) -> None:
-    """Poses aside, which are given here. Renders are equal too; what they are held against is not."""
+    """Poses aside, which are given here. Renders are equal too; what they are held against is
+    not."""
     words = [f"init={init}", f"init.points_from={choice}"]
-    words += ["init.first_octave=0", "init.max_num_features=1500", "init.two_view_tracks=true"] if init == "sfm" else []
+    words += (
+        ["init.first_octave=0", "init.max_num_features=1500", "init.two_view_tracks=true"]
+        if init == "sfm"
+        else []
+    )
     folders = [trial(tmp_path, capture, *words) for capture in captures]
     assert bits(folders[0]) == bits(folders[1])
     clean, noisy = (json.loads((folder / "results.json").read_text()) for folder in folders)
     assert clean["hashes"]["data"] != noisy["hashes"]["data"]
     assert clean["metrics"]["psnr"] > noisy["metrics"]["psnr"] + 3
     for render in (folders[0] / "renders").iterdir():
-        np.testing.assert_array_equal(Image.open(render), Image.open(folders[1] / "renders" / render.name))
+        np.testing.assert_array_equal(
+            Image.open(render), Image.open(folders[1] / "renders" / render.name)
+        )
 
 
-def test_with_points_from_all_the_noise_is_seen(captures: tuple[Path, Path], tmp_path: Path) -> None:
+def test_with_points_from_all_the_noise_is_seen(
+    captures: tuple[Path, Path], tmp_path: Path
+) -> None:
     """So the test above can fail."""
-    words = ["init=sfm", "init.first_octave=0", "init.max_num_features=1500", "init.two_view_tracks=true"]
+    words = [
+        "init=sfm",
+        "init.first_octave=0",
+        "init.max_num_features=1500",
+        "init.two_view_tracks=true",
+    ]
     clean, noisy = (trial(tmp_path, capture, *words) for capture in captures)
     assert bits(clean) != bits(noisy)
 
 
-def test_a_sector_is_recorded_with_its_views_and_their_distances(captures: tuple[Path, Path], tmp_path: Path) -> None:
-    words = ["init=dataset", "densify=none", "scene.split=sector", "scene.sectors=4", "scene.sector=3"]
+def test_a_sector_is_recorded_with_its_views_and_their_distances(
+    captures: tuple[Path, Path], tmp_path: Path
+) -> None:
+    words = [
+        "init=dataset",
+        "densify=none",
+        "scene.split=sector",
+        "scene.sectors=4",
+        "scene.sector=3",
+    ]
     folder = trial(tmp_path, captures[0], *words)
     results: dict[str, Any] = json.loads((folder / "results.json").read_text())
     assert results["split"] == "sector 3 of 4"
@@ -87,15 +123,19 @@ def test_a_sector_is_recorded_with_its_views_and_their_distances(captures: tuple
     assert (results["train_views"], results["test_views"]) == (9, 3)
     with (folder / "per_view.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
-    assert [row["view"] for row in rows] == ["0009.png", "0010.png", "0011.png"]  # the end of the arc
+    # the end of the arc
+    assert [row["view"] for row in rows] == ["0009.png", "0010.png", "0011.png"]
     angles = [float(row["angle_to_nearest"]) for row in rows]
     assert angles == sorted(angles)
     assert 5 < angles[0] < 10 < angles[2] < 30
     assert "angle_to_nearest" not in results["metrics"]
 
 
-def test_a_search_with_validation_views_never_sees_a_test_view(captures: tuple[Path, Path], tmp_path: Path) -> None:
-    """Not even with photographs replaced by noise does anything change, the fingerprint included."""
+def test_a_search_with_validation_views_never_sees_a_test_view(
+    captures: tuple[Path, Path], tmp_path: Path
+) -> None:
+    """Not even with photographs replaced by noise does anything change, the fingerprint
+    included."""
     words = ["init=dataset", "densify=none", "scene.validation=true"]
     clean, noisy = (trial(tmp_path, capture, *words) for capture in captures)
     one, other = (json.loads((folder / "results.json").read_text()) for folder in (clean, noisy))

@@ -1,4 +1,5 @@
-"""What a densifier needs is edited and a seed is run: no table averages both versions, one command forgets the old."""
+"""What a densifier needs is edited and a seed is run: no table averages both versions, one command
+forgets the old."""
 
 from __future__ import annotations
 
@@ -26,18 +27,29 @@ class Mine(ADC):
 """
 HELPER = "said = 1\n"
 QUICK = ["train.iterations=20", "eval.lpips=[]", "eval.flip=false", "tracking=none"]
-OWN = ["densify=adc", "densify._target_=mine.Mine", "allow_targets=[mine,helper]", "densify.name=mine", "name=edited"]
+OWN = [
+    "densify=adc",
+    "densify._target_=mine.Mine",
+    "allow_targets=[mine,helper]",
+    "densify.name=mine",
+    "name=edited",
+]
 
 
 def test_an_edited_densifier_is_never_averaged_with_what_it_was(
-    gsbench: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    gsbench: Run,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     runs = str(tmp_path / "runs")
     monkeypatch.setenv("GSBENCH_RUNS", runs)
 
     def train(*seeds: int) -> str:
         """Trainings run in processes of their own, which import the file as it is."""
-        done = gsbench("-m", *SMALL, *QUICK, *OWN, f"seed={','.join(map(str, seeds))}", GSBENCH_RUNS=runs)
+        done = gsbench(
+            "-m", *SMALL, *QUICK, *OWN, f"seed={','.join(map(str, seeds))}", GSBENCH_RUNS=runs
+        )
         assert done.returncode == 0, done.stderr
         return done.stderr
 
@@ -69,7 +81,8 @@ def test_an_edited_densifier_is_never_averaged_with_what_it_was(
     assert ask("status", "edited") == "1 trial: 1 done\n"
     ask("tables", "edited")
 
-    (tmp_path / "helper.py").write_text(HELPER)  # the old code comes back: its trials are in the store
+    # the old code comes back: its trials are in the store
+    (tmp_path / "helper.py").write_text(HELPER)
     assert "iteration" not in train(0, 1)
     assert "3 trials: 2 done, 1 superseded" in ask("status", "edited")
 

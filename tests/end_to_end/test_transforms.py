@@ -1,4 +1,5 @@
-"""A COLMAP scene written as transforms.json by other code, and read back: the same cameras, the same training."""
+"""A COLMAP scene written as transforms.json by other code, and read back: the same cameras, the
+same training."""
 
 from __future__ import annotations
 
@@ -29,31 +30,56 @@ pytestmark = pytest.mark.slow
 # What `ns-process-data` does to COLMAP's coordinates: x and y exchanged, z turned round.
 APPLIED = np.array([[0.0, 1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0]])
 QUICK = [
-    "init=dataset", "train.iterations=40", "train.densify_start=10", "train.densify_interval=10",
-    "train.densify_stop=30", "eval.download=false", "eval.lpips=[]", "tracking=none", "device=cpu",
-]  # fmt: skip
+    "init=dataset",
+    "train.iterations=40",
+    "train.densify_start=10",
+    "train.densify_interval=10",
+    "train.densify_stop=30",
+    "eval.download=false",
+    "eval.lpips=[]",
+    "tracking=none",
+    "device=cpu",
+]
 
 
 def as_nerfstudio(model: pycolmap.Reconstruction, folder: Path) -> None:
-    """Write the model's cameras and points beside ``folder``/images as nerfstudio's documents describe the format."""
+    """Write the model's cameras and points beside ``folder``/images as nerfstudio's documents
+    describe the format."""
     frames: list[dict[str, Any]] = []
     for image in model.images.values():
         camera = model.cameras[image.camera_id]
-        focal, cx, cy, *radial = camera.params if camera.model_name == "SIMPLE_RADIAL" else camera.params[[0, 2, 3]]
+        focal, cx, cy, *radial = (
+            camera.params if camera.model_name == "SIMPLE_RADIAL" else camera.params[[0, 2, 3]]
+        )
         world_from_camera = np.vstack([image.cam_from_world().inverse().matrix(), [0, 0, 0, 1]])
         world_from_camera[:, 1:3] *= -1  # OpenCV to OpenGL: y and z turn round
         matrix = np.vstack([APPLIED, [0, 0, 0, 1]]) @ world_from_camera
-        own = {"w": camera.width, "h": camera.height, "fl_x": focal, "fl_y": focal, "cx": cx, "cy": cy}
+        own = {
+            "w": camera.width,
+            "h": camera.height,
+            "fl_x": focal,
+            "fl_y": focal,
+            "cx": cx,
+            "cy": cy,
+        }
         own |= {"k1": radial[0], "k2": 0.0, "p1": 0.0, "p2": 0.0} if radial else {}
-        frames.append({"file_path": f"images/{image.name}", "transform_matrix": matrix.tolist()} | own)
+        frames.append(
+            {"file_path": f"images/{image.name}", "transform_matrix": matrix.tolist()} | own
+        )
     points = [point for _, point in sorted(model.points3D.items())]
     rows = [[*(APPLIED[:, :3] @ point.xyz), *point.color] for point in points]
-    header = f"ply\nformat ascii 1.0\nelement vertex {len(points)}\n" + "".join(f"property double {c}\n" for c in "xyz")
+    header = f"ply\nformat ascii 1.0\nelement vertex {len(points)}\n" + "".join(
+        f"property double {c}\n" for c in "xyz"
+    )
     header += "".join(f"property uchar {c}\n" for c in ("red", "green", "blue")) + "end_header\n"
-    lines = [" ".join([*map(repr, map(float, row[:3])), *map(str, map(int, row[3:]))]) for row in rows]
+    lines = [
+        " ".join([*map(repr, map(float, row[:3])), *map(str, map(int, row[3:]))]) for row in rows
+    ]
     (folder / "sparse_pc.ply").write_text(header + "\n".join(lines) + "\n")
     document = {"camera_model": "OPENCV", "frames": frames, "applied_transform": APPLIED.tolist()}
-    (folder / "transforms.json").write_text(json.dumps(document | {"ply_file_path": "sparse_pc.ply"}))
+    (folder / "transforms.json").write_text(
+        json.dumps(document | {"ply_file_path": "sparse_pc.ply"})
+    )
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +96,19 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def trial(runs: Path, kind: str, folder: Path, *words: str) -> Path:
-    assert run([*QUICK, f"scene={kind}", f"scene.path={folder}", f"runs={runs}", f"name={kind}", *words]) == 0
+    assert (
+        run(
+            [
+                *QUICK,
+                f"scene={kind}",
+                f"scene.path={folder}",
+                f"runs={runs}",
+                f"name={kind}",
+                *words,
+            ]
+        )
+        == 0
+    )
     (found,) = {path.parent for path in (runs / kind).glob("*/*/*/results.json")}
     return found
 
@@ -114,7 +152,9 @@ def test_without_points_the_file_says_which_initialiser(scene: Path, tmp_path: P
     document = json.loads((folder / "transforms.json").read_text())
     document.pop("ply_file_path")
     (folder / "transforms.json").write_text(json.dumps(document))
-    assert run([*QUICK, "scene=transforms", f"scene.path={folder}", f"runs={tmp_path / 'runs'}"]) != 0
+    assert (
+        run([*QUICK, "scene=transforms", f"scene.path={folder}", f"runs={tmp_path / 'runs'}"]) != 0
+    )
     assert "has no points: use init=sfm or random" in capfd.readouterr().err
     assert trial(tmp_path / "runs", "transforms", folder, "init=random", "init.count=500")
 

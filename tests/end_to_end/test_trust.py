@@ -1,4 +1,5 @@
-"""Whole trials in a folder that holds a module for every name that anything imports; none of them may be imported."""
+"""Whole trials in a folder that holds a module for every name that anything imports; none of them
+may be imported."""
 
 from __future__ import annotations
 
@@ -20,33 +21,56 @@ BOMB = "with open({mark!r}, 'a') as stream:\n    stream.write(__name__ + '\\n')\
 
 @pytest.fixture
 def capture(tmp_path: Path) -> Path:
-    """A folder with bombs of all names of the standard library and of everything that is installed."""
+    """A folder with bombs of all names of the standard library and of everything that is
+    installed."""
     folder, mark = tmp_path / "capture", tmp_path / "exploded"
     folder.mkdir()
-    names = {*sys.stdlib_module_names, *importlib.metadata.packages_distributions(), "plyfile", "sitecustomize"}
+    names = {
+        *sys.stdlib_module_names,
+        *importlib.metadata.packages_distributions(),
+        "plyfile",
+        "sitecustomize",
+    }
     for name in names:
         if name.isidentifier():
             (folder / f"{name}.py").write_text(BOMB.format(mark=str(mark)))
     (folder / "hydra_plugins.py").unlink(missing_ok=True)
     (folder / "hydra_plugins").mkdir()  # a namespace, which Hydra imports as a whole
     (folder / "hydra_plugins" / "extra.py").write_text(BOMB.format(mark=str(mark)))
-    (tmp_path / "gsbench").write_text("from gsbench.cli import main\nmain()\n")  # the console script, as pip writes it
+    # the console script, as pip writes it
+    (tmp_path / "gsbench").write_text("from gsbench.cli import main\nmain()\n")
     return folder
 
 
-def gsbench(folder: Path, *words: str, start: Sequence[str] = ("../gsbench",)) -> subprocess.CompletedProcess[str]:
-    kept = {key: value for key, value in os.environ.items() if not key.startswith(("GSBENCH_", "MLFLOW_", "PYTHON"))}
-    environment = kept | {"GSBENCH_RUNS": str(folder.parent / "runs"), "TORCH_HOME": str(folder.parent / "hub")}
+def gsbench(
+    folder: Path, *words: str, start: Sequence[str] = ("../gsbench",)
+) -> subprocess.CompletedProcess[str]:
+    kept = {
+        key: value
+        for key, value in os.environ.items()
+        if not key.startswith(("GSBENCH_", "MLFLOW_", "PYTHON"))
+    }
+    environment = kept | {
+        "GSBENCH_RUNS": str(folder.parent / "runs"),
+        "TORCH_HOME": str(folder.parent / "hub"),
+    }
     command = [sys.executable, *start, *words]
     return subprocess.run(
-        command, cwd=folder, env=environment, capture_output=True, text=True, timeout=SECONDS, check=False
+        command,
+        cwd=folder,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=SECONDS,
+        check=False,
     )
 
 
 def test_no_module_of_the_current_folder_is_imported(capture: Path) -> None:
     own = "from gsbench.densify import NoDensifier\nclass Own(NoDensifier):\n    pass\n"
     (capture / "own.py").write_text(own)
-    allowed = ["densify._target_=own.Own", "allow_targets=[own,yaml]"]  # what is installed comes before what lies here
+    # what is installed comes before what lies here
+    allowed = ["densify._target_=own.Own", "allow_targets=[own,yaml]"]
     tracked = [word for word in TINY if word != "tracking=none"]
     for words in (
         ["--help"],
@@ -57,7 +81,10 @@ def test_no_module_of_the_current_folder_is_imported(capture: Path) -> None:
     ):
         done = gsbench(capture, *words)
         assert done.returncode == 0, done.stderr
-        assert not (capture.parent / "exploded").exists(), (words, (capture.parent / "exploded").read_text())
+        assert not (capture.parent / "exploded").exists(), (
+            words,
+            (capture.parent / "exploded").read_text(),
+        )
     assert len(list((capture.parent / "runs" / "one").rglob("results.json"))) == 2
 
 
@@ -69,9 +96,13 @@ def test_nor_by_a_process_of_its_own(capture: Path) -> None:
     assert not (capture.parent / "exploded").exists(), (capture.parent / "exploded").read_text()
 
 
-def test_nor_by_python_m_but_for_what_python_imports_before_it_comes_to_gsbench(capture: Path) -> None:
+def test_nor_by_python_m_but_for_what_python_imports_before_it_comes_to_gsbench(
+    capture: Path,
+) -> None:
     code = "import runpy, sys; print(*sys.modules)"
-    before = subprocess.run([sys.executable, "-P", "-c", code], capture_output=True, text=True, check=True).stdout
+    before = subprocess.run(
+        [sys.executable, "-P", "-c", code], capture_output=True, text=True, check=True
+    ).stdout
     for name in {name.split(".")[0] for name in before.split()} | {"gsbench"}:
         (capture / f"{name}.py").unlink(missing_ok=True)
     for words in (["--help"], ["--cfg", "job"], ["seed=1", "--dry-run"]):
@@ -82,8 +113,11 @@ def test_nor_by_python_m_but_for_what_python_imports_before_it_comes_to_gsbench(
 
 def test_nor_by_another_trainer_that_tells_its_version(capture: Path) -> None:
     """``python -c`` imports from where it runs, so its version is asked for in an empty folder."""
-    (capture.parent / "train.py").write_text("import beside, sys; sys.exit('Error: trained ' + beside.WHAT)")
-    (capture.parent / "beside.py").write_text("WHAT = 'with what lies beside it'")  # as many trainers have
+    (capture.parent / "train.py").write_text(
+        "import beside, sys; sys.exit('Error: trained ' + beside.WHAT)"
+    )
+    # as many trainers have
+    (capture.parent / "beside.py").write_text("WHAT = 'with what lies beside it'")
     words = [
         "densify=external/program",
         f"densify.command=['{sys.executable}','{capture.parent / 'train.py'}','{{data}}']",

@@ -1,7 +1,9 @@
-"""How a setting travels: a trial is composed, built and checked once, and V_th takes few doors from YAML to rule.
+"""How a setting travels: a trial is composed, built and checked once, and V_th takes few doors from
+YAML to rule.
 
-The way is what the call stacks say at the moments when the value is composed, checked and used: from one to the next,
-up to the frame that they share and down again. A crossing is a step from one folder of gsbench to another.
+The way is what the call stacks say at the moments when the value is composed, checked and used:
+from one to the next, up to the frame that they share and down again. A crossing is a step from one
+folder of gsbench to another.
 """
 
 from __future__ import annotations
@@ -29,24 +31,47 @@ PACKAGE = Path(gsbench.__file__).parent
 MAX_CROSSINGS = 18
 KEY = "densify.volume_threshold"
 TRIAL = [
-    *SMALL, "train.iterations=4", "train.densify_start=1", "train.densify_interval=2", "train.densify_stop=4",
-    "scene.views=9", "scene.width=48", "scene.height=36", "init.count=200", "raster=reference", "eval.lpips=[]",
-    "eval.flip=false", "eval.maps=false", "tracking=none", "device=cpu", "densify=volumetric", f"{KEY}=1e-9",
-]  # fmt: skip
+    *SMALL,
+    "train.iterations=4",
+    "train.densify_start=1",
+    "train.densify_interval=2",
+    "train.densify_stop=4",
+    "scene.views=9",
+    "scene.width=48",
+    "scene.height=36",
+    "init.count=200",
+    "raster=reference",
+    "eval.lpips=[]",
+    "eval.flip=false",
+    "eval.maps=false",
+    "tracking=none",
+    "device=cpu",
+    "densify=volumetric",
+    f"{KEY}=1e-9",
+]
 Frame = tuple[int, str]  # its identity while it lives, and its file below gsbench/
 
 
 def stack() -> list[Frame]:
     """The living frames of gsbench, from the outermost in."""
     frames = [(id(entry.frame), Path(entry.filename)) for entry in reversed(inspect.stack(0))]
-    return [(number, path.relative_to(PACKAGE).as_posix()) for number, path in frames if path.is_relative_to(PACKAGE)]
+    return [
+        (number, path.relative_to(PACKAGE).as_posix())
+        for number, path in frames
+        if path.is_relative_to(PACKAGE)
+    ]
 
 
 def way(stacks: list[list[Frame]]) -> list[str]:
     """The files that one passes from the end of each stack to the end of the next."""
     passed = stacks[0][-1:]
     for here, there in itertools.pairwise(stacks):
-        shared = sum(1 for _ in itertools.takewhile(lambda pair: pair[0] == pair[1], zip(here, there, strict=False)))
+        shared = sum(
+            1
+            for _ in itertools.takewhile(
+                lambda pair: pair[0] == pair[1], zip(here, there, strict=False)
+            )
+        )
         passed += [*reversed(here[max(0, shared - 1) : -1]), *there[shared:]]
     return [file for file, _ in itertools.groupby(file for _, file in passed)]
 
@@ -58,7 +83,10 @@ def crossings(files: list[str]) -> int:
 
 
 def test_a_way_is_counted_by_its_folders() -> None:
-    outer, inner = [(1, "app/a.py"), (2, "config/b.py")], [(1, "app/a.py"), (3, "app/c.py"), (4, "launch/d.py")]
+    outer, inner = (
+        [(1, "app/a.py"), (2, "config/b.py")],
+        [(1, "app/a.py"), (3, "app/c.py"), (4, "launch/d.py")],
+    )
     assert way([outer, inner]) == ["config/b.py", "app/a.py", "app/c.py", "launch/d.py"]
     assert crossings(way([outer, inner])) == 3  # conf, config, app, launch
 
@@ -68,7 +96,8 @@ def test_from_the_yaml_to_the_split(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     calls: Counter[str] = Counter()
 
     def watch(owner: Any, name: str, counts: Callable[..., bool] = lambda *given: True) -> None:
-        """Count the calls of ``owner.name`` whose arguments count, and note the stack at the first."""
+        """Count the calls of ``owner.name`` whose arguments count, and note the stack at the
+        first."""
         real = getattr(owner, name)
 
         def watched(*given: Any, **named: Any) -> Any:
@@ -76,7 +105,15 @@ def test_from_the_yaml_to_the_split(tmp_path: Path, monkeypatch: pytest.MonkeyPa
                 calls[name] += 1
                 if calls[name] == 1:
                     stacks.append(
-                        [*stack(), (0, Path(inspect.getfile(inspect.unwrap(real))).relative_to(PACKAGE).as_posix())]
+                        [
+                            *stack(),
+                            (
+                                0,
+                                Path(inspect.getfile(inspect.unwrap(real)))
+                                .relative_to(PACKAGE)
+                                .as_posix(),
+                            ),
+                        ]
                     )
             return real(*given, **named)
 

@@ -1,7 +1,8 @@
 """A trainer of another program, as small as one can be: it knows nothing of gsbench.
 
-It reads its COLMAP folder with pycolmap, makes a Gaussian of every point, in the colours that the training images have
-there, and writes a 3DGS PLY; or paints the points as seen by the test cameras. MODE says how it fails.
+It reads its COLMAP folder with pycolmap, makes a Gaussian of every point, in the colours that the
+training images have there, and writes a 3DGS PLY; or paints the points as seen by the test cameras.
+MODE says how it fails.
 """
 
 from __future__ import annotations
@@ -35,7 +36,9 @@ COLUMNS = [
 ]
 
 
-def project(image: pycolmap.Image, camera: pycolmap.Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def project(
+    image: pycolmap.Image, camera: pycolmap.Camera, points: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Pixels [P, 2] and depths [P] of world points."""
     matrix = image.cam_from_world().matrix()
     local = points @ matrix[:, :3].T + matrix[:, 3]
@@ -46,7 +49,8 @@ def project(image: pycolmap.Image, camera: pycolmap.Camera, points: np.ndarray) 
 
 
 def colors_of(data: Path, model: pycolmap.Reconstruction, points: np.ndarray) -> np.ndarray:
-    """The median colour of every point [P, 3] in [0, 1] over the training images that look at it."""
+    """The median colour of every point [P, 3] in [0, 1] over the training images that look at
+    it."""
     seen = []
     for image in model.images.values():
         picture = np.asarray(Image.open(data / "images" / image.name)) / 255.0
@@ -54,11 +58,19 @@ def colors_of(data: Path, model: pycolmap.Reconstruction, points: np.ndarray) ->
         assert picture.shape[:2] == (camera.height, camera.width)
         pixels, depth = project(image, camera, points)
         column, row = np.floor(pixels).astype(int).T
-        inside = (depth > 0.01) & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
+        inside = (
+            (depth > 0.01)
+            & (column >= 0)
+            & (row >= 0)
+            & (column < camera.width)
+            & (row < camera.height)
+        )
         values = np.full((len(points), 3), np.nan)
         values[inside] = picture[row[inside], column[inside]]
         seen.append(values)
-    return np.nan_to_num(np.nanmedian(np.stack([*seen, np.full((len(points), 3), 0.5)]), axis=0), nan=0.5)
+    return np.nan_to_num(
+        np.nanmedian(np.stack([*seen, np.full((len(points), 3), 0.5)]), axis=0), nan=0.5
+    )
 
 
 def write_model(path: Path, points: np.ndarray, colors: np.ndarray, mode: str) -> None:
@@ -73,20 +85,25 @@ def write_model(path: Path, points: np.ndarray, colors: np.ndarray, mode: str) -
     header += [f"property float {name}" for name in COLUMNS] + ["end_header", ""]
     body = table.tobytes()
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes("\n".join(header).encode() + (body[: len(body) // 2] if mode == "torn" else body))
+    path.write_bytes(
+        "\n".join(header).encode() + (body[: len(body) // 2] if mode == "torn" else body)
+    )
 
 
 def paint(cameras: Path, output: Path, points: np.ndarray, colors: np.ndarray, mode: str) -> None:
     """The points, far ones first, as squares of 3 px."""
     for frame in json.loads((cameras / "transforms.json").read_text())["frames"]:
-        pose = np.linalg.inv(np.array(frame["transform_matrix"]) @ np.diag([1, -1, -1, 1]))  # world to OpenCV camera
+        # world to OpenCV camera
+        pose = np.linalg.inv(np.array(frame["transform_matrix"]) @ np.diag([1, -1, -1, 1]))
         local = points @ pose[:3, :3].T + pose[:3, 3]
         picture = np.zeros((frame["h"], frame["w"], 3), np.uint8)
         for index in np.argsort(-local[:, 2]):
             if local[index, 2] > 0.1:
                 x = int(frame["fl_x"] * local[index, 0] / local[index, 2] + frame["cx"])
                 y = int(frame["fl_y"] * local[index, 1] / local[index, 2] + frame["cy"])
-                picture[max(0, y - 1) : max(0, y + 2), max(0, x - 1) : max(0, x + 2)] = colors[index] * 255
+                picture[max(0, y - 1) : max(0, y + 2), max(0, x - 1) : max(0, x + 2)] = (
+                    colors[index] * 255
+                )
         output.mkdir(parents=True, exist_ok=True)
         size = (frame["w"] // 2, frame["h"] // 2) if mode == "smaller" else (frame["w"], frame["h"])
         Image.fromarray(picture).resize(size).save(output / frame["file_path"])
@@ -95,12 +112,15 @@ def paint(cameras: Path, output: Path, points: np.ndarray, colors: np.ndarray, m
 
 
 def confess(folder: Path) -> None:
-    """Print every file below ``folder`` that can be seen, and the pixels of those that are pictures, as hashes."""
+    """Print every file below ``folder`` that can be seen, and the pixels of those that are
+    pictures, as hashes."""
     for place, _, files in os.walk(folder, followlinks=True):
         for name in files:
             path = Path(place, name)
             pixels = (
-                hashlib.sha256(np.asarray(Image.open(path)).tobytes()).hexdigest() if name.endswith(".png") else "-"
+                hashlib.sha256(np.asarray(Image.open(path)).tobytes()).hexdigest()
+                if name.endswith(".png")
+                else "-"
             )
             print("saw", path.relative_to(folder).as_posix(), pixels)
 
@@ -116,7 +136,11 @@ def main() -> None:
     parser.add_argument("--iterations", type=int, required=True)
     options = parser.parse_args()
     confess(options.data.parent)
-    print("environment", sorted(name for name in os.environ if name.startswith("GSBENCH")), os.environ.get("PAINTER"))
+    print(
+        "environment",
+        sorted(name for name in os.environ if name.startswith("GSBENCH")),
+        os.environ.get("PAINTER"),
+    )
     model = pycolmap.Reconstruction(options.data / "sparse" / "0")
     print("observations", sum(len(point.track.elements) for point in model.points3D.values()))
     if options.mode == "exit":
@@ -133,7 +157,9 @@ def main() -> None:
     points = points + np.random.default_rng(options.seed).normal(0, 1e-3, points.shape)
     colors = colors_of(options.data, model, points)
     if options.cameras is None:
-        place = options.output / "point_cloud" / f"iteration_{options.iterations}" / "point_cloud.ply"
+        place = (
+            options.output / "point_cloud" / f"iteration_{options.iterations}" / "point_cloud.ply"
+        )
         write_model(place, points, colors, options.mode)
         if options.mode == "two":
             write_model(place.with_name("second.ply"), points, colors, "good")

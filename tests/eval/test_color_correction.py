@@ -1,4 +1,5 @@
-"""The correction of colours before metrics, against numpy's least squares and maps that are known."""
+"""The correction of colours before metrics, against numpy's least squares and maps that are
+known."""
 
 from __future__ import annotations
 
@@ -64,7 +65,9 @@ def test_a_render_of_one_colour_is_finite(value: float) -> None:
     result = corrected(np.full_like(TRUTH, value), TRUTH)
     assert np.isfinite(result).all()
     if value == 0.5:  # the best of one colour is the mean
-        np.testing.assert_allclose(result, np.broadcast_to(TRUTH.mean(axis=(0, 1)), TRUTH.shape), atol=1e-9)
+        np.testing.assert_allclose(
+            result, np.broadcast_to(TRUTH.mean(axis=(0, 1)), TRUTH.shape), atol=1e-9
+        )
     else:  # all pixels are clipped: nothing is known
         np.testing.assert_array_equal(result, value)
 
@@ -76,10 +79,13 @@ def test_the_metrics_are_those_of_the_corrected_render(protocol) -> None:
     darker = (TRUTH * 0.6 * 255 + 0.5).astype(np.uint8)
     photograph = (TRUTH * 255 + 0.5).astype(np.uint8)
     values = evaluator.evaluate_view(darker, photograph)
-    again = evaluator.evaluate_view(torch.from_numpy(by_numpy(darker / 255, photograph / 255)), photograph)
+    again = evaluator.evaluate_view(
+        torch.from_numpy(by_numpy(darker / 255, photograph / 255)), photograph
+    )
     assert values["psnr_cc"] > values["psnr"] + 20
     assert values["cc_gain"] == pytest.approx(values["psnr_cc"] - values["psnr"])
-    assert values["psnr_cc"] == pytest.approx(again["psnr"], abs=2.5)  # `again` is rounded to 8 bits, as a render is
+    # `again` is rounded to 8 bits, as a render is
+    assert values["psnr_cc"] == pytest.approx(again["psnr"], abs=2.5)
     assert values["ssim_cc"] == pytest.approx(again["ssim"], abs=1e-3)
     same = evaluator.evaluate_view(photograph, photograph)
     assert (same["psnr_cc"], same["cc_gain"]) == (100.0, 0.0)

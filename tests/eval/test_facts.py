@@ -1,4 +1,5 @@
-"""The table of metrics: one place that everything asks, and what a user's metric may say of itself."""
+"""The table of metrics: one place that everything asks, and what a user's metric may say of
+itself."""
 
 from __future__ import annotations
 
@@ -102,7 +103,11 @@ def test_missing_weights_are_awaited_and_what_was_not_asked_for_is_not(
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
     evaluator = Evaluator(PAPER, lpips=["vgg", "vgg_raw"], flip=False, download=False)
     assert evaluator.awaited == {"lpips_vgg", "lpips_vgg_raw"}
-    assert evaluator.unavailable.keys() - evaluator.awaited == {"lpips_alex", "lpips_squeeze", "flip"}
+    assert evaluator.unavailable.keys() - evaluator.awaited == {
+        "lpips_alex",
+        "lpips_squeeze",
+        "flip",
+    }
 
 
 @pytest.mark.parametrize(
@@ -127,7 +132,8 @@ def test_what_a_metric_says_of_itself_is_checked(name: str, value: object) -> No
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [("direction", 0), ("decimals", 0), ("decimals", 12), ("unit", ""), ("worthwhile", 1e-9)]
+    ("name", "value"),
+    [("direction", 0), ("decimals", 0), ("decimals", 12), ("unit", ""), ("worthwhile", 1e-9)],
 )
 def test_a_metric_may_say_what_the_rules_allow(name: str, value: object) -> None:
     assert getattr(facts_of("mine", type("Mine", (Brightness,), {name: value})()), name) == value
@@ -143,6 +149,8 @@ def test_the_page_on_metrics_shows_the_table() -> None:
     page = (Path(__file__).parents[2] / "docs" / "metric.md").read_text(encoding="utf-8")
     for facts in (*METRICS, FPS):
         better = {1: "more", -1: "less", 0: ""}[facts.direction]
-        low, high = ("" if bound is None else f"{bound:g}" for bound in (facts.lowest, facts.highest))
+        low, high = (
+            "" if bound is None else f"{bound:g}" for bound in (facts.lowest, facts.highest)
+        )
         cells = (f"`{facts.key}`", facts.name, better, low, high, facts.words)
         assert re.sub(r"\|  (?=\|)", "| ", f"| {' | '.join(cells)} |") in page, facts.key

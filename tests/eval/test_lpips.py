@@ -1,4 +1,5 @@
-"""LPIPS against the published reference value, and its networks against an independent statement of their layers."""
+"""LPIPS against the published reference value, and its networks against an independent statement of
+their layers."""
 
 from __future__ import annotations
 
@@ -17,13 +18,16 @@ State = dict[str, Tensor]
 
 
 def random_weights(net: str, prefix: str = "features.") -> tuple[State, State]:
-    """Weights of the right shapes from a fixed seed: a backbone's, keyed with ``prefix``, and the heads'."""
+    """Weights of the right shapes from a fixed seed: a backbone's, keyed with ``prefix``, and the
+    heads'."""
     generator = torch.Generator().manual_seed(0)
     shapes = {key: value.shape for key, value in BACKBONES[net].build().state_dict().items()}
     features = {}
     for key, shape in shapes.items():
         fan_in = shape[1:].numel() if len(shape) > 1 else 1
-        features[prefix + key] = torch.randn(shape, generator=generator) * (2 / fan_in) ** 0.5 * (len(shape) > 1)
+        features[prefix + key] = (
+            torch.randn(shape, generator=generator) * (2 / fan_in) ** 0.5 * (len(shape) > 1)
+        )
     heads = {
         f"lin{k}.model.1.weight": torch.rand(1, channels, 1, 1, generator=generator)
         for k, channels in enumerate(BACKBONES[net].channels)
@@ -32,13 +36,16 @@ def random_weights(net: str, prefix: str = "features.") -> tuple[State, State]:
 
 
 def vgg_taps(x: Tensor, w: State) -> list[Tensor]:
-    """VGG16 after relu1_2, relu2_2, relu3_3, relu4_3 and relu5_3, written by torchvision's layer numbers."""
+    """VGG16 after relu1_2, relu2_2, relu3_3, relu4_3 and relu5_3, written by torchvision's layer
+    numbers."""
     taps = []
     for block in ([0, 2], [5, 7], [10, 12, 14], [17, 19, 21], [24, 26, 28]):
         if block[0] > 0:
             x = F.max_pool2d(x, 2, 2)
         for index in block:
-            x = F.relu(F.conv2d(x, w[f"features.{index}.weight"], w[f"features.{index}.bias"], padding=1))
+            x = F.relu(
+                F.conv2d(x, w[f"features.{index}.weight"], w[f"features.{index}.bias"], padding=1)
+            )
         taps.append(x)
     return taps
 
@@ -55,17 +62,24 @@ def alex_taps(x: Tensor, w: State) -> list[Tensor]:
     ):
         if pool:
             x = F.max_pool2d(x, 3, 2)
-        x = F.relu(F.conv2d(x, w[f"features.{index}.weight"], w[f"features.{index}.bias"], stride, padding))
+        x = F.relu(
+            F.conv2d(x, w[f"features.{index}.weight"], w[f"features.{index}.bias"], stride, padding)
+        )
         taps.append(x)
     return taps
 
 
 def textbook_lpips(first: Tensor, second: Tensor, taps, features: State, heads: State) -> Tensor:
-    """The definition of LPIPS v0.1 on batches [B, 3, H, W] in [-1, 1], with 1x1 convolutions as heads."""
+    """The definition of LPIPS v0.1 on batches [B, 3, H, W] in [-1, 1], with 1x1 convolutions as
+    heads."""
     shift = torch.tensor([-0.030, -0.088, -0.188]).view(1, 3, 1, 1)
     scale = torch.tensor([0.458, 0.448, 0.450]).view(1, 3, 1, 1)
     total = torch.zeros(len(first))
-    pairs = zip(taps((first - shift) / scale, features), taps((second - shift) / scale, features), strict=True)
+    pairs = zip(
+        taps((first - shift) / scale, features),
+        taps((second - shift) / scale, features),
+        strict=True,
+    )
     for k, (a, b) in enumerate(pairs):
         a = a / (a.pow(2).sum(1, keepdim=True).sqrt() + 1e-10)
         b = b / (b.pow(2).sum(1, keepdim=True).sqrt() + 1e-10)

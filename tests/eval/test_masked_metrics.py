@@ -26,7 +26,9 @@ def pair() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def evaluator(protocol=STANDARD, shared=None, **options) -> Evaluator:
     weights = None if shared is None else shared / "weights"
-    return Evaluator(protocol, lpips=["squeeze"] if shared else [], weights=weights, download=False, **options)
+    return Evaluator(
+        protocol, lpips=["squeeze"] if shared else [], weights=weights, download=False, **options
+    )
 
 
 def test_psnr_is_of_the_pixels_that_count(pair) -> None:
@@ -43,7 +45,13 @@ def test_ssim_is_scikit_images_map_where_pixels_count(pair, protocol, inside) ->
     border = 0 if inside else 5
     images = [np.pad(x, ((border, border), (border, border), (0, 0))) for x in (shown, truth / 255)]
     _, full = structural_similarity(
-        *images, gaussian_weights=True, sigma=1.5, use_sample_covariance=False, channel_axis=-1, data_range=1, full=True
+        *images,
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+        channel_axis=-1,
+        data_range=1,
+        full=True,
     )
     full = full[5:-5, 5:-5]
     counts = mask[5:-5, 5:-5] if inside else mask
@@ -55,7 +63,9 @@ def test_not_one_metric_sees_what_is_under_the_mask(pair, shared) -> None:
     render, truth, mask = pair
     noisy = np.where(mask[..., None], render, 255 - render)
     more = ["gmsd", "fsim"]
-    one, other = (evaluator(shared=shared, more=more).evaluate_view(x, truth, mask) for x in (render, noisy))
+    one, other = (
+        evaluator(shared=shared, more=more).evaluate_view(x, truth, mask) for x in (render, noisy)
+    )
     assert one.keys() >= {"psnr", "ssim", "lpips_squeeze", "flip", "gmsd", "fsim"}
     assert one == other
     assert one != evaluator(shared=shared, more=more).evaluate_view(render, truth)
@@ -80,14 +90,18 @@ def test_ignoring_what_is_perfect_makes_a_view_worse_and_what_is_bad_better(pair
 
 
 def test_lpips_of_a_mask_is_the_mean_of_its_maps_where_pixels_count(shared) -> None:
-    """Two pictures side by side, far enough apart for the network: the mask chooses the distance of one of them."""
+    """Two pictures side by side, far enough apart for the network: the mask chooses the distance of
+    one of them."""
     rng = np.random.default_rng(3)
     network = load_lpips("squeeze", shared / "weights", download=False)
     left, right = torch.rand(2, 1, 3, 256, 256, generator=torch.Generator().manual_seed(1)) * 2 - 1
     other = (left + torch.from_numpy(rng.normal(0, 0.4, left.shape)).float()).clamp(-1, 1)
     first, second = torch.cat([left, right], -1), torch.cat([other, right], -1)
     alone = float(network(left, other))
-    for chosen, wanted in (((slice(None), slice(0, 256)), alone), ((slice(None), slice(256, 512)), 0.0)):
+    for chosen, wanted in (
+        ((slice(None), slice(0, 256)), alone),
+        ((slice(None), slice(256, 512)), 0.0),
+    ):
         mask = torch.zeros(256, 512, dtype=torch.bool)
         mask[chosen] = True
         assert float(network(first, second, mask)) == pytest.approx(wanted, abs=0.03 * alone)
@@ -118,5 +132,7 @@ def test_an_own_metric_gets_the_mask_if_it_asks(pair) -> None:
             assert torch.equal(image[mask], torch.from_numpy(render)[mask] / 255)
             return float((image - truth).abs()[mask].mean())
 
-    found = evaluator(extra={"plain": Plain(), "masked": Masked()}).evaluate_view(render, truth, mask)
+    found = evaluator(extra={"plain": Plain(), "masked": Masked()}).evaluate_view(
+        render, truth, mask
+    )
     assert found["plain"] == pytest.approx(found["masked"] * mask.mean(), rel=1e-5)

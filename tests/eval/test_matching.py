@@ -26,12 +26,24 @@ PHOTOGRAPHS = ["DSC08000.JPG", "DSC08008.JPG", "DSC08016.JPG"]
             ["render_DSC08000_rgb.png", "render_DSC08008_rgb.png", "render_DSC08016_rgb.png"],
             "apart from what all names begin or end with",
         ),
-        (["gt_1.png", "gt_2.png"], ["pred_1.png", "pred_2.png"], "apart from what all names begin or end with"),
+        (
+            ["gt_1.png", "gt_2.png"],
+            ["pred_1.png", "pred_2.png"],
+            "apart from what all names begin or end with",
+        ),
         (["0007.png", "0012.png"], ["7.png", "12.png"], "apart from leading zeros"),
         (["v0007.png", "v0012.png"], ["r_07.jpg", "r_12.jpg"], "apart from leading zeros"),
-        (["cam/07.png", "cam/12.png"], ["07.png", "12.png"], "apart from what all names begin or end with"),
+        (
+            ["cam/07.png", "cam/12.png"],
+            ["07.png", "12.png"],
+            "apart from what all names begin or end with",
+        ),
         (["cam/x/07.png", "cam/y/12.png"], ["07.png", "12.png"], "apart from folders"),
-        (["cam/x/07.png", "cam/y/12.png"], ["r7.png", "r12.png"], "apart from folders and leading zeros"),
+        (
+            ["cam/x/07.png", "cam/y/12.png"],
+            ["r7.png", "r12.png"],
+            "apart from folders and leading zeros",
+        ),
     ],
 )
 def test_rules(photographs: list[str], pictures: list[str], rule: str) -> None:
@@ -52,16 +64,30 @@ def test_renders_of_training_views_are_left_out_and_named() -> None:
 @pytest.mark.parametrize(
     ("photographs", "pictures", "words"),
     [
-        (["a.JPG", "b.JPG"], ["a.png", "a.jpg", "b.png"], "a.jpg, a.png all fit the photograph a.JPG"),
-        (["1.png", "2.png"], ["01.png", "1.png", "002.png"], "01.png, 1.png all fit the photograph 1.png"),
-        (["10.png", "11.png"], ["20.png", "21.png"], "2 of 2 photographs have no picture .*--by-order"),
+        (
+            ["a.JPG", "b.JPG"],
+            ["a.png", "a.jpg", "b.png"],
+            "a.jpg, a.png all fit the photograph a.JPG",
+        ),
+        (
+            ["1.png", "2.png"],
+            ["01.png", "1.png", "002.png"],
+            "01.png, 1.png all fit the photograph 1.png",
+        ),
+        (
+            ["10.png", "11.png"],
+            ["20.png", "21.png"],
+            "2 of 2 photographs have no picture .*--by-order",
+        ),
         (["10.png", "11.png"], ["0.png", "1.png"], "--by-order"),
         (PHOTOGRAPHS, ["DSC08000.png", "DSC08008.png"], r"1 of 3 photographs .*\(DSC08016.JPG\)"),
         (PHOTOGRAPHS, [], "3 of 3 photographs .*there are none"),
         (["view7.png"], ["other.png"], "1 of 1 photograph have no picture"),
     ],
 )
-def test_what_does_not_match_is_an_error(photographs: list[str], pictures: list[str], words: str) -> None:
+def test_what_does_not_match_is_an_error(
+    photographs: list[str], pictures: list[str], words: str
+) -> None:
     with pytest.raises(InputError, match=words):
         match_pictures(photographs, pictures)
 
@@ -79,7 +105,9 @@ def test_by_order_is_by_number() -> None:
     prefix=st.sampled_from(["", "IMG_", "frame-", "cam/"]),
     width=st.integers(1, 6),
 )
-def test_a_match_is_always_of_equal_numbers(numbers: set[int], wrong: set[int], prefix: str, width: int) -> None:
+def test_a_match_is_always_of_equal_numbers(
+    numbers: set[int], wrong: set[int], prefix: str, width: int
+) -> None:
     photographs = [f"{prefix}{number:05d}.JPG" for number in sorted(numbers)]
     pictures = [f"{number:0{width}d}.png" for number in sorted(wrong)]
     try:

@@ -14,7 +14,9 @@ from gsbench.eval.metrics import flip, flip_map, psnr
 from gsbench.eval.ssim import ssim
 
 
-def distorted_pair(height: int = 40, width: int = 53, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+def distorted_pair(
+    height: int = 40, width: int = 53, seed: int = 0
+) -> tuple[np.ndarray, np.ndarray]:
     """A smooth image and a noisy copy, [H, W, 3] float64 in [0, 1]."""
     rng = np.random.default_rng(seed)
     rows, columns = np.mgrid[0:height, 0:width]
@@ -37,7 +39,10 @@ def brute_force_ssim(x: np.ndarray, y: np.ndarray) -> float:
                 a = x[row : row + 11, column : column + 11, channel]
                 b = y[row : row + 11, column : column + 11, channel]
                 mean_a, mean_b = (window * a).sum(), (window * b).sum()
-                var_a, var_b = (window * (a - mean_a) ** 2).sum(), (window * (b - mean_b) ** 2).sum()
+                var_a, var_b = (
+                    (window * (a - mean_a) ** 2).sum(),
+                    (window * (b - mean_b) ** 2).sum(),
+                )
                 cov = (window * (a - mean_a) * (b - mean_b)).sum()
                 values.append(
                     (2 * mean_a * mean_b + 1e-4)
@@ -54,11 +59,14 @@ def test_psnr_matches_scikit_image() -> None:
 
 
 def test_psnr_is_one_value_per_image_over_all_channels() -> None:
-    # Channel errors of 0.1, 0.2 and 0 give mse (0.01 + 0.04) / 3; a mean of per-channel PSNRs would be infinite.
+    # Channel errors of 0.1, 0.2 and 0 give mse (0.01 + 0.04) / 3; a mean of per-channel PSNRs would
+    # be infinite.
     target = torch.zeros(2, 3, 4, 5, dtype=torch.float64)
     image = target.clone()
     image[0, 0], image[0, 1], image[1] = 0.1, 0.2, 1.0
-    assert psnr(image, target).tolist() == pytest.approx([-10 * math.log10(0.05 / 3), 0.0], abs=1e-9)
+    assert psnr(image, target).tolist() == pytest.approx(
+        [-10 * math.log10(0.05 / 3), 0.0], abs=1e-9
+    )
 
 
 def test_psnr_of_identical_images_is_infinite() -> None:
@@ -70,17 +78,30 @@ def test_psnr_of_identical_images_is_infinite() -> None:
 def test_ssim_valid_matches_scikit_image(seed: int) -> None:
     x, y = distorted_pair(seed=seed)
     expected = structural_similarity(
-        x, y, channel_axis=2, data_range=1.0, gaussian_weights=True, sigma=1.5, use_sample_covariance=False
+        x,
+        y,
+        channel_axis=2,
+        data_range=1.0,
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
     )
-    assert float(ssim(torch.tensor(y), torch.tensor(x), "valid")) == pytest.approx(expected, abs=1e-9)
-    assert float(ssim(torch.tensor(y).float(), torch.tensor(x).float(), "valid")) == pytest.approx(expected, abs=1e-5)
+    assert float(ssim(torch.tensor(y), torch.tensor(x), "valid")) == pytest.approx(
+        expected, abs=1e-9
+    )
+    assert float(ssim(torch.tensor(y).float(), torch.tensor(x).float(), "valid")) == pytest.approx(
+        expected, abs=1e-5
+    )
 
 
 def test_ssim_zero_padding_matches_brute_force() -> None:
     x, y = distorted_pair(14, 17)
     expected = brute_force_ssim(x, y)
-    assert float(ssim(torch.tensor(y), torch.tensor(x), "zero")) == pytest.approx(expected, abs=1e-10)
-    assert abs(expected - float(ssim(torch.tensor(y), torch.tensor(x), "valid"))) > 1e-3  # the two conventions differ
+    assert float(ssim(torch.tensor(y), torch.tensor(x), "zero")) == pytest.approx(
+        expected, abs=1e-10
+    )
+    # the two conventions differ
+    assert abs(expected - float(ssim(torch.tensor(y), torch.tensor(x), "valid"))) > 1e-3
 
 
 def test_a_batch_gives_the_values_of_its_images() -> None:
@@ -107,10 +128,17 @@ def test_flip_depends_on_the_viewing_distance() -> None:
 
 
 @pytest.mark.parametrize(
-    ("shape", "other"), [((4, 5, 3), (4, 6, 3)), ((3, 4, 5), (3, 4, 5)), ((2, 1, 4, 5), (2, 1, 4, 5))]
+    ("shape", "other"),
+    [((4, 5, 3), (4, 6, 3)), ((3, 4, 5), (3, 4, 5)), ((2, 1, 4, 5), (2, 1, 4, 5))],
 )
 def test_wrong_shapes_are_refused(shape: tuple[int, ...], other: tuple[int, ...]) -> None:
-    for metric in (psnr, ssim, flip, flip_map, lambda x, y: ssim(x, y, mask=torch.ones(4, 5, dtype=torch.bool))):
+    for metric in (
+        psnr,
+        ssim,
+        flip,
+        flip_map,
+        lambda x, y: ssim(x, y, mask=torch.ones(4, 5, dtype=torch.bool)),
+    ):
         words = "image" if shape == other else f"{shape} and {other}"
         with pytest.raises(ValueError, match=re.escape(words)):
             metric(torch.zeros(shape), torch.zeros(other))

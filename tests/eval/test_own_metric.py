@@ -28,21 +28,36 @@ class Own:
 
 
 def measured(value: Any) -> dict[str, float]:
-    return Evaluator(get_protocol("paper"), lpips=(), flip=False, extra={"own": Own(value)}).evaluate_view(IMAGE, IMAGE)
+    return Evaluator(
+        get_protocol("paper"), lpips=(), flip=False, extra={"own": Own(value)}
+    ).evaluate_view(IMAGE, IMAGE)
 
 
 @pytest.mark.parametrize(
-    "value", [2, 2.0, np.float32(2), np.int64(2), np.array(2.0), np.array([2.0]), torch.tensor(2.0), torch.tensor([2])]
+    "value",
+    [
+        2,
+        2.0,
+        np.float32(2),
+        np.int64(2),
+        np.array(2.0),
+        np.array([2.0]),
+        torch.tensor(2.0),
+        torch.tensor([2]),
+    ],
 )
 def test_any_number_will_do(value: Any) -> None:
     assert measured(value)["own"] == 2.0
 
 
 @pytest.mark.parametrize(
-    "value", ["2.0", "good", b"2", True, None, 2j, [2.0], {}, np.zeros(2), torch.zeros(2), np.array("2")]
+    "value",
+    ["2.0", "good", b"2", True, None, 2j, [2.0], {}, np.zeros(2), torch.zeros(2), np.array("2")],
 )
 def test_what_is_no_number_is_named(value: Any) -> None:
-    with pytest.raises(InputError, match=r"eval\.extra\.own must return a number for each view, got "):
+    with pytest.raises(
+        InputError, match=r"eval\.extra\.own must return a number for each view, got "
+    ):
         measured(value)
 
 
@@ -70,10 +85,19 @@ def failing() -> Any:
 @pytest.mark.parametrize(
     ("fall", "said"),
     [
-        (failing, r"eval\.extra\.own raised RuntimeError two lines \(.*test_own_metric\.py, line \d+\)"),
+        (
+            failing,
+            r"eval\.extra\.own raised RuntimeError two lines \(.*test_own_metric\.py, line \d+\)",
+        ),
         (endless, r"eval\.extra\.own raised RecursionError .*test_own_metric\.py"),
-        (lambda: 10**400, r"eval\.extra\.own must return a number for each view, got one beyond all bounds"),
-        (lambda: 10**5000, r"eval\.extra\.own must return a number for each view, got one beyond all bounds"),
+        (
+            lambda: 10**400,
+            r"eval\.extra\.own must return a number for each view, got one beyond all bounds",
+        ),
+        (
+            lambda: 10**5000,
+            r"eval\.extra\.own must return a number for each view, got one beyond all bounds",
+        ),
     ],
 )
 def test_a_metric_that_falls_is_named_in_one_line(fall: Callable[[], Any], said: str) -> None:

@@ -30,7 +30,9 @@ def test_the_metrics_are_of_the_files_pixels(pairs: list[PicturePair]) -> None:
     per_view = measure(pairs, Evaluator(PAPER, lpips=(), flip=False))
     assert list(per_view) == ["b", "a"]
     for pair in pairs:
-        render, truth = (np.asarray(Image.open(path), dtype=float) for path in (pair.picture, pair.photograph))
+        render, truth = (
+            np.asarray(Image.open(path), dtype=float) for path in (pair.picture, pair.photograph)
+        )
         expected = 10 * np.log10(255**2 / ((render - truth) ** 2).mean())
         # the pixels are single precision before they are squared
         assert per_view[pair.view]["psnr"] == pytest.approx(expected, abs=1e-6)
@@ -38,7 +40,9 @@ def test_the_metrics_are_of_the_files_pixels(pairs: list[PicturePair]) -> None:
 
 def test_sizes_are_never_changed(pairs: list[PicturePair]) -> None:
     Image.open(pairs[1].picture).resize((25, 20)).save(pairs[1].picture)
-    with pytest.raises(InputError, match=r"a_render\.png is 25x20 px, but its photograph .*a.png 50x40"):
+    with pytest.raises(
+        InputError, match=r"a_render\.png is 25x20 px, but its photograph .*a.png 50x40"
+    ):
         measure(pairs, Evaluator(PAPER, lpips=(), flip=False))
 
 

@@ -36,7 +36,9 @@ def test_identifiers_are_named_and_versioned() -> None:
 
 
 def test_quantize_rounds_half_up_and_clamps() -> None:
-    image = torch.tensor([-0.1, 0.0, 0.499 / 255, 0.5 / 255, 1.49 / 255, 0.5, 254.6 / 255, 1.0, 1.7])
+    image = torch.tensor(
+        [-0.1, 0.0, 0.499 / 255, 0.5 / 255, 1.49 / 255, 0.5, 254.6 / 255, 1.0, 1.7]
+    )
     assert quantize(image).tolist() == [0, 0, 0, 1, 1, 128, 255, 255, 255]
 
 
@@ -68,14 +70,21 @@ def test_missing_weights_are_named_and_nothing_stands_in_for_them() -> None:
     evaluator = Evaluator(PAPER, lpips=["vgg_raw", "vgg"], download=False)
     image = np.zeros((32, 32, 3), dtype=np.uint8)
     assert set(evaluator.evaluate_view(image, image)) == {"psnr", "ssim", "flip"}
-    assert set(evaluator.unavailable) == {"lpips_vgg_raw", "lpips_vgg", "lpips_alex", "lpips_squeeze"}
+    assert set(evaluator.unavailable) == {
+        "lpips_vgg_raw",
+        "lpips_vgg",
+        "lpips_alex",
+        "lpips_squeeze",
+    }
     assert "vgg16-397923af.pth" in evaluator.unavailable["lpips_vgg_raw"]
     assert "not asked for" in evaluator.unavailable["lpips_alex"]
     assert not any("\n" in reason for reason in evaluator.unavailable.values())
 
 
 @pytest.mark.shared
-def test_lpips_variants_see_the_range_that_their_name_says(shared: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_lpips_variants_see_the_range_that_their_name_says(
+    shared: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     squeeze = find_metric("lpips_squeeze")
     raw = replace(squeeze, key="lpips_squeeze_raw")
     assert evaluator_module.MEASURES["lpips_vgg_raw"].keywords == {"net": "vgg", "raw": True}
@@ -83,7 +92,9 @@ def test_lpips_variants_see_the_range_that_their_name_says(shared: Path, monkeyp
     monkeypatch.setitem(evaluator_module.MEASURES, raw.key, like_vgg_raw)
     monkeypatch.setattr(facts, "METRICS", (squeeze, raw))
     monkeypatch.setattr(evaluator_module, "METRICS", (squeeze, raw))
-    evaluator = Evaluator(PAPER, lpips=["squeeze", "squeeze_raw"], flip=False, weights=shared / "weights")
+    evaluator = Evaluator(
+        PAPER, lpips=["squeeze", "squeeze_raw"], flip=False, weights=shared / "weights"
+    )
     rng = np.random.default_rng(0)
     render, truth = rng.integers(0, 256, (2, 40, 40, 3), dtype=np.uint8)
     values = evaluator.evaluate_view(render, truth)
@@ -96,13 +107,17 @@ def test_lpips_variants_see_the_range_that_their_name_says(shared: Path, monkeyp
 
 @pytest.mark.shared
 def test_a_view_too_small_for_a_network_is_said(shared: Path) -> None:
-    evaluator = Evaluator(PAPER, lpips=["squeeze"], flip=False, weights=shared / "weights", download=False)
+    evaluator = Evaluator(
+        PAPER, lpips=["squeeze"], flip=False, weights=shared / "weights", download=False
+    )
     image = np.zeros((16, 40, 3), dtype=np.uint8)
     assert "lpips_squeeze" not in evaluator.evaluate_view(image, image)
     assert evaluator.unavailable["lpips_squeeze"] == "a view is 40x16 px, below 17 px a side"
 
 
-def test_without_the_flip_package_the_metric_is_unavailable(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_the_flip_package_the_metric_is_unavailable(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setitem(sys.modules, "flip_evaluator", None)
     evaluator = Evaluator(PAPER, lpips=[])
     image = np.zeros((16, 16, 3), dtype=np.uint8)

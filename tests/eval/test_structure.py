@@ -1,4 +1,5 @@
-"""MS-SSIM, IW-SSIM, FSIM and GMSD against piq, restatements with scipy and scikit-image, and values by hand."""
+"""MS-SSIM, IW-SSIM, FSIM and GMSD against piq, restatements with scipy and scikit-image, and values
+by hand."""
 
 from __future__ import annotations
 
@@ -20,7 +21,14 @@ from gsbench.eval.evaluator import Evaluator
 from gsbench.eval.facts import METRICS, further_keys
 from gsbench.eval.metrics import gmsd
 from gsbench.eval.protocol import PAPER
-from gsbench.eval.structure import MULTISCALE_MIN_SIZE, SCALE_WEIGHTS, fsim, iw_ssim, ms_ssim, phase_congruency
+from gsbench.eval.structure import (
+    MULTISCALE_MIN_SIZE,
+    SCALE_WEIGHTS,
+    fsim,
+    iw_ssim,
+    ms_ssim,
+    phase_congruency,
+)
 
 FUNCTIONS = {"ms_ssim": ms_ssim, "iw_ssim": iw_ssim, "fsim": fsim, "gmsd": gmsd}
 PEERS = {
@@ -30,8 +38,9 @@ PEERS = {
     "gmsd": "gmsd.gmsd",
 }
 ODD = (201, 180)  # px, height and width
-# piq 0.8.0 of the pairs below, in the order of PEERS. It is no dependency of the tests, since it asks for torchvision;
-# where it is installed (pip install --no-deps piq), the values are computed again.
+# piq 0.8.0 of the pairs below, in the order of PEERS. It is no dependency of the tests, since it
+# asks for torchvision; where it is installed (pip install --no-deps piq), the values are computed
+# again.
 PIQ = {
     ((176, 208), "noise"): (0.855058, 0.918725, 0.795243, 0.094648),
     ((176, 208), "blur"): (0.975246, 0.947219, 0.892405, 0.071217),
@@ -45,7 +54,8 @@ PIQ = {
 
 @pytest.fixture(scope="module")
 def peer() -> Iterator[Callable[[str], Callable[..., torch.Tensor]]]:
-    """piq's function for a metric. Its modules are loaded one by one: the package as a whole wants torchvision."""
+    """piq's function for a metric. Its modules are loaded one by one: the package as a whole wants
+    torchvision."""
     spec = importlib.util.find_spec("piq")
     if spec is None:
         pytest.skip("piq is not installed")
@@ -79,40 +89,60 @@ def test_agrees_with_piq(case: tuple[tuple[int, int], str]) -> None:
     image, truth = pair(*case[0], case[1])
     for key, expected in zip(PEERS, PIQ[case], strict=True):
         if key == "ms_ssim" and case[0] == ODD:
-            continue  # piq lengthens odd sides at their beginning; a test below restates what the authors do
+            # piq lengthens odd sides at their beginning; a test below restates what the authors do
+            continue
         assert float(FUNCTIONS[key](image, truth)) == pytest.approx(expected, abs=1e-4), key
 
 
 @pytest.mark.parametrize("case", PIQ, ids=str)
-def test_the_values_noted_here_are_those_of_piq(case: tuple[tuple[int, int], str], peer: Callable) -> None:
+def test_the_values_noted_here_are_those_of_piq(
+    case: tuple[tuple[int, int], str], peer: Callable
+) -> None:
     images = (x.permute(2, 0, 1).unsqueeze(0) for x in pair(*case[0], case[1]))
     first, second = images
-    assert [float(peer(key)(first, second, data_range=1.0)) for key in PEERS] == pytest.approx(PIQ[case], abs=1e-6)
+    assert [float(peer(key)(first, second, data_range=1.0)) for key in PEERS] == pytest.approx(
+        PIQ[case], abs=1e-6
+    )
 
 
 @pytest.mark.parametrize("size", [(161, 170), (187, 161), (192, 192)], ids=str)
 def test_ms_ssim_halves_as_its_authors_do(size: tuple[int, int]) -> None:
-    """Their ``imfilter(image, ones(2) / 4, 'symmetric')`` and every other pixel, restated with scipy; SSIM itself is
-    scikit-image's, and contrast and structure are its quotient by luminance."""
+    """Their ``imfilter(image, ones(2) / 4, 'symmetric')`` and every other pixel, restated with
+    scipy; SSIM itself is scikit-image's, and contrast and structure are its quotient by
+    luminance."""
     image, truth = (x.numpy() for x in pair(*size))
     products = []
     for channel in range(3):
         x, y, product = image[..., channel], truth[..., channel], 1.0
         for scale, weight in enumerate(SCALE_WEIGHTS):
-            options = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "data_range": 1.0}
+            options = {
+                "gaussian_weights": True,
+                "sigma": 1.5,
+                "use_sample_covariance": False,
+                "data_range": 1.0,
+            }
             full = structural_similarity(x, y, full=True, **options)[1]
-            mean_x, mean_y = (ndimage.gaussian_filter(z, 1.5, truncate=3.5, mode="reflect") for z in (x, y))
+            mean_x, mean_y = (
+                ndimage.gaussian_filter(z, 1.5, truncate=3.5, mode="reflect") for z in (x, y)
+            )
             luminance = (2 * mean_x * mean_y + 1e-4) / (mean_x**2 + mean_y**2 + 1e-4)
             compared = full if scale == 4 else full / luminance
             product *= compared[5:-5, 5:-5].mean() ** weight
-            x, y = (ndimage.correlate(z, np.full((2, 2), 0.25), mode="reflect", origin=-1)[::2, ::2] for z in (x, y))
+            x, y = (
+                ndimage.correlate(z, np.full((2, 2), 0.25), mode="reflect", origin=-1)[::2, ::2]
+                for z in (x, y)
+            )
         products.append(product)
-    assert float(ms_ssim(*map(torch.tensor, (image, truth)))) == pytest.approx(np.mean(products), abs=1e-7)
+    assert float(ms_ssim(*map(torch.tensor, (image, truth)))) == pytest.approx(
+        np.mean(products), abs=1e-7
+    )
 
 
 def test_gmsd_by_hand() -> None:
-    """A vertical edge of height 1 against none, as [2, 4] after halving: its similarity is c / (m² + c) where m is not
-    0. Zeros outside make an edge all round the black picture's partner too, so both have black borders."""
+    """A vertical edge of height 1 against none, as [2, 4] after halving: its similarity is c / (m²
+    + c) where m is not
+    0. Zeros outside make an edge all round the black picture's partner too, so both have black
+       borders."""
     truth = torch.zeros(12, 12, 3, dtype=torch.float64)
     image = truth.clone()
     image[4:8, 4:8] = 0.5  # 2x2 px of 0.5 in 6x6
@@ -129,7 +159,9 @@ def test_phase_congruency_does_not_depend_on_contrast() -> None:
     """What it is for (Kovesi 1999): an edge is one whatever its height, and noise is none."""
     rows = torch.zeros(128, 128, dtype=torch.float64)
     rows[64:] = 1.0
-    rows += 0.02 * torch.randn(rows.shape, generator=torch.Generator().manual_seed(0), dtype=rows.dtype)
+    rows += 0.02 * torch.randn(
+        rows.shape, generator=torch.Generator().manual_seed(0), dtype=rows.dtype
+    )
     low, high = (phase_congruency((40 + step * rows)[None, None])[0, 0] for step in (20.0, 200.0))
     assert torch.allclose(low, high, atol=1e-3)
     assert high[63:65].mean() > 0.5 > 5 * high[28:36].mean()
@@ -140,7 +172,9 @@ def test_identical_images_are_best_and_worse_ones_worse(key: str) -> None:
     facts = next(facts for facts in METRICS if facts.key == key)
     image, truth = pair(176, 180)
     best = float(FUNCTIONS[key](truth, truth))
-    values = [float(FUNCTIONS[key](truth + share * (image - truth), truth)) for share in (0.25, 0.5, 1.0)]
+    values = [
+        float(FUNCTIONS[key](truth + share * (image - truth), truth)) for share in (0.25, 0.5, 1.0)
+    ]
     assert best == pytest.approx(facts.highest if facts.direction > 0 else facts.lowest, abs=1e-9)
     assert [best, *values] == sorted([best, *values], reverse=facts.direction > 0)
     assert all(facts.lowest <= value <= facts.highest for value in values)
@@ -154,7 +188,9 @@ def test_a_batch_gives_the_values_of_its_images(key: str) -> None:
     assert FUNCTIONS[key](first, second).tolist() == pytest.approx(single, abs=1e-9)
 
 
-@pytest.mark.parametrize(("key", "smallest"), [("ms_ssim", 161), ("iw_ssim", 161), ("fsim", 16), ("gmsd", 2)])
+@pytest.mark.parametrize(
+    ("key", "smallest"), [("ms_ssim", 161), ("iw_ssim", 161), ("fsim", 16), ("gmsd", 2)]
+)
 def test_what_is_too_small_is_refused_and_reported(key: str, smallest: int) -> None:
     assert MULTISCALE_MIN_SIZE == 161
     with pytest.raises(ValueError, match=f"at least {smallest} px"):
@@ -165,7 +201,9 @@ def test_what_is_too_small_is_refused_and_reported(key: str, smallest: int) -> N
         render, truth = rng.integers(0, 256, (2, max(side, 1), 170, 3), dtype=np.uint8)
         assert (key in evaluator.evaluate_view(render, truth)) is there
         assert (key in evaluator.unavailable) is not there
-    assert evaluator.unavailable[key] == f"a view is 170x{smallest - 1} px, below {smallest} px a side"
+    assert (
+        evaluator.unavailable[key] == f"a view is 170x{smallest - 1} px, below {smallest} px a side"
+    )
     assert key not in evaluator.awaited
 
 

@@ -61,23 +61,38 @@ def test_the_training_folder_as_pycolmap_reads_it(views: list[View], tmp_path: P
     named = {image.name: image for image in model.images.values()}
     assert sorted(named) == ["a.png", "c.png", "left__b.png"]
     for view, name in zip(views, ("a.png", "left__b.png", "c.png"), strict=True):
-        np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "images" / name)), view.image)
+        np.testing.assert_array_equal(
+            np.asarray(Image.open(tmp_path / "images" / name)), view.image
+        )
         assert model.cameras[named[name].camera_id].model_name == "PINHOLE"
         ahead = named[name].cam_from_world().inverse() * np.array([0.3, -0.2, 5.0])
-        np.testing.assert_allclose(named[name].project_point(ahead), project(view.camera, ahead[None])[0], atol=1e-6)
+        np.testing.assert_allclose(
+            named[name].project_point(ahead), project(view.camera, ahead[None])[0], atol=1e-6
+        )
 
 
 def test_test_cameras_have_no_pixel_and_project_alike(views: list[View], tmp_path: Path) -> None:
     write_test_cameras(tmp_path, views)
     files = {path.name for path in tmp_path.rglob("*") if path.is_file()}
-    assert files == {"transforms.json", "cameras.bin", "images.bin", "points3D.bin", "rigs.bin", "frames.bin"}
+    assert files == {
+        "transforms.json",
+        "cameras.bin",
+        "images.bin",
+        "points3D.bin",
+        "rigs.bin",
+        "frames.bin",
+    }
     frames = json.loads((tmp_path / "transforms.json").read_text())["frames"]
     for view, frame in zip(views, frames, strict=True):
         points = view.camera.center + np.random.default_rng(2).normal(size=(20, 3))
-        local = np.linalg.inv(frame["transform_matrix"]) @ np.column_stack([points, np.ones(20)]).T  # OpenGL's axes
+        # OpenGL's axes
+        local = np.linalg.inv(frame["transform_matrix"]) @ np.column_stack([points, np.ones(20)]).T
         seen = local[2] < 0  # it looks along -z, y is up
         pixels = np.column_stack(
-            [frame["cx"] - frame["fl_x"] * local[0] / local[2], frame["cy"] + frame["fl_y"] * local[1] / local[2]]
+            [
+                frame["cx"] - frame["fl_x"] * local[0] / local[2],
+                frame["cy"] + frame["fl_y"] * local[1] / local[2],
+            ]
         )
         assert 0 < seen.sum() < 20
         np.testing.assert_allclose(pixels[seen], project(view.camera, points)[seen], atol=1e-6)
@@ -86,7 +101,8 @@ def test_test_cameras_have_no_pixel_and_project_alike(views: list[View], tmp_pat
 
 def test_placeholders() -> None:
     assert split_command("a 'b c' {d}", "x") == ["a", "b c", "{d}"]
-    assert fill_placeholders("{a}-{b}-{a}", {"a": "{b}", "b": 2}, "x") == "{b}-2-{b}"  # each is replaced once
+    # each is replaced once
+    assert fill_placeholders("{a}-{b}-{a}", {"a": "{b}", "b": 2}, "x") == "{b}-2-{b}"
     for command, said in (("", "x is empty"), ("'a", "cannot be split")):
         with pytest.raises(InputError, match=said):
             split_command(command, "x")
@@ -95,7 +111,12 @@ def test_placeholders() -> None:
 
 
 def test_yaml_of_the_original_code_hands_our_schedule_on() -> None:
-    words = ["densify=external/3dgs", "densify.options.code=/code", "densify.version='1'", "allow_targets=[python,git]"]
+    words = [
+        "densify=external/3dgs",
+        "densify.options.code=/code",
+        "densify.version='1'",
+        "allow_targets=[python,git]",
+    ]
     command = composed(*words, "train=paper", "train.densify_stop=9000")["densify"]["command"]
     assert str(command[command.index("--densify_until_iter") + 1]) == "9000"
     assert str(command[command.index("--opacity_lr") + 1]) == "0.05"
@@ -118,22 +139,34 @@ def test_it_must_take_the_data() -> None:
 
 def run(tmp_path: Path, code: str, limit: float | None = None) -> float:
     environment = {"PATH": "/usr/bin:/bin", "MINE": "here"}
-    return run_program([sys.executable, "-c", code], tmp_path / "log", tmp_path, environment, limit).peak_memory_mb
+    return run_program(
+        [sys.executable, "-c", code], tmp_path / "log", tmp_path, environment, limit
+    ).peak_memory_mb
 
 
 def test_a_program_runs_in_its_folder_with_its_environment(tmp_path: Path) -> None:
-    run(tmp_path, "import os; open('mark', 'w').write(os.environ['MINE']); print('said', sorted(os.environ)[:1])")
+    run(
+        tmp_path,
+        "import os; open('mark', 'w').write(os.environ['MINE']); print('said', "
+        "sorted(os.environ)[:1])",
+    )
     assert (tmp_path / "mark").read_text() == "here"
     assert "said" in (tmp_path / "log").read_text()
 
 
 def test_memory_of_its_children_counts(tmp_path: Path) -> None:
     child = "x = bytearray(300 << 20); import time; time.sleep(2)"
-    assert run(tmp_path, f"import subprocess, sys; subprocess.run([sys.executable, '-c', {child!r}])") > 290
+    assert (
+        run(tmp_path, f"import subprocess, sys; subprocess.run([sys.executable, '-c', {child!r}])")
+        > 290
+    )
 
 
 def test_nothing_is_left_running(tmp_path: Path) -> None:
-    code = "import subprocess, sys; print(subprocess.Popen([sys.executable, '-c', 'import time; time.sleep(600)']).pid)"
+    code = (
+        "import subprocess, sys; print(subprocess.Popen([sys.executable, '-c', 'import time; "
+        "time.sleep(600)']).pid)"
+    )
     run(tmp_path, code)
     left, deadline = int((tmp_path / "log").read_text().split()[-1]), time.monotonic() + PATIENCE
     while is_running(left) and time.monotonic() < deadline:
@@ -144,13 +177,19 @@ def test_nothing_is_left_running(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("code", "limit", "said"),
     [
-        ("raise SystemExit('Error: no paint')", None, r"ended early \(exit code 1\); its last lines: Error: no paint"),
+        (
+            "raise SystemExit('Error: no paint')",
+            None,
+            r"ended early \(exit code 1\); its last lines: Error: no paint",
+        ),
         ("import os; os.kill(os.getpid(), 9)", None, "crashed .SIGKILL, perhaps out of memory."),
         ("import time; print('working', flush=True); time.sleep(600)", 3.0, "still ran after 3 s"),
     ],
 )
 @pytest.mark.slow
-def test_bad_ends_are_one_line_with_the_log(tmp_path: Path, code: str, limit: float | None, said: str) -> None:
+def test_bad_ends_are_one_line_with_the_log(
+    tmp_path: Path, code: str, limit: float | None, said: str
+) -> None:
     with pytest.raises(TrainingError, match=said) as caught:
         run(tmp_path, code, limit)
     assert str(caught.value).endswith(f"log: {tmp_path / 'log'}")

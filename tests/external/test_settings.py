@@ -16,7 +16,15 @@ def external(result: str, **options: Any) -> External:
 
 @pytest.mark.parametrize(
     "result",
-    ["a.ply", "**/point_cloud.ply", "out/*/view_*.png", "it_{iterations}/a.ply", "{kind}/x.ply", "./a.ply", "[ab].ply"],
+    [
+        "a.ply",
+        "**/point_cloud.ply",
+        "out/*/view_*.png",
+        "it_{iterations}/a.ply",
+        "{kind}/x.ply",
+        "./a.ply",
+        "[ab].ply",
+    ],
 )
 def test_patterns_below_the_output_folder_pass(result: str) -> None:
     assert external(result, options={"kind": "deep"}).result == result

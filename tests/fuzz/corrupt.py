@@ -1,4 +1,5 @@
-"""Ways in which files come to harm: cut, flipped, doubled, filled with NaN, infinities, zeros or huge counts."""
+"""Ways in which files come to harm: cut, flipped, doubled, filled with NaN, infinities, zeros or
+huge counts."""
 
 from __future__ import annotations
 
@@ -6,11 +7,33 @@ import struct
 from random import Random
 
 VALUES = (
-    struct.pack("<d", float("nan")), struct.pack("<d", float("inf")), struct.pack("<d", -1.0), struct.pack("<d", 0.0),
-    struct.pack("<f", float("nan")), struct.pack("<f", float("-inf")), struct.pack("<Q", 2**63),
-    struct.pack("<Q", 2**40), b"\xff" * 8, b"\0" * 32, struct.pack("<I", 2**32 - 1), struct.pack("<i", -1),
-)  # fmt: skip
-WORDS = (b"nan", b"inf", b"-1", b"0", b"99999999999999999999", b"", b"x", b"1e400", b"-", b"\xff", b"1 2 3", b"\n")
+    struct.pack("<d", float("nan")),
+    struct.pack("<d", float("inf")),
+    struct.pack("<d", -1.0),
+    struct.pack("<d", 0.0),
+    struct.pack("<f", float("nan")),
+    struct.pack("<f", float("-inf")),
+    struct.pack("<Q", 2**63),
+    struct.pack("<Q", 2**40),
+    b"\xff" * 8,
+    b"\0" * 32,
+    struct.pack("<I", 2**32 - 1),
+    struct.pack("<i", -1),
+)
+WORDS = (
+    b"nan",
+    b"inf",
+    b"-1",
+    b"0",
+    b"99999999999999999999",
+    b"",
+    b"x",
+    b"1e400",
+    b"-",
+    b"\xff",
+    b"1 2 3",
+    b"\n",
+)
 
 
 def corrupt(data: bytes, rng: Random) -> bytes:
@@ -62,4 +85,8 @@ def _word(data: bytes, rng: Random) -> bytes:
 
 
 def _noise(data: bytes, rng: Random) -> bytes:
-    return rng.randbytes(rng.randint(0, 200)) if rng.random() < 0.2 else data + rng.randbytes(rng.randint(1, 40))
+    return (
+        rng.randbytes(rng.randint(0, 200))
+        if rng.random() < 0.2
+        else data + rng.randbytes(rng.randint(1, 40))
+    )

@@ -1,4 +1,5 @@
-"""Damaged models, PLY files, pictures and archives, read one by one; a program, so that a crash is seen as one.
+"""Damaged models, PLY files, pictures and archives, read one by one; a program, so that a crash is
+seen as one.
 
     python -m tests.fuzz.models FOLDER FIRST COUNT
 
@@ -29,7 +30,8 @@ SLOW_SECONDS = 20.0
 KINDS = ("colmap.bin", "colmap.txt", "ply", "picture", "zip")
 PICTURES = ("a.jpg", "b.png", "c.png", "d.webp", "e.tif", "f.tif", "g.bmp", "h.png")
 MEMBERS = {
-    f"scene/images/{name}": bytes(range(256)) * size for name, size in (("a.jpg", 3), ("b.jpg", 1), ("c.jpg", 9))
+    f"scene/images/{name}": bytes(range(256)) * size
+    for name, size in (("a.jpg", 3), ("b.jpg", 1), ("c.jpg", 9))
 }
 
 
@@ -77,7 +79,9 @@ def run_case(originals: Path, work: Path, case: int) -> bool:
         return _refused(lambda: _check_picture(target))
     if kind == "zip":
         target = work / "case.zip"
-        target.write_bytes(corrupt((originals / rng.choice(("stored.zip", "packed.zip"))).read_bytes(), rng))
+        target.write_bytes(
+            corrupt((originals / rng.choice(("stored.zip", "packed.zip"))).read_bytes(), rng)
+        )
         return _refused(lambda: _check_archive(target, work))
     target = work / kind
     target.mkdir(exist_ok=True)
@@ -98,7 +102,10 @@ def _check_model(folder: Path) -> None:
     poses = [image.cam_from_world().matrix() for image in model.images.values() if image.has_pose]
     points = [point.xyz for point in model.points3D.values()]
     assert all(np.isfinite(value).all() for value in (*poses, *points))
-    assert all(min(camera.width, camera.height, camera.focal_length_x) > 0 for camera in model.cameras.values())
+    assert all(
+        min(camera.width, camera.height, camera.focal_length_x) > 0
+        for camera in model.cameras.values()
+    )
 
 
 def _check_gaussians(path: Path) -> None:

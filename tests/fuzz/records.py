@@ -1,9 +1,10 @@
-"""Damaged files of a runs folder, one after the other; run as a program, so that a crash or a hang is seen as one.
+"""Damaged files of a runs folder, one after the other; run as a program, so that a crash or a hang
+is seen as one.
 
     python -m tests.fuzz.records FOLDER FIRST COUNT [FILE]
 
-damages the files of a small experiment, or FILE alone, reads them as the verbs do, and prints how many cases were
-noticed and how many were read, and the case that ended in anything else.
+damages the files of a small experiment, or FILE alone, reads them as the verbs do, and prints how
+many cases were noticed and how many were read, and the case that ended in anything else.
 """
 
 from __future__ import annotations
@@ -23,7 +24,12 @@ from typing import Any
 
 from gsbench.analysis.cells import to_frame
 from gsbench.analysis.fairness import tuning_lines
-from gsbench.analysis.report.build import event_charts, search_summary, training_charts, volume_charts
+from gsbench.analysis.report.build import (
+    event_charts,
+    search_summary,
+    training_charts,
+    volume_charts,
+)
 from gsbench.analysis.results import load_experiment, read_views
 from gsbench.analysis.table_formats import to_html_page
 from gsbench.analysis.tables import build_table
@@ -43,15 +49,51 @@ from tests.fuzz.corrupt import corrupt
 SLOW_SECONDS = 20.0
 DONE, FAILED, EXPERIMENT = "sfm-adc", "sfm-volumetric", "exp"
 NAMES = (
-    "results.json", "config.yaml", "plan.json", "declared.jsonl", "metrics.jsonl", "events.jsonl",
-    "volume_histograms.jsonl", "per_view.csv", "failed.json", "building.json", ".submitted.json", "tuning.json",
-    "mlflow.json", ".lock.holder",
-)  # fmt: skip
+    "results.json",
+    "config.yaml",
+    "plan.json",
+    "declared.jsonl",
+    "metrics.jsonl",
+    "events.jsonl",
+    "volume_histograms.jsonl",
+    "per_view.csv",
+    "failed.json",
+    "building.json",
+    ".submitted.json",
+    "tuning.json",
+    "mlflow.json",
+    ".lock.holder",
+)
 STRANGE: tuple[str, ...] = (
-    "null", "{}", "[]", '""', "true", "0", "-1", "NaN", "-Infinity", "1e400", "1e308", "9" * 400, "9" * 5000, '"x"',
-    '"27"', "[" * 5000, "[" * 150 + "]" * 150, '{"a":' * 60 + "1" + "}" * 60, '"\\ud800"', '"../../x"', '"\\u0000"',
-    '"a\\nb"', "[null]", '{"name": 3}', "1.5", "18446744073709551616", '{"": {}}', '["_target_"]',
-)  # fmt: skip
+    "null",
+    "{}",
+    "[]",
+    '""',
+    "true",
+    "0",
+    "-1",
+    "NaN",
+    "-Infinity",
+    "1e400",
+    "1e308",
+    "9" * 400,
+    "9" * 5000,
+    '"x"',
+    '"27"',
+    "[" * 5000,
+    "[" * 150 + "]" * 150,
+    '{"a":' * 60 + "1" + "}" * 60,
+    '"\\ud800"',
+    '"../../x"',
+    '"\\u0000"',
+    '"a\\nb"',
+    "[null]",
+    '{"name": 3}',
+    "1.5",
+    "18446744073709551616",
+    '{"": {}}',
+    '["_target_"]',
+)
 
 
 def values_of(runs: Path, densify: str, seed: int, threshold: float) -> dict[str, Any]:
@@ -61,7 +103,12 @@ def values_of(runs: Path, densify: str, seed: int, threshold: float) -> dict[str
         "seed": seed,
         "runs": str(runs),
         "scene": {
-            "name": "courtyard", "kind": "courtyard", "test_every": 8, "width": 64, "height": 48, "downscale": 1,
+            "name": "courtyard",
+            "kind": "courtyard",
+            "test_every": 8,
+            "width": 64,
+            "height": 48,
+            "downscale": 1,
             "max_size": None,
         },
         "raster": {"name": "cpu"},
@@ -69,9 +116,15 @@ def values_of(runs: Path, densify: str, seed: int, threshold: float) -> dict[str
         "densify": {"name": densify, "volume_threshold": threshold},
         "train": {"iterations": 100, "max_seconds": None},
         "eval": {"primary": None},
-        "tracking": {"enabled": True, "uri": None, "flush_seconds": 1.0, "patience_seconds": 1.0, "images": 1},
+        "tracking": {
+            "enabled": True,
+            "uri": None,
+            "flush_seconds": 1.0,
+            "patience_seconds": 1.0,
+            "images": 1,
+        },
         "launch": {"name": "serial"},
-    }  # fmt: skip
+    }
 
 
 def write_trial(runs: Path, densify: str, seed: int, threshold: float = 0.03) -> Path:
@@ -81,8 +134,14 @@ def write_trial(runs: Path, densify: str, seed: int, threshold: float = 0.03) ->
     folder.mkdir(parents=True)
     (folder / "config.yaml").write_text(json.dumps(values))
     steps = range(10, 101, 10)
-    rows = [{"step": k, "psnr": 20 + k / 50, "num_gaussians": 10 * k, "seconds": k / 10, "loss": 1 / k} for k in steps]
-    events = [{"step": k, "cloned": 2, "split_volume": 1, "opacity_reset": False, "strictness": 1.0} for k in steps]
+    rows = [
+        {"step": k, "psnr": 20 + k / 50, "num_gaussians": 10 * k, "seconds": k / 10, "loss": 1 / k}
+        for k in steps
+    ]
+    events = [
+        {"step": k, "cloned": 2, "split_volume": 1, "opacity_reset": False, "strictness": 1.0}
+        for k in steps
+    ]
     edges = [-18 + k for k in range(22)]
     histograms = [{"step": 50, "log10_edges": edges, "counts": [k % 5 for k in range(21)]}]
     for name, lines in (("metrics", rows), ("events", events), ("volume_histograms", histograms)):
@@ -116,30 +175,55 @@ def write_original(runs: Path) -> dict[str, Path]:
     (variant / "results.json").write_text(json.dumps(content))
     failed = write_trial(runs, "volumetric", 1, 0.5)
     (failed / "results.json").unlink()
-    (failed / "failed.json").write_text(json.dumps({"error": "E", "message": "m", "time": 1.0, "seed": 1}))
+    (failed / "failed.json").write_text(
+        json.dumps({"error": "E", "message": "m", "time": 1.0, "seed": 1})
+    )
     (failed / "building.json").write_text(json.dumps({"stage": "train", "folder": str(done)}))
     (failed / ".submitted.json").write_text(json.dumps({"job": "5", "log": "l", "user": "u"}))
     (variant / "mlflow.json").write_text(
-        json.dumps({"uri": "u", "token": "t", "started": 1, "logged": {"metrics.jsonl": 5}, "complete": "c"})
+        json.dumps(
+            {
+                "uri": "u",
+                "token": "t",
+                "started": 1,
+                "logged": {"metrics.jsonl": 5},
+                "complete": "c",
+            }
+        )
     )
-    (done / ".lock.holder").write_text(json.dumps({"host": "h", "pid": 1, "since": 1.0, "slurm": None, "what": "w"}))
+    (done / ".lock.holder").write_text(
+        json.dumps({"host": "h", "pid": 1, "since": 1.0, "slurm": None, "what": "w"})
+    )
     entry = {"overrides": ["seed=0"], "cwd": str(runs), "time": 1.0}
     places = {path.relative_to(home).as_posix(): entry for path in (done, failed)}
     (home / "plan.json").write_text(json.dumps({"version": 1, "trials": places}))
     declared = [
         {"questions": [{"metric": "psnr", "sign": 0}], "time": "2026-11-21T20:05:00Z"},
-        {"questions": [{"metric": "psnr", "name": "a"}], "looks": [2, 3], "time": "2026-11-21T20:05:00Z"},
+        {
+            "questions": [{"metric": "psnr", "name": "a"}],
+            "looks": [2, 3],
+            "time": "2026-11-21T20:05:00Z",
+        },
     ]
     (home / "declared.jsonl").write_text("".join(json.dumps(line) + "\n" for line in declared))
     tuning = {
-        "sweep": home.name, "arm": "sfm-volumetric", "metric": "psnr", "direction": 1, "wanted": 3, "seeds": [100],
-        "scenes": ["courtyard"], "ranges": {"densify.volume_threshold": "0.01,0.03"}, "log": [],
+        "sweep": home.name,
+        "arm": "sfm-volumetric",
+        "metric": "psnr",
+        "direction": 1,
+        "wanted": 3,
+        "seeds": [100],
+        "scenes": ["courtyard"],
+        "ranges": {"densify.volume_threshold": "0.01,0.03"},
+        "log": [],
         "points": [{"settings": {"densify.volume_threshold": 0.03}, "value": 20.0}],
-    }  # fmt: skip
+    }
     (home / "tuning.json").write_text(json.dumps(tuning))
     places_of = {name: done / name for name in NAMES}
     places_of |= {name: home / name for name in ("plan.json", "declared.jsonl", "tuning.json")}
-    places_of |= {name: failed / name for name in ("failed.json", "building.json", ".submitted.json")}
+    places_of |= {
+        name: failed / name for name in ("failed.json", "building.json", ".submitted.json")
+    }
     places_of |= {"mlflow.json": variant / "mlflow.json", "config.yaml": variant / "config.yaml"}
     assert all(path.is_file() for path in places_of.values())
     return places_of
@@ -205,7 +289,8 @@ def _replaced(tree: Any, rng: Random, marks: dict[str, str]) -> Any:
 
 
 def look(runs: Path, places: dict[str, Path]) -> int:
-    """Read everything as the verbs do; how much was refused or left out. Raises what is no InputError."""
+    """Read everything as the verbs do; how much was refused or left out. Raises what is no
+    InputError."""
     home = runs / EXPERIMENT
     refused = 0
 
@@ -308,4 +393,9 @@ def main(folder: Path, first: int, count: int, only: str | None) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3]), sys.argv[4] if len(sys.argv) > 4 else None)
+    main(
+        Path(sys.argv[1]),
+        int(sys.argv[2]),
+        int(sys.argv[3]),
+        sys.argv[4] if len(sys.argv) > 4 else None,
+    )

@@ -1,4 +1,5 @@
-"""Damaged COLMAP models and PLY files end in one line or in a right result: never in a crash, a hang or nonsense."""
+"""Damaged COLMAP models and PLY files end in one line or in a right result: never in a crash, a
+hang or nonsense."""
 
 from __future__ import annotations
 
@@ -22,7 +23,9 @@ CASES = 240  # in CI; `python -m tests.fuzz.models FOLDER 0 10000` tries more
 
 def test_damaged_files_are_refused_or_read_right(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "tests.fuzz.models", str(tmp_path), "0", str(CASES)]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300, check=False)
+    done = subprocess.run(
+        command, cwd=ROOT, capture_output=True, text=True, timeout=300, check=False
+    )
     case = (tmp_path / "current").read_text()
     assert done.returncode == 0, f"case {case}: {done.stderr[-2000:]}"
     assert done.stdout.startswith(f"{CASES} cases: ")
@@ -38,7 +41,11 @@ NAN = float("nan")
 @pytest.mark.parametrize(
     ("file", "harm", "words"),
     [
-        ("images.bin", lambda data: replaced(data, 12, "<4d", 0, 0, 0, 0), "has no pose that can be used"),
+        (
+            "images.bin",
+            lambda data: replaced(data, 12, "<4d", 0, 0, 0, 0),
+            "has no pose that can be used",
+        ),
         ("images.bin", lambda data: replaced(data, 12, "<d", NAN), "has no pose that can be used"),
         ("images.bin", lambda data: replaced(data, 44, "<d", NAN), "has no pose that can be used"),
         ("cameras.bin", lambda data: replaced(data, 32, "<d", -300.0), "is damaged"),

@@ -1,4 +1,5 @@
-"""Damaged files of a runs folder cost themselves, never the rest: no crash, no hang, one line that names the file."""
+"""Damaged files of a runs folder cost themselves, never the rest: no crash, no hang, one line that
+names the file."""
 
 from __future__ import annotations
 
@@ -34,7 +35,9 @@ DAMAGES = {
 
 def test_damaged_files_are_left_out_or_read_right(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "tests.fuzz.records", str(tmp_path), "0", str(CASES)]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=600, check=False)
+    done = subprocess.run(
+        command, cwd=ROOT, capture_output=True, text=True, timeout=600, check=False
+    )
     case = (tmp_path / "current").read_text()
     assert done.returncode == 0, f"case {case}: {done.stderr[-2000:]}"
     assert done.stdout.startswith(f"{CASES} cases: ")
@@ -61,14 +64,21 @@ def test_the_verbs_say_one_line_for_a_damaged_file(
     else:
         path.unlink()
         (os.mkfifo if damage == "fifo" else os.mkdir)(path)
-    for argv in (["tables", EXPERIMENT], ["status", EXPERIMENT], ["status"], ["tables", EXPERIMENT, "--format=trials"]):
+    for argv in (
+        ["tables", EXPERIMENT],
+        ["status", EXPERIMENT],
+        ["status"],
+        ["tables", EXPERIMENT, "--format=trials"],
+    ):
         assert cli.run(argv) in (0, 1)
         captured = capsys.readouterr()
         said = [line for line in captured.err.splitlines() if line.startswith("left out")]
         assert len(said) <= 2  # one trial of these has failed, and tables say so
         if argv[0] == "tables":
             assert "psnr" in captured.out.lower()
-            assert name == "metrics.jsonl" or name == "plan.json" or any(name in line for line in said)
+            assert (
+                name == "metrics.jsonl" or name == "plan.json" or any(name in line for line in said)
+            )
         if argv == ["status", EXPERIMENT]:
             assert name != "plan.json" or any(name in line for line in said)
             assert ("damaged" in captured.out) == (name == "results.json")
@@ -79,18 +89,28 @@ def test_every_kind_of_file_is_among_the_damaged(places: dict[str, Path]) -> Non
     assert set(places) == set(NAMES)
 
 
-# What is ours to read goes through the typed readers; what these files read is somebody else's or their own process's.
+# What is ours to read goes through the typed readers; what these files read is somebody else's or
+# their own process's.
 READS_ITSELF = {
-    "analysis/paper.py", "datasets/catalog.py",  # of the package
-    "launch/batch.py", "init/base.py", "runs/keys.py",  # text of this very process
+    "analysis/paper.py",
+    "datasets/catalog.py",  # of the package
+    "launch/batch.py",
+    "init/base.py",
+    "runs/keys.py",  # text of this very process
     "analysis/differences.py",  # arms of the package; those of trials are read by TrialFolder
     "claims/stopping.py",  # text of this process
     "system/install.py",  # what pip wrote of the package
     "claims/archive.py",  # archives, which anybody may have made
     "scene/load.py",  # prepared views, beside the store
     "parsing.py",
-}  # fmt: skip
-LOADERS = {("json", "loads"), ("json", "load"), ("yaml", "load"), ("yaml", "safe_load"), ("yaml", "full_load")}
+}
+LOADERS = {
+    ("json", "loads"),
+    ("json", "load"),
+    ("yaml", "load"),
+    ("yaml", "safe_load"),
+    ("yaml", "full_load"),
+}
 
 
 def test_no_file_of_ours_is_parsed_beside_its_reader() -> None:
@@ -102,5 +122,7 @@ def test_no_file_of_ours_is_parsed_beside_its_reader() -> None:
             if named and (node.value.id, node.attr) in LOADERS:
                 found.add(path.relative_to(package).as_posix())
             if isinstance(node, ast.ImportFrom) and node.module in ("json", "yaml"):
-                assert not {alias.name for alias in node.names} & {name for _, name in LOADERS}, path
+                assert not {alias.name for alias in node.names} & {name for _, name in LOADERS}, (
+                    path
+                )
     assert found == READS_ITSELF

@@ -34,10 +34,15 @@ def random_gaussians(
     ).map(lambda tensor: tensor.to(dtype))
 
 
-def front_camera(width: int = 40, height: int = 30, shift: tuple[float, float] = (0.0, 0.0)) -> Camera:
-    """A camera at the origin, slightly turned, that looks along z; ``shift`` moves the principal point (px)."""
+def front_camera(
+    width: int = 40, height: int = 30, shift: tuple[float, float] = (0.0, 0.0)
+) -> Camera:
+    """A camera at the origin, slightly turned, that looks along z; ``shift`` moves the principal
+    point (px)."""
     angle = 0.05
-    rotation = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+    rotation = np.array(
+        [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
+    )
     return Camera(
         width=width,
         height=height,

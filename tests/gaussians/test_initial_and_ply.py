@@ -61,7 +61,9 @@ def test_an_element_without_rows_is_no_damage(tmp_path: Path, text: bool) -> Non
     vertex = PlyData.read(str(tmp_path / "a.ply"))["vertex"]
     faces = PlyElement.describe(np.empty(0, dtype=[("a", "i4"), ("b", "i4"), ("c", "i4")]), "face")
     PlyData([vertex, faces], text=text).write(str(tmp_path / "b.ply"))
-    for a, b in zip(gaussians.tensors().values(), read_ply(tmp_path / "b.ply").tensors().values(), strict=True):
+    for a, b in zip(
+        gaussians.tensors().values(), read_ply(tmp_path / "b.ply").tensors().values(), strict=True
+    ):
         assert torch.allclose(a, b)
 
 
@@ -73,7 +75,16 @@ def test_ply_layout_is_the_standard_one(tmp_path: Path) -> None:
     names = [p.name for p in vertex.properties]
     assert names[:9] == ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
     assert names[9:54] == [f"f_rest_{i}" for i in range(45)]
-    assert names[54:] == ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+    assert names[54:] == [
+        "opacity",
+        "scale_0",
+        "scale_1",
+        "scale_2",
+        "rot_0",
+        "rot_1",
+        "rot_2",
+        "rot_3",
+    ]
     assert vertex["f_rest_15"][2] == gaussians.sh_rest[2, 0, 1].item()  # first coefficient of green
     assert vertex["f_rest_1"][2] == gaussians.sh_rest[2, 1, 0].item()  # second coefficient of red
     assert vertex["rot_0"][1] == gaussians.quaternions[1, 0].item()  # w first
@@ -112,13 +123,18 @@ def rewritten(path: Path, old: bytes, new: bytes) -> Path:
 
 @pytest.mark.parametrize(("text", "bytes_each"), [(False, 61 * 4 + 8), (True, 62 * 2)])
 def test_more_than_a_file_can_hold_is_not_read(tmp_path: Path, text: bool, bytes_each: int) -> None:
-    """Its header alone says so: of 62 numbers, one of double precision; in text each takes two characters or more."""
+    """Its header alone says so: of 62 numbers, one of double precision; in text each takes two
+    characters or more."""
     write_ply(random_gaussians(4), tmp_path / "a.ply")
     path = rewritten(tmp_path / "a.ply", b"property float opacity", b"property double opacity")
-    path = rewritten(path, b"element vertex 4", b"comment a property float b\nelement vertex 1000000")
+    path = rewritten(
+        path, b"element vertex 4", b"comment a property float b\nelement vertex 1000000"
+    )
     if text:
         path = rewritten(path, b"format binary_little_endian", b"format ascii")
-    with pytest.raises(InputError, match=f"cut short: its header promises {1_000_000 * bytes_each} bytes or more"):
+    with pytest.raises(
+        InputError, match=f"cut short: its header promises {1_000_000 * bytes_each} bytes or more"
+    ):
         check_ply(path)
     check_ply(rewritten(path, b"element vertex 1000000", b"element vertex 2"))
     with pytest.raises(InputError, match="counts below zero"):
@@ -135,7 +151,9 @@ def test_more_than_a_file_can_hold_is_not_read(tmp_path: Path, text: bool, bytes
         (b"property float f_rest_43\nproperty float f_rest_44\n", b"", "it has 43"),
     ],
 )
-def test_harmonics_that_would_shift_are_refused(tmp_path: Path, old: bytes, new: bytes, said: str) -> None:
+def test_harmonics_that_would_shift_are_refused(
+    tmp_path: Path, old: bytes, new: bytes, said: str
+) -> None:
     write_ply(random_gaussians(4, seed=2), tmp_path / "a.ply")
     with pytest.raises(InputError, match=said):
         read_ply(rewritten(tmp_path / "a.ply", old, new))
@@ -168,14 +186,35 @@ def test_fewer_harmonics_are_read(tmp_path: Path, degree: int, stored: int) -> N
     assert torch.equal(back.means, gaussians.means)
 
 
-SIZES = {"char": 1, "int8": 1, "uchar": 1, "uint8": 1, "short": 2, "ushort": 2, "int16": 2, "uint16": 2}
-SIZES |= {"int": 4, "int32": 4, "uint": 4, "uint32": 4, "float": 4, "float32": 4, "double": 8, "float64": 8}
+SIZES = {
+    "char": 1,
+    "int8": 1,
+    "uchar": 1,
+    "uint8": 1,
+    "short": 2,
+    "ushort": 2,
+    "int16": 2,
+    "uint16": 2,
+}
+SIZES |= {
+    "int": 4,
+    "int32": 4,
+    "uint": 4,
+    "uint32": 4,
+    "float": 4,
+    "float32": 4,
+    "double": 8,
+    "float64": 8,
+}
 
 
 @pytest.mark.parametrize("kind", SIZES)
 def test_a_promise_counts_the_bytes_of_each_type(tmp_path: Path, kind: str) -> None:
     path = tmp_path / "a.ply"
-    header = f"ply\nformat binary_little_endian 1.0\nelement vertex 1000\nproperty {kind} x\nend_header\n"
+    header = (
+        f"ply\nformat binary_little_endian 1.0\nelement vertex 1000\nproperty {kind} "
+        "x\nend_header\n"
+    )
     path.write_text(header)
     promised = 1000 * SIZES[kind]
     with pytest.raises(InputError, match=f"promises {promised} bytes or more"):
@@ -187,7 +226,9 @@ def test_a_promise_counts_the_bytes_of_each_type(tmp_path: Path, kind: str) -> N
 def test_a_header_without_end_is_not_searched_for_long(tmp_path: Path) -> None:
     path = tmp_path / "a.ply"
     for length, fits in ((60_000, True), (66_000, False)):
-        path.write_text(f"ply\nformat ascii 1.0\ncomment {'x' * length}\nelement vertex 0\nend_header\n")
+        path.write_text(
+            f"ply\nformat ascii 1.0\ncomment {'x' * length}\nelement vertex 0\nend_header\n"
+        )
         if fits:
             check_ply(path)
         else:
@@ -203,7 +244,9 @@ def test_a_header_without_end_is_not_searched_for_long(tmp_path: Path) -> None:
         ("rot_", 0.0, r"a Gaussian has a rotation of \(0, 0, 0, 0\)"),
     ],
 )
-def test_values_without_meaning_are_named(tmp_path: Path, name: str, value: float, said: str) -> None:
+def test_values_without_meaning_are_named(
+    tmp_path: Path, name: str, value: float, said: str
+) -> None:
     write_ply(random_gaussians(3), tmp_path / "a.ply")
     table = PlyData.read(str(tmp_path / "a.ply"))["vertex"].data.copy()
     for column in table.dtype.names:
@@ -238,23 +281,31 @@ def save(table: np.ndarray, path: Path) -> Path:
 @pytest.mark.parametrize("change", ["utf-8", "latin-1", "mark", "crlf"])
 def test_headers_of_other_programs_are_read(tmp_path: Path, change: str, text: bool) -> None:
     table = table_of(tmp_path / "a.ply")
-    PlyData([PlyElement.describe(table, "vertex")], text=text, comments=["made by hand"]).write(str(tmp_path / "b.ply"))
+    PlyData([PlyElement.describe(table, "vertex")], text=text, comments=["made by hand"]).write(
+        str(tmp_path / "b.ply")
+    )
     header, end, body = (tmp_path / "b.ply").read_bytes().partition(b"end_header\n")
     if change == "mark":
         changed = b"\xef\xbb\xbf" + header + end + body
     elif change == "crlf":
-        changed = (header + end).replace(b"\n", b"\r\n") + (body.replace(b"\n", b"\r\n") if text else body)
+        changed = (header + end).replace(b"\n", b"\r\n") + (
+            body.replace(b"\n", b"\r\n") if text else body
+        )
     else:
         changed = header.replace(b"made by", "gemäß".encode(change)) + end + body
     (tmp_path / "b.ply").write_bytes(changed)
     wanted = read_ply(tmp_path / "a.ply")
-    for one, other in zip(read_ply(tmp_path / "b.ply").tensors().values(), wanted.tensors().values(), strict=True):
+    for one, other in zip(
+        read_ply(tmp_path / "b.ply").tensors().values(), wanted.tensors().values(), strict=True
+    ):
         assert torch.equal(one, other)
     np.testing.assert_array_equal(read_points(tmp_path / "b.ply")[0], wanted.means.double())
 
 
 COMPRESSED = b"ply\nformat binary_little_endian 1.0\nelement chunk 1\nproperty float min_x\nelement vertex 1\n"
-COMPRESSED += b"property uint packed_position\nproperty uint packed_rotation\nend_header\n" + bytes(12)
+COMPRESSED += b"property uint packed_position\nproperty uint packed_rotation\nend_header\n" + bytes(
+    12
+)
 
 
 @pytest.mark.parametrize(
@@ -269,24 +320,36 @@ COMPRESSED += b"property uint packed_position\nproperty uint packed_rotation\nen
         ("a.KSPLAT", bytes(32), "the format ksplat"),
     ],
 )
-def test_other_formats_are_named_with_the_command_that_unpacks_them(tmp_path: Path, name, content, said: str) -> None:
+def test_other_formats_are_named_with_the_command_that_unpacks_them(
+    tmp_path: Path, name, content, said: str
+) -> None:
     (tmp_path / name).write_bytes(content)
     for read in (read_ply, check_ply, *((read_points,) if name.endswith("ply") else ())):
-        with pytest.raises(InputError, match=f"{said}: unpack it with npx @playcanvas/splat-transform {name} out.ply"):
+        with pytest.raises(
+            InputError,
+            match=f"{said}: unpack it with npx @playcanvas/splat-transform {name} out.ply",
+        ):
             read(tmp_path / name)
 
 
 @pytest.mark.parametrize("kind", ["f4", "f8"])
-def test_opacities_of_zero_and_one_are_read(tmp_path: Path, kind: str, caplog: pytest.LogCaptureFixture) -> None:
+def test_opacities_of_zero_and_one_are_read(
+    tmp_path: Path, kind: str, caplog: pytest.LogCaptureFixture
+) -> None:
     table = table_of(tmp_path / "a.ply")
-    table = table.astype([(name, kind if name == "opacity" else "f4") for name in table.dtype.names])
+    table = table.astype(
+        [(name, kind if name == "opacity" else "f4") for name in table.dtype.names]
+    )
     table["opacity"] = [np.inf, -np.inf, 0.3, np.inf]
     opacities = torch.sigmoid(read_ply(save(table, tmp_path / "b.ply")).opacity_logits)
     assert opacities.tolist() == pytest.approx([1, 0, 1 / (1 + np.exp(-0.3)), 1], abs=2e-7)
     assert ((opacities > 0) & (opacities < 1)).all()  # so that they can be trained
     assert "3 Gaussians have an opacity of exactly 0 or 1" in caplog.text
     table["opacity"][2] = np.nan
-    with pytest.raises(InputError, match="opacity is not a finite number everywhere: it is nan in row 2 and in 0 more"):
+    with pytest.raises(
+        InputError,
+        match="opacity is not a finite number everywhere: it is nan in row 2 and in 0 more",
+    ):
         read_ply(save(table, tmp_path / "b.ply"))
 
 
@@ -294,7 +357,9 @@ def test_what_float32_cannot_hold_is_refused(tmp_path: Path) -> None:
     table = table_of(tmp_path / "a.ply")
     table = table.astype([(name, "f8" if name == "x" else "f4") for name in table.dtype.names])
     table["x"][1] = 1e300
-    with pytest.raises(InputError, match=r"x is not a finite number everywhere: it is 1e\+300 in row 1"):
+    with pytest.raises(
+        InputError, match=r"x is not a finite number everywhere: it is 1e\+300 in row 1"
+    ):
         read_ply(save(table, tmp_path / "b.ply"))
 
 
@@ -308,7 +373,9 @@ def test_what_float32_cannot_hold_is_refused(tmp_path: Path) -> None:
         ("opacity", (0.0, 1.01), ""),
     ],
 )
-def test_values_that_look_activated_are_warned_of(tmp_path: Path, prefix, values, said: str, caplog) -> None:
+def test_values_that_look_activated_are_warned_of(
+    tmp_path: Path, prefix, values, said: str, caplog
+) -> None:
     table = table_of(tmp_path / "a.ply")
     for name in table.dtype.names:
         if name.startswith(("scale_", "opacity")):
@@ -322,7 +389,9 @@ def test_values_that_look_activated_are_warned_of(tmp_path: Path, prefix, values
 
 @pytest.mark.parametrize("unit", [0.01, 1.0, 10.0, 1000.0, 1e5])
 @pytest.mark.parametrize("activated", [False, True])
-def test_lengths_are_told_from_logarithms_in_any_unit(tmp_path: Path, unit: float, activated: bool, caplog) -> None:
+def test_lengths_are_told_from_logarithms_in_any_unit(
+    tmp_path: Path, unit: float, activated: bool, caplog
+) -> None:
     random = np.random.default_rng(0)
     table = table_of(tmp_path / "a.ply")
     for axis in "xyz":
@@ -336,19 +405,28 @@ def test_lengths_are_told_from_logarithms_in_any_unit(tmp_path: Path, unit: floa
 
 @pytest.mark.parametrize(
     ("center", "scale", "kind"),
-    [((0.0, 0.0, 0.0), 1.0, "f4"), ((0.1, -0.2, 0.3), 100.0, "f4"), ((5e5, 5.4e6, 300.0), 1.0, "f8"),
-     ((2.0, 3.0, 4.0), 1e5, "f8")],
-)  # fmt: skip
+    [
+        ((0.0, 0.0, 0.0), 1.0, "f4"),
+        ((0.1, -0.2, 0.3), 100.0, "f4"),
+        ((5e5, 5.4e6, 300.0), 1.0, "f8"),
+        ((2.0, 3.0, 4.0), 1e5, "f8"),
+    ],
+)
 def test_a_normalized_model_is_written_in_its_own_coordinates_and_read_back(
     tmp_path: Path, center: tuple[float, float, float], scale: float, kind: str
 ) -> None:
-    normalization, gaussians = Normalization(center, scale), random_gaussians(50, dtype=torch.float32)
+    normalization, gaussians = (
+        Normalization(center, scale),
+        random_gaussians(50, dtype=torch.float32),
+    )
     write_ply(gaussians, tmp_path / "own.ply", normalization)
     table = PlyData.read(str(tmp_path / "own.ply"))["vertex"].data
     assert table["x"].dtype == np.dtype(kind)
     own = np.array(center) + gaussians.means.double().numpy() / scale
     np.testing.assert_allclose(np.column_stack([table[axis] for axis in "xyz"]), own, rtol=2e-7)
-    np.testing.assert_allclose(np.exp(table["scale_1"]), gaussians.log_scales[:, 1].exp() / scale, rtol=1e-5)
+    np.testing.assert_allclose(
+        np.exp(table["scale_1"]), gaussians.log_scales[:, 1].exp() / scale, rtol=1e-5
+    )
     again = read_ply(tmp_path / "own.ply", normalization=normalization)
     torch.testing.assert_close(again.means, gaussians.means, atol=1e-5, rtol=0)
     torch.testing.assert_close(again.log_scales, gaussians.log_scales, atol=1e-5, rtol=0)

@@ -19,7 +19,8 @@ def step_with(trainable: TrainableGaussians, seed: int, **arguments: object) -> 
 
 
 def test_steps_are_those_of_torchs_adam() -> None:
-    """To the last bit, with the fused kernel; a parameter without a gradient stays as it is and counts no step."""
+    """To the last bit, with the fused kernel; a parameter without a gradient stays as it is and
+    counts no step."""
     ours = TrainableGaussians(random_gaussians(6, dtype=torch.float32), LearningRates(), 2.0)
     theirs = ours.values.map(lambda tensor: tensor.detach().clone().requires_grad_(True)).tensors()
     groups = [{"params": [tensor], "lr": ours.adam[name].rate} for name, tensor in theirs.items()]
@@ -27,7 +28,9 @@ def test_steps_are_those_of_torchs_adam() -> None:
     for seed in range(4):
         rng = torch.Generator().manual_seed(seed)
         for name, tensor in ours.values.tensors().items():
-            tensor.grad = None if seed == 2 and name == "means" else torch.randn(tensor.shape, generator=rng)
+            tensor.grad = (
+                None if seed == 2 and name == "means" else torch.randn(tensor.shape, generator=rng)
+            )
             theirs[name].grad = None if tensor.grad is None else tensor.grad.clone()
         ours.optimizer_step()
         adam.step()
@@ -74,12 +77,16 @@ def test_idle_harmonics_count_their_steps_as_adam_would() -> None:
 def test_load_restores_parameters_and_moments() -> None:
     trainable = TrainableGaussians(random_gaussians(5), LearningRates(), 3.0)
     step_with(trainable, 0)
-    trainable.edit(keep=torch.tensor([True, True, False, True, True]), append=random_gaussians(2, seed=4))
+    trainable.edit(
+        keep=torch.tensor([True, True, False, True, True]), append=random_gaussians(2, seed=4)
+    )
     copy = TrainableGaussians.load(trainable.state_dict(), LearningRates(), 3.0)  # type: ignore[arg-type]
     for seed in (1, 2):
         step_with(trainable, seed)
         step_with(copy, seed)
-    for a, b in zip(trainable.values.tensors().values(), copy.values.tensors().values(), strict=True):
+    for a, b in zip(
+        trainable.values.tensors().values(), copy.values.tensors().values(), strict=True
+    ):
         assert torch.equal(a, b)
 
 
@@ -134,7 +141,9 @@ def test_an_edit_keeps_moments_and_appends_zeros() -> None:
 def test_the_rate_of_the_means_falls_log_linearly() -> None:
     rates = LearningRates()
     steps = [0, 15_000, 30_000, 60_000]
-    assert [rates.position(step) for step in steps] == pytest.approx([1.6e-4, 1.6e-5, 1.6e-6, 1.6e-6])
+    assert [rates.position(step) for step in steps] == pytest.approx(
+        [1.6e-4, 1.6e-5, 1.6e-6, 1.6e-6]
+    )
     assert rates.position(-10) == pytest.approx(1.6e-4)
     assert rates.sh_rest == pytest.approx(1.25e-4)
     trainable = TrainableGaussians(random_gaussians(2), rates, 3.0)

@@ -1,4 +1,5 @@
-"""A small capture with exact poses, and networks without training that still find and match features."""
+"""A small capture with exact poses, and networks without training that still find and match
+features."""
 
 from __future__ import annotations
 
@@ -33,8 +34,9 @@ def bare_photos(courtyard: Capture) -> Capture:
 def untrained_weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A weights folder with a random SuperPoint, and a LightGlue whose layers add nothing.
 
-    Random convolutions move with the picture, so their maxima and descriptors can be matched. With layers that add
-    nothing and an identity before the assignment, LightGlue picks descriptors that are each other's nearest.
+    Random convolutions move with the picture, so their maxima and descriptors can be matched. With
+    layers that add nothing and an identity before the assignment, LightGlue picks descriptors that
+    are each other's nearest.
     """
     transformers = pytest.importorskip("transformers", reason="needs the extra dim")
     from kornia.feature import LightGlue

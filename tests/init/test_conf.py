@@ -17,7 +17,12 @@ REQUIRED = {"ply": ["init.path=a.ply"], "points": ["init.path=a.ply"]}
 # presets: a class under another name, with other values than its defaults
 DELIBERATE: dict[str, dict[str, Any]] = {
     "dim_paper": {"pairs": "lowres", "max_keypoints": 4096, "min_inlier_ratio": 0.25},
-    "sfm_preview": {"pairs": "auto", "max_image_size": 1000, "max_num_features": 4096, "first_octave": 0},
+    "sfm_preview": {
+        "pairs": "auto",
+        "max_image_size": 1000,
+        "max_num_features": 4096,
+        "first_octave": 0,
+    },
 }
 
 
@@ -37,7 +42,8 @@ def test_yaml_and_class_agree(name: str):
     assert values.keys() == {field.name for field in dataclasses.fields(cls)}
     own = {"device": "auto", **DELIBERATE.get(name, {})}
     for field in dataclasses.fields(cls):
-        if field.default is not dataclasses.MISSING:  # a required option has no default to agree with
+        # a required option has no default to agree with
+        if field.default is not dataclasses.MISSING:
             assert values[field.name] == own.get(field.name, field.default), field.name
 
 

@@ -28,11 +28,17 @@ def add_points(model_dir: Path, target: Path, count: int) -> np.ndarray:
         copy.add_camera_with_trivial_rig(camera)
     for image in model.images.values():
         projected = np.array([image.project_point(point) for point in points])
-        new = pycolmap.Image(name=image.name, keypoints=projected, camera_id=image.camera_id, image_id=image.image_id)
+        new = pycolmap.Image(
+            name=image.name, keypoints=projected, camera_id=image.camera_id, image_id=image.image_id
+        )
         copy.add_image_with_trivial_frame(new, image.cam_from_world())
     for index, point in enumerate(points):
         elements = [pycolmap.TrackElement(image_id, index) for image_id in (1, 2, 3)]
-        copy.add_point3D(point, pycolmap.Track(elements), np.array([index, 2 * index, 255 - index], dtype=np.uint8))
+        copy.add_point3D(
+            point,
+            pycolmap.Track(elements),
+            np.array([index, 2 * index, 255 - index], dtype=np.uint8),
+        )
     target.mkdir(parents=True)
     copy.write_binary(target)
     return points
@@ -61,7 +67,9 @@ def test_random_fills_the_box_around_the_training_cameras(courtyard: Capture, tm
     report = Random(count=5000, size=2.0, seed=3).run(courtyard, tmp_path / "a")
     cloud = read_cloud(tmp_path / "a" / MODEL_FOLDER)
     images = pycolmap.Reconstruction(courtyard.model).images.values()
-    centers = np.array([image.projection_center() for image in images if image.name in courtyard.train_names])
+    centers = np.array(
+        [image.projection_center() for image in images if image.name in courtyard.train_names]
+    )
     offset = np.abs(cloud.points - centers.mean(axis=0)) / report.gauge.scene_extent
     assert offset.max() <= 2.0
     assert offset.max() > 1.99
@@ -76,7 +84,9 @@ def test_random_fills_the_box_around_the_training_cameras(courtyard: Capture, tm
 
 
 @pytest.mark.parametrize("seen_by", [1, 3])
-def test_carved_keeps_what_training_cameras_have_in_view(courtyard: Capture, tmp_path: Path, seen_by: int) -> None:
+def test_carved_keeps_what_training_cameras_have_in_view(
+    courtyard: Capture, tmp_path: Path, seen_by: int
+) -> None:
     """COLMAP's own projection, one point and one image at a time."""
     options = {"count": 300, "size": 2.0, "seed": 3}
     Random(**options).run(courtyard, tmp_path / "random")
@@ -103,7 +113,8 @@ def test_carved_says_when_nobody_sees_anything(courtyard: Capture, tmp_path: Pat
 
 
 def test_copies_lie_about_their_points(tmp_path: Path) -> None:
-    """A grid of two spacings: shifts are normal and in proportion to the distance to the neighbour."""
+    """A grid of two spacings: shifts are normal and in proportion to the distance to the
+    neighbour."""
     grid = np.stack(np.meshgrid(*[np.arange(12.0)] * 3), -1).reshape(-1, 3)
     points = np.concatenate([grid, 100 + 10 * grid])
     copies = shifted_copies(points, 3, 0.5, seed=1)
@@ -128,7 +139,9 @@ def test_no_model_to_read(tmp_path: Path):
         read_cloud(tmp_path)
 
 
-def test_a_trained_model_becomes_points_under_the_cameras_and_is_kept_whole(courtyard: Capture, tmp_path: Path) -> None:
+def test_a_trained_model_becomes_points_under_the_cameras_and_is_kept_whole(
+    courtyard: Capture, tmp_path: Path
+) -> None:
     gaussians = random_gaussians(20, dtype=torch.float32)
     write_ply(gaussians, tmp_path / "model.ply")
     report = Ply(path=str(tmp_path / "model.ply")).run(courtyard, tmp_path / "out")
@@ -142,5 +155,7 @@ def test_a_trained_model_becomes_points_under_the_cameras_and_is_kept_whole(cour
     with pytest.raises(InputError, match=r"init\.path=nowhere\.ply"):
         Ply(path="nowhere.ply")
     (tmp_path / "words.ply").write_text("no model")
-    with pytest.raises(InputError, match=r"words\.ply: not a readable PLY of Gaussians \(it has no header\)"):
+    with pytest.raises(
+        InputError, match=r"words\.ply: not a readable PLY of Gaussians \(it has no header\)"
+    ):
         Ply(path=str(tmp_path / "words.ply"))  # before any photograph is looked at

@@ -1,4 +1,5 @@
-"""Deep image matching without training: coordinates, store, errors; and what it relies on in the libraries."""
+"""Deep image matching without training: coordinates, store, errors; and what it relies on in the
+libraries."""
 
 from __future__ import annotations
 
@@ -39,7 +40,9 @@ CPU = torch.device("cpu")
 
 
 def digest(model: Path) -> str:
-    return hashlib.sha256(b"".join(file.read_bytes() for file in sorted(model.glob("*.bin")))).hexdigest()
+    return hashlib.sha256(
+        b"".join(file.read_bytes() for file in sorted(model.glob("*.bin")))
+    ).hexdigest()
 
 
 @pytest.fixture(autouse=True)
@@ -61,7 +64,9 @@ class TestUntrained:
     """The whole path with networks that were never trained."""
 
     @pytest.fixture(scope="class")
-    def run(self, courtyard: Capture, untrained_weights: Path, tmp_path_factory: pytest.TempPathFactory):
+    def run(
+        self, courtyard: Capture, untrained_weights: Path, tmp_path_factory: pytest.TempPathFactory
+    ):
         output = tmp_path_factory.mktemp("dim")
         init = superpoint(untrained_weights, matcher="mutual_nearest")
         return init, init.run(courtyard, output / "out", work_dir=output / "work"), output
@@ -78,8 +83,16 @@ class TestUntrained:
         assert np.median(surface_distance(read_cloud(output / "out" / MODEL_FOLDER).points)) < 0.15
 
     @pytest.mark.slow
-    def test_lightglue_on_the_same_path(self, few: Capture, untrained_weights: Path, tmp_path: Path, caplog):
-        init = superpoint(untrained_weights, max_keypoints=256, filter_threshold=0.0, pairs="sequential", overlap=1)
+    def test_lightglue_on_the_same_path(
+        self, few: Capture, untrained_weights: Path, tmp_path: Path, caplog
+    ):
+        init = superpoint(
+            untrained_weights,
+            max_keypoints=256,
+            filter_threshold=0.0,
+            pairs="sequential",
+            overlap=1,
+        )
         report = init.run(few, tmp_path)
         assert report.counts["pairs_selected"] == 3
         assert report.counts["inlier_matches"] > 30
@@ -101,7 +114,9 @@ def test_pairs_of_few_matches_at_low_resolution_are_left_out(
     shared = {pair: len(open_store(small).require_matches(*pair)) for pair in pairs}
     threshold = sorted(shared.values())[2]
     monkeypatch.setattr(extract_and_match, "LOWRES_MATCHES", threshold)
-    assert choose_pairs(job, few.image_names, pairs) == [pair for pair in pairs if shared[pair] > threshold]
+    assert choose_pairs(job, few.image_names, pairs) == [
+        pair for pair in pairs if shared[pair] > threshold
+    ]
     assert 0 < len(choose_pairs(job, few.image_names, pairs)) < 6
     assert preparation.counts["pairs_selected"] == sum(count > 20 for count in shared.values())
     assert preparation.counts["pairs_selected"] + preparation.counts["pairs_left_out"] == 6
@@ -139,7 +154,9 @@ class TestStore:
         assert digest(tmp_path / MODEL_FOLDER) == digest(output / "out" / MODEL_FOLDER)
 
     def test_other_settings_or_pictures_have_other_names(self, courtyard: Capture, tmp_path: Path):
-        def paths(extraction: dict[str, object], matching: dict[str, object], images: Path) -> tuple[Path, Path]:
+        def paths(
+            extraction: dict[str, object], matching: dict[str, object], images: Path
+        ) -> tuple[Path, Path]:
             store = FeatureStore(tmp_path / "work", images, extraction, matching)
             return store.features_path("0000.png"), store.matches_path("0000.png", "0001.png")
 
@@ -148,7 +165,10 @@ class TestStore:
         shutil.copy(changed / "0005.png", changed / "0000.png")
         base = paths({"n": 1}, {"r": 0.9}, courtyard.images)
         assert paths({"n": 1}, {"r": 0.9}, courtyard.images) == base
-        for other in (paths({"n": 2}, {"r": 0.9}, courtyard.images), paths({"n": 1}, {"r": 0.9}, changed)):
+        for other in (
+            paths({"n": 2}, {"r": 0.9}, courtyard.images),
+            paths({"n": 1}, {"r": 0.9}, changed),
+        ):
             assert other[0] != base[0]
             assert other[1] != base[1]
         other = paths({"n": 1}, {"r": 0.8}, courtyard.images)
@@ -164,14 +184,20 @@ class TestContracts:
         self, untrained_weights: Path, width: int, height: int
     ):
         settings = superpoint(untrained_weights, max_keypoints=10**6).feature_settings()
-        extract = EXTRACTORS[settings.extractor](settings, untrained_weights / "superpoint.safetensors", CPU)
+        extract = EXTRACTORS[settings.extractor](
+            settings, untrained_weights / "superpoint.safetensors", CPU
+        )
         transformers = pytest.importorskip("transformers")
-        network = transformers.SuperPointForKeypointDetection(transformers.SuperPointConfig(nms_radius=3)).eval()
+        network = transformers.SuperPointForKeypointDetection(
+            transformers.SuperPointConfig(nms_radius=3)
+        ).eval()
         network.load_state_dict(load_state(untrained_weights / "superpoint.safetensors"))
         image = torch.rand(1, 3, height, width, generator=torch.Generator().manual_seed(0))
         with torch.inference_mode():
             keypoints, descriptors, scores = extract(image)
-            gray = (image * torch.tensor([0.299, 0.587, 0.114])[None, :, None, None]).sum(1, keepdim=True)
+            gray = (image * torch.tensor([0.299, 0.587, 0.114])[None, :, None, None]).sum(
+                1, keepdim=True
+            )
             encoded = network.encoder(gray).last_hidden_state
             score_map = network.keypoint_decoder._get_pixel_scores(encoded)[0]
         expected = {
@@ -187,14 +213,18 @@ class TestContracts:
             assert score_map[y, x] == score
         torch.testing.assert_close(descriptors.norm(dim=1), torch.ones(len(keypoints)))
 
-    def test_lightglue_finds_a_permutation_with_images_of_different_sizes(self, untrained_weights: Path):
+    def test_lightglue_finds_a_permutation_with_images_of_different_sizes(
+        self, untrained_weights: Path
+    ):
         rng = np.random.default_rng(0)
         descriptors = rng.normal(size=(100, 256)).astype(np.float32)
         descriptors /= np.linalg.norm(descriptors, axis=1, keepdims=True)
         order = rng.permutation(100)[:80]
         keypoints = rng.uniform(0, 60, (100, 2)).astype(np.float32)
         first = Features(keypoints, descriptors, np.ones(100, np.float32), (100, 80), (100, 80))
-        second = Features(keypoints[order], descriptors[order], np.ones(80, np.float32), (64, 200), (640, 2000))
+        second = Features(
+            keypoints[order], descriptors[order], np.ones(80, np.float32), (64, 200), (640, 2000)
+        )
         settings = superpoint(untrained_weights).feature_settings()
         matcher = build_matcher(settings, untrained_weights / "superpoint_lightglue.pth", CPU)
         matches = matcher(first, second)
@@ -205,7 +235,8 @@ class TestContracts:
     def test_lightglue_reads_the_published_names(
         self, untrained_weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ):
-        """cvg/LightGlue's files say self_attn.0.… where the network says transformers.0.self_attn.…"""
+        """cvg/LightGlue's files say self_attn.0.… where the network says
+        transformers.0.self_attn.…"""
         state = torch.load(untrained_weights / "superpoint_lightglue.pth", weights_only=True)
         published = {}
         for name, value in state.items():
@@ -219,13 +250,17 @@ class TestContracts:
         networks: list[torch.nn.Module] = []
         load_into = extract_and_match.load_into
         monkeypatch.setattr(
-            extract_and_match, "load_into", lambda network, *rest: (networks.append(network), load_into(network, *rest))
+            extract_and_match,
+            "load_into",
+            lambda network, *rest: (networks.append(network), load_into(network, *rest)),
         )
         build_matcher(settings, tmp_path / "published.pth", CPU)
         loaded = networks[0].state_dict()
         assert all(torch.equal(loaded[name], value) for name, value in state.items())
 
-    def test_no_network_is_downloaded_by_the_libraries(self, untrained_weights: Path, monkeypatch: pytest.MonkeyPatch):
+    def test_no_network_is_downloaded_by_the_libraries(
+        self, untrained_weights: Path, monkeypatch: pytest.MonkeyPatch
+    ):
         def refuse(*_: object, **__: object) -> None:
             raise AssertionError("a library tried to download")
 
@@ -239,8 +274,13 @@ class TestContracts:
         from kornia.feature import DISK
 
         torch.manual_seed(0)
-        torch.save({"extractor": DISK().state_dict(), "optimizer": {"lr": 1.0}}, tmp_path / "depth-save.pth")
-        settings = Dim(extractor="disk", matcher="mutual_nearest", max_keypoints=50).feature_settings()
+        torch.save(
+            {"extractor": DISK().state_dict(), "optimizer": {"lr": 1.0}},
+            tmp_path / "depth-save.pth",
+        )
+        settings = Dim(
+            extractor="disk", matcher="mutual_nearest", max_keypoints=50
+        ).feature_settings()
         extract = EXTRACTORS[settings.extractor](settings, tmp_path / "depth-save.pth", CPU)
         with torch.inference_mode():
             keypoints, descriptors, scores = extract(torch.rand(1, 3, 75, 101))
@@ -251,30 +291,47 @@ class TestContracts:
 
 
 @pytest.mark.parametrize(
-    ("extractor", "threshold", "radius"), [("superpoint", 0.0005, 3), ("aliked", 0.2, 2), ("disk", 0.0, 2)]
+    ("extractor", "threshold", "radius"),
+    [("superpoint", 0.0005, 3), ("aliked", 0.2, 2), ("disk", 0.0, 2)],
 )
 def test_detection_settings_are_the_extractors_own_unless_given(
     extractor: str, threshold: float, radius: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As deep-image-matching and the authors have them; the files are those of the networks in use."""
+    """As deep-image-matching and the authors have them; the files are those of the networks in
+    use."""
     own = Dim(extractor=extractor, matcher="mutual_nearest", weights=tmp_path, download=False)  # type: ignore[arg-type]
     found = own.feature_settings()
     assert (found.keypoint_threshold, found.nms_radius) == (threshold, radius)
     given = replace(own, keypoint_threshold=0.0, nms_radius=7).feature_settings()
     assert (given.keypoint_threshold, given.nms_radius) == (0.0, 7)
     monkeypatch.setattr(
-        "gsbench.init.dim.find_all_weights", lambda files, folder, download: [f.names[0] for f in files]
+        "gsbench.init.dim.find_all_weights",
+        lambda files, folder, download: [f.names[0] for f in files],
     )
-    name = {"superpoint": "superpoint.safetensors", "aliked": "aliked-n16.pth", "disk": "depth-save.pth"}[extractor]
+    name = {
+        "superpoint": "superpoint.safetensors",
+        "aliked": "aliked-n16.pth",
+        "disk": "depth-save.pth",
+    }[extractor]
     assert own.find_weights() == (name, None)
-    assert replace(own, matcher="lightglue").find_weights() == (name, f"{extractor}_lightglue_v0-1_arxiv-pth")
+    assert replace(own, matcher="lightglue").find_weights() == (
+        name,
+        f"{extractor}_lightglue_v0-1_arxiv-pth",
+    )
     assert ("transformers" in own.packages()) == (extractor == "superpoint")
     for one in (found, given):  # what features depend on, and no more, makes other features
         model = {"aliked_model": "n16"} if extractor == "aliked" else {}
-        assert one.extraction() == {
-            "extractor": extractor, "max_image_size": 1600, "max_keypoints": 2048,
-            "keypoint_threshold": one.keypoint_threshold, "nms_radius": one.nms_radius,
-        } | model  # fmt: skip
+        assert (
+            one.extraction()
+            == {
+                "extractor": extractor,
+                "max_image_size": 1600,
+                "max_keypoints": 2048,
+                "keypoint_threshold": one.keypoint_threshold,
+                "nms_radius": one.nms_radius,
+            }
+            | model
+        )
     assert found.matching() == {"matcher": "mutual_nearest", "max_ratio": 0.95}
     light = replace(own, matcher="lightglue").feature_settings().matching()
     assert light == {"matcher": "lightglue", "filter_threshold": 0.1}
@@ -282,14 +339,21 @@ def test_detection_settings_are_the_extractors_own_unless_given(
 
 class TestErrors:
     def test_missing_weights_are_named_before_any_work(self, courtyard: Capture, tmp_path: Path):
-        with pytest.raises(MissingWeightsError, match=r"superpoint.safetensors, superpoint_lightglue_v0-1_arxiv-pth"):
+        with pytest.raises(
+            MissingWeightsError,
+            match=r"superpoint.safetensors, superpoint_lightglue_v0-1_arxiv-pth",
+        ):
             Dim(download=False).run(courtyard, tmp_path / "out")
         assert not (tmp_path / "out").exists()
 
     def test_wrong_checksum(self, courtyard: Capture, tmp_path: Path):
         (tmp_path / "aliked-n16.pth").write_bytes(b"not ALIKED")
-        with pytest.raises(MissingWeightsError, match=r"aliked-n16.pth has sha256 .* expected 5be8704840ed662d"):
-            Dim(extractor="aliked", weights=tmp_path, download=False).run(courtyard, tmp_path / "out")
+        with pytest.raises(
+            MissingWeightsError, match=r"aliked-n16.pth has sha256 .* expected 5be8704840ed662d"
+        ):
+            Dim(extractor="aliked", weights=tmp_path, download=False).run(
+                courtyard, tmp_path / "out"
+            )
 
     def test_weights_of_another_network(self, tmp_path: Path):
         torch.save({"conv.weight": torch.zeros(3)}, tmp_path / "foreign.pth")
@@ -297,7 +361,9 @@ class TestErrors:
         with pytest.raises(MissingWeightsError, match="is for another network"):
             build_matcher(settings, tmp_path / "foreign.pth", CPU)
         with pytest.raises(MissingWeightsError, match="is for another network"):
-            EXTRACTORS["aliked"](Dim(extractor="aliked").feature_settings(), tmp_path / "foreign.pth", CPU)
+            EXTRACTORS["aliked"](
+                Dim(extractor="aliked").feature_settings(), tmp_path / "foreign.pth", CPU
+            )
 
     def test_weights_of_another_shape(self, untrained_weights: Path, tmp_path: Path):
         state = torch.load(untrained_weights / "superpoint_lightglue.pth", weights_only=True)
@@ -326,13 +392,19 @@ class TestErrors:
 
     def test_out_of_gpu_memory_in_matching_says_so(self):
         features = Features(
-            np.zeros((1000, 2), np.float32), np.zeros((1000, 8), np.float32), np.ones(1000, np.float32), (9, 9), (9, 9)
+            np.zeros((1000, 2), np.float32),
+            np.zeros((1000, 8), np.float32),
+            np.ones(1000, np.float32),
+            (9, 9),
+            (9, 9),
         )
 
         def no_gpu(first: Features, second: Features) -> np.ndarray:
             raise torch.OutOfMemoryError("CUDA out of memory")
 
-        with pytest.raises(InputError, match=r"1000 keypoints ran out of memory: lower init.max_image_size"):
+        with pytest.raises(
+            InputError, match=r"1000 keypoints ran out of memory: lower init.max_image_size"
+        ):
             match(no_gpu, features, features)
 
     def test_out_of_gpu_memory_in_extraction_says_so(self, courtyard: Capture):
@@ -344,17 +416,30 @@ class TestErrors:
 
     def test_an_empty_image_has_no_matches(self):
         some = Features(
-            np.zeros((3, 2), np.float32), np.eye(3, 8, dtype=np.float32), np.ones(3, np.float32), (9, 9), (9, 9)
+            np.zeros((3, 2), np.float32),
+            np.eye(3, 8, dtype=np.float32),
+            np.ones(3, np.float32),
+            (9, 9),
+            (9, 9),
         )
         assert match(mutual_nearest_matcher(0.9, CPU), some, some[:0]).shape == (0, 2)
 
     @pytest.mark.parametrize(
         ("options", "message"),
         [
-            ({"extractor": "sift"}, "init.extractor must be 'superpoint', 'aliked' or 'disk', got 'sift'"),
+            (
+                {"extractor": "sift"},
+                "init.extractor must be 'superpoint', 'aliked' or 'disk', got 'sift'",
+            ),
             ({"matcher": "superglue"}, "init.matcher must be .* got 'superglue'"),
-            ({"extractor": "aliked", "aliked_model": "t16"}, "init.matcher=lightglue has no weights"),
-            ({"filter_threshold": -1}, r"init.filter_threshold must be a number in \[0, 1\], got -1"),
+            (
+                {"extractor": "aliked", "aliked_model": "t16"},
+                "init.matcher=lightglue has no weights",
+            ),
+            (
+                {"filter_threshold": -1},
+                r"init.filter_threshold must be a number in \[0, 1\], got -1",
+            ),
             ({"max_keypoints": 0}, "init.max_keypoints must be a whole number above 0, got 0"),
         ],
     )
@@ -372,7 +457,11 @@ def test_mutual_nearest_by_brute_force():
     sides = []
     for _ in range(2):
         descriptors = rng.normal(size=(60, 6)).astype(np.float32)
-        sides.append(Features(np.zeros((60, 2), np.float32), descriptors, np.ones(60, np.float32), (9, 9), (9, 9)))
+        sides.append(
+            Features(
+                np.zeros((60, 2), np.float32), descriptors, np.ones(60, np.float32), (9, 9), (9, 9)
+            )
+        )
     distance = np.linalg.norm(sides[0].descriptors[:, None] - sides[1].descriptors[None], axis=2)
     expected = []
     for i in range(60):

@@ -1,4 +1,5 @@
-"""Features from outside COLMAP: the same model as COLMAP's own path, and coordinates that are right."""
+"""Features from outside COLMAP: the same model as COLMAP's own path, and coordinates that are
+right."""
 
 from __future__ import annotations
 
@@ -27,17 +28,24 @@ from gsbench.init.networks.features import Features, FeatureSettings
 from gsbench.logs import no_progress
 from gsbench.scene.types import Capture
 
-SIFT = FeatureSettings(extractor="sift_kornia", matcher="mutual_nearest", max_image_size=1600, max_keypoints=2000)
+SIFT = FeatureSettings(
+    extractor="sift_kornia", matcher="mutual_nearest", max_image_size=1600, max_keypoints=2000
+)
 
 
 def new_database(path: Path, capture: Capture) -> list[str]:
     return list(
-        create_database(path, unknown_camera_groups(capture.images, capture.image_names, "single", "PINHOLE", 300.0))
+        create_database(
+            path,
+            unknown_camera_groups(capture.images, capture.image_names, "single", "PINHOLE", 300.0),
+        )
     )
 
 
 @pytest.fixture(scope="module")
-def own_path(bare_photos: Capture, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[tuple[str, str]]]:
+def own_path(
+    bare_photos: Capture, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, list[tuple[str, str]]]:
     """A database that COLMAP filled by itself, and its pairs."""
     path = tmp_path_factory.mktemp("own") / "database.db"
     names = new_database(path, bare_photos)
@@ -53,7 +61,9 @@ def test_sift_through_the_external_path_gives_the_same_model(
     own, pairs = own_path
     with pycolmap.Database.open(own) as database:
         ids = {image.name: image.image_id for image in database.read_all_images()}
-        keypoints = {name: database.read_keypoints(image_id)[:, :2] for name, image_id in ids.items()}
+        keypoints = {
+            name: database.read_keypoints(image_id)[:, :2] for name, image_id in ids.items()
+        }
         matches = {(a, b): database.read_matches(ids[a], ids[b]) for a, b in pairs}
     external = tmp_path / "external.db"
     new_database(external, bare_photos)
@@ -63,7 +73,8 @@ def test_sift_through_the_external_path_gives_the_same_model(
     assert database_counts(external) == database_counts(own)
 
     first, second = (
-        map_images(path, bare_photos.images, tmp_path / path.stem, Sfm(), no_progress).model for path in (own, external)
+        map_images(path, bare_photos.images, tmp_path / path.stem, Sfm(), no_progress).model
+        for path in (own, external)
     )
     assert first.num_points3D() == second.num_points3D() > 100
     for point_id, point in first.points3D.items():
@@ -78,12 +89,15 @@ def test_sift_through_the_external_path_gives_the_same_model(
 def test_kornia_keypoints_coincide_with_colmaps(
     own_path: tuple[Path, list[tuple[str, str]]], bare_photos: Capture, max_image_size: int
 ):
-    """Two implementations of SIFT find the same points; a half-pixel or scale error would shift all of them."""
+    """Two implementations of SIFT find the same points; a half-pixel or scale error would shift all
+    of them."""
     name = bare_photos.image_names[0]
     with pycolmap.Database.open(own_path[0]) as database:
         colmap = database.read_keypoints(database.read_image_with_name(name).image_id)[:, :2]
     extractor = EXTRACTORS[SIFT.extractor](SIFT, None, torch.device("cpu"))
-    features = extract_features(bare_photos.images / name, extractor, max_image_size, 2000, torch.device("cpu"))
+    features = extract_features(
+        bare_photos.images / name, extractor, max_image_size, 2000, torch.device("cpu")
+    )
     assert features.network_size == (max_image_size, round(max_image_size * 0.75))
     ours = features.colmap_keypoints
     distances = np.linalg.norm(ours[:, None] - colmap[None], axis=2)  # [K, L]
@@ -98,7 +112,9 @@ def test_a_blob_is_found_at_its_centre(tmp_path: Path, center: tuple[float, floa
     """Coordinates in which the first pixel covers 0 to 1: the blob is drawn, and found, in them."""
     x, y = np.meshgrid(np.arange(100) + 0.5, np.arange(80) + 0.5)
     blob = 40 + 200 * np.exp(-((x - center[0]) ** 2 + (y - center[1]) ** 2) / (2 * 4.0**2))
-    Image.fromarray(np.repeat(blob[..., None], 3, axis=2).round().astype(np.uint8)).save(tmp_path / "blob.png")
+    Image.fromarray(np.repeat(blob[..., None], 3, axis=2).round().astype(np.uint8)).save(
+        tmp_path / "blob.png"
+    )
     extractor = EXTRACTORS[SIFT.extractor](SIFT, None, torch.device("cpu"))
     features = extract_features(tmp_path / "blob.png", extractor, 1600, 10, torch.device("cpu"))
     np.testing.assert_allclose(features.colmap_keypoints[0], center, atol=0.05)
@@ -120,12 +136,15 @@ def test_a_pair_must_keep_a_share_of_its_matches(
 ):
     """Pairs below the ratio are dropped, those above stay.
 
-    COLMAP asks the ratio of each geometry that it tries (essential, fundamental, homography), so a pair may be
-    kept by another one than without the ratio, with other inliers; by the same one, it is what it was.
+    COLMAP asks the ratio of each geometry that it tries (essential, fundamental, homography), so a
+    pair may be kept by another one than without the ratio, with other inliers; by the same one, it
+    is what it was.
     """
     with pycolmap.Database.open(own_path[0]) as database:
         ids = {image.name: image.image_id for image in database.read_all_images()}
-        keypoints = {name: database.read_keypoints(image_id)[:, :2] for name, image_id in ids.items()}
+        keypoints = {
+            name: database.read_keypoints(image_id)[:, :2] for name, image_id in ids.items()
+        }
         matches = {(a, b): database.read_matches(ids[a], ids[b]) for a, b in own_path[1]}
     geometries: dict[float, dict[tuple[str, str], pycolmap.TwoViewGeometry]] = {}
     for ratio in (0.0, 0.8):
@@ -133,10 +152,13 @@ def test_a_pair_must_keep_a_share_of_its_matches(
         new_database(path, bare_photos)
         write_keypoints(path, keypoints)
         write_matches(path, matches)
-        verify_pairs(path, own_path[1], verification_options(Sfm(min_inlier_ratio=ratio)), no_progress)
+        verify_pairs(
+            path, own_path[1], verification_options(Sfm(min_inlier_ratio=ratio)), no_progress
+        )
         with pycolmap.Database.open(path) as database:
             geometries[ratio] = {
-                pair: database.read_two_view_geometry(ids[pair[0]], ids[pair[1]]) for pair in own_path[1]
+                pair: database.read_two_view_geometry(ids[pair[0]], ids[pair[1]])
+                for pair in own_path[1]
             }
     verified = {pair for pair, geometry in geometries[0.0].items() if len(geometry.inlier_matches)}
     kept = {pair for pair, geometry in geometries[0.8].items() if len(geometry.inlier_matches)}

@@ -1,4 +1,5 @@
-"""Clouds of points from files of every kind, checked against arrays that were written and pycolmap's projection."""
+"""Clouds of points from files of every kind, checked against arrays that were written and
+pycolmap's projection."""
 
 from __future__ import annotations
 
@@ -24,7 +25,13 @@ XYZ = RNG.uniform(-2, 2, (40, 3)).astype(np.float32).astype(np.float64)
 RGB = RNG.integers(0, 256, (40, 3))
 
 
-def write(path: Path, properties: list[tuple[str, str]], values: dict[str, np.ndarray], text: bool, order: str) -> Path:
+def write(
+    path: Path,
+    properties: list[tuple[str, str]],
+    values: dict[str, np.ndarray],
+    text: bool,
+    order: str,
+) -> Path:
     table = np.zeros(len(XYZ), dtype=[(name, kind) for name, kind in properties])
     for name, column in values.items():
         table[name] = column
@@ -36,9 +43,15 @@ def write(path: Path, properties: list[tuple[str, str]], values: dict[str, np.nd
 @pytest.mark.parametrize("order", ["<", ">"])
 @pytest.mark.parametrize(
     ("names", "kind", "scale"),
-    [(("red", "green", "blue"), "u1", 1), (("r", "g", "b"), "f4", 1 / 255), (("red", "green", "blue"), "u2", 257)],
+    [
+        (("red", "green", "blue"), "u1", 1),
+        (("r", "g", "b"), "f4", 1 / 255),
+        (("red", "green", "blue"), "u2", 257),
+    ],
 )
-def test_ply_of_any_order_and_type(tmp_path: Path, text: bool, order: str, names, kind: str, scale: float):
+def test_ply_of_any_order_and_type(
+    tmp_path: Path, text: bool, order: str, names, kind: str, scale: float
+):
     properties = [
         (names[2], kind),
         ("z", "f8"),
@@ -48,7 +61,9 @@ def test_ply_of_any_order_and_type(tmp_path: Path, text: bool, order: str, names
         ("y", "f8"),
         (names[1], kind),
     ]
-    values = dict(zip("xyz", XYZ.T, strict=True)) | {name: RGB[:, i] * scale for i, name in enumerate(names)}
+    values = dict(zip("xyz", XYZ.T, strict=True)) | {
+        name: RGB[:, i] * scale for i, name in enumerate(names)
+    }
     points, colors = read_points(write(tmp_path / "cloud.ply", properties, values, text, order))
     np.testing.assert_allclose(points, XYZ, rtol=1e-6)
     np.testing.assert_array_equal(colors, RGB)
@@ -80,7 +95,8 @@ def test_a_table_may_have_a_mark_and_line_ends_of_windows(tmp_path: Path, suffix
 
 
 def test_colours_of_gaussians_are_those_of_their_constant_harmonic(tmp_path: Path):
-    """RGB = .5 + f_dc / (2 sqrt(pi)), clipped: the colour that 3DGS gives a Gaussian without view dependence."""
+    """RGB = .5 + f_dc / (2 sqrt(pi)), clipped: the colour that 3DGS gives a Gaussian without view
+    dependence."""
     properties = [(name, "f4") for name in (*"xyz", "f_dc_0", "f_dc_1", "f_dc_2")]
     dc = (RGB / 255 - 0.5) * 2 * np.sqrt(np.pi)
     dc[0], dc[1] = 9.0, -9.0
@@ -154,7 +170,9 @@ def save(path: Path, table: np.ndarray) -> None:
 
 
 def bad_ply(path: Path) -> None:
-    path.write_bytes(b"ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nend_header\n1\n2\n3\n")
+    path.write_bytes(
+        b"ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nend_header\n1\n2\n3\n"
+    )
 
 
 def empty_ply(path: Path) -> None:
@@ -189,7 +207,9 @@ def test_a_file_that_is_not_there_and_photos_without_cameras(bare_photos: Captur
     assert Points(path=tmp_path / "a.xyz").needs_reference(replace(bare_photos))
 
 
-@pytest.mark.parametrize(("shape", "kind"), [((4, 2), "float64"), ((4,), "float64"), ((4, 3), "float32")])
+@pytest.mark.parametrize(
+    ("shape", "kind"), [((4, 2), "float64"), ((4,), "float64"), ((4, 3), "float32")]
+)
 def test_a_cloud_takes_rows_of_three_coordinates_alone(shape: tuple[int, ...], kind: str) -> None:
     with pytest.raises(ValueError, match="points must be"):
         PointCloud(np.zeros(shape, kind), np.zeros(shape, np.uint8))

@@ -31,12 +31,17 @@ NAMES = ("a.png", "b.png", "c.png", "d.png")
 CENTERS = np.array([[1.0, 0, 0], [-1.0, 0, 0], [0, 1.0, 0], [0, 5.0, 0]])  # d is held out
 
 
-def model_of(centers: np.ndarray, turn: Rotation | None = None, shift_px: float = 0.0) -> pycolmap.Reconstruction:
-    """Cameras that look along +z, and two points, observed with an error of ``shift_px`` in x by the first two."""
+def model_of(
+    centers: np.ndarray, turn: Rotation | None = None, shift_px: float = 0.0
+) -> pycolmap.Reconstruction:
+    """Cameras that look along +z, and two points, observed with an error of ``shift_px`` in x by
+    the first two."""
     points = np.array([[0.0, 0.0, 5.0], [0.5, 0.5, 6.0]])
     rotation = (turn or Rotation.identity()).as_matrix()
     model = pycolmap.Reconstruction()
-    model.add_camera_with_trivial_rig(pycolmap.Camera.create_from_model_name(1, "PINHOLE", 100.0, 100, 80))
+    model.add_camera_with_trivial_rig(
+        pycolmap.Camera.create_from_model_name(1, "PINHOLE", 100.0, 100, 80)
+    )
     for index, (name, center) in enumerate(zip(NAMES, centers, strict=True), start=1):
         pose = pycolmap.Rigid3d(np.column_stack([rotation, -rotation @ center]))
         camera_points = points @ rotation.T - rotation @ center
@@ -73,7 +78,9 @@ def test_gauge_of_the_papers_threshold():
 def test_figures_of_a_model(capture: Capture):
     model = model_of(CENTERS, shift_px=0.75)
     counts = {"features": 7}
-    report = make_report("x", "shared", capture, model, 1.0, ("pycolmap",), settings={}, seconds={}, counts=counts)
+    report = make_report(
+        "x", "shared", capture, model, 1.0, ("pycolmap",), settings={}, seconds={}, counts=counts
+    )
     assert report.counts == counts
     assert (report.num_images, report.num_registered, report.num_points) == (4, 4, 2)
     assert report.mean_reprojection_error == pytest.approx(0.75)
@@ -89,7 +96,12 @@ def test_missing_images_and_doubtful_numbers_are_warnings(tmp_path: Path):
     report = make_report("x", "own", capture, model, None, (), settings={}, seconds={})
     assert report.unregistered == ("e.png",)
     text = "\n".join(report.warnings)
-    for part in ("only 4 of 5 images have a pose (missing: e.png)", "only 2 points", "3.00 px is large", "implausible"):
+    for part in (
+        "only 4 of 5 images have a pose (missing: e.png)",
+        "only 2 points",
+        "3.00 px is large",
+        "implausible",
+    ):
         assert part in text
 
 
@@ -99,7 +111,11 @@ POSES = PoseErrors(4, True, 0.1, 0.1, 0.1, 0.04, 1.0, 1.0)
 @pytest.mark.parametrize(
     ("sound", "doubtful", "said"),
     [
-        ({"num_registered": 9}, {"num_registered": 8}, "only 8 of 10 images have a pose (missing: a, b, c, d, e …)"),
+        (
+            {"num_registered": 9},
+            {"num_registered": 8},
+            "only 8 of 10 images have a pose (missing: a, b, c, d, e …)",
+        ),
         ({"num_points": 100}, {"num_points": 99}, "only 99 points"),
         ({"mean_reprojection_error": 1.5}, {"mean_reprojection_error": 1.52}, "1.52 px is large"),
         ({"mean_reprojection_error": None}, {"mean_reprojection_error": 40.0}, "40.00 px is large"),
@@ -113,7 +129,11 @@ POSES = PoseErrors(4, True, 0.1, 0.1, 0.1, 0.04, 1.0, 1.0)
             {"pose_errors": replace(POSES, center_rmse_relative=0.051, exact=False)},
             "5.1% of the scene extent away from the reference ones",
         ),
-        ({"pose_errors": replace(POSES, center_rmse_relative=None)}, {"num_points": 0}, "only 0 points"),
+        (
+            {"pose_errors": replace(POSES, center_rmse_relative=None)},
+            {"num_points": 0},
+            "only 0 points",
+        ),
     ],
 )
 def test_a_model_is_doubted_beyond_each_limit(
@@ -121,15 +141,21 @@ def test_a_model_is_doubted_beyond_each_limit(
 ) -> None:
     model = model_of(CENTERS)
     report = make_report("x", "own", capture, model, None, (), settings={}, seconds={})
-    report = replace(report, num_images=10, num_registered=10, unregistered=tuple("abcdef"), num_points=100)
+    report = replace(
+        report, num_images=10, num_registered=10, unregistered=tuple("abcdef"), num_points=100
+    )
     assert find_warnings(report, model) == ()
     assert find_warnings(replace(report, **sound), model) == ()
     (warning,) = find_warnings(replace(report, **doubtful), model)
     assert said in warning
 
 
-@pytest.mark.parametrize(("focal", "view"), [(1140.0, 5.02), (1150.0, 4.98), (13.5, 149.8), (13.2, 150.4)])
-def test_a_field_of_view_beyond_5_to_150_degrees_is_doubted(capture: Capture, focal: float, view: float) -> None:
+@pytest.mark.parametrize(
+    ("focal", "view"), [(1140.0, 5.02), (1150.0, 4.98), (13.5, 149.8), (13.2, 150.4)]
+)
+def test_a_field_of_view_beyond_5_to_150_degrees_is_doubted(
+    capture: Capture, focal: float, view: float
+) -> None:
     """Of the longest side, 100 px: twice the arc tangent of 50 px over the focal length."""
     assert math.degrees(2 * math.atan(50 / focal)) == pytest.approx(view, abs=0.05)
     model = model_of(CENTERS)
@@ -139,11 +165,14 @@ def test_a_field_of_view_beyond_5_to_150_degrees_is_doubted(capture: Capture, fo
 
 
 def test_pose_errors_after_a_similarity():
-    """A model moved by a similarity has no error; one camera displaced by 0.3 shows it, and only it."""
+    """A model moved by a similarity has no error; one camera displaced by 0.3 shows it, and only
+    it."""
     turn = Rotation.from_rotvec([0.2, 0.1, -0.4])
     reference = model_of(CENTERS)
     model = model_of(CENTERS)
-    model.transform(pycolmap.Sim3d(3.0, pycolmap.Rotation3d(turn.as_matrix()), np.array([1.0, 2.0, 3.0])))
+    model.transform(
+        pycolmap.Sim3d(3.0, pycolmap.Rotation3d(turn.as_matrix()), np.array([1.0, 2.0, 3.0]))
+    )
     similarity = similarity_to(model, reference)
     errors = compare_poses(model, reference, similarity, 2.0, exact=True)
     assert similarity.scale == pytest.approx(1 / 3)
@@ -157,12 +186,16 @@ def test_pose_errors_after_a_similarity():
     assert errors.center_max < 1e-9
 
 
-def test_where_two_cameras_are_common_nothing_is_compared_and_that_is_said(capture: Capture, tmp_path: Path) -> None:
+def test_where_two_cameras_are_common_nothing_is_compared_and_that_is_said(
+    capture: Capture, tmp_path: Path
+) -> None:
     """Three at least fix a similarity."""
     model, reference = model_of(CENTERS), model_of(CENTERS)
     for image_id in (3, 4):
         reference.deregister_frame(reference.images[image_id].frame_id)
-    work = ReconstructionJob(Sfm(), capture, tmp_path / "out", tmp_path / "work", None, Preparation())
+    work = ReconstructionJob(
+        Sfm(), capture, tmp_path / "out", tmp_path / "work", None, Preparation()
+    )
     similarity = similarity_to(model, reference)
     report = _finish(work, "own", model, reference, similarity, Timer({}), {})
     assert report.pose_errors is None
@@ -204,7 +237,8 @@ def test_above_is_along_the_normal_of_a_ring_of_cameras():
 def test_above_for_cameras_that_look_down(points: int, side: float):
     """What is above is the side of the points on which the cameras stand."""
     centers = np.array([[x, y, 10.0 * side] for x in range(4) for y in range(4)])
-    down = np.diag([side, -1.0, -side])  # world to camera: looks along -z or z, the image's top is +y
+    # world to camera: looks along -z or z, the image's top is +y
+    down = np.diag([side, -1.0, -side])
     axes = view_from_above(centers, np.tile(down, (16, 1, 1)), np.zeros((points, 3)))
     np.testing.assert_allclose(axes[2], [0, 0, side], atol=1e-9)
 
@@ -219,8 +253,9 @@ def test_picture_shows_points_in_their_colours(tmp_path: Path, monkeypatch: pyte
 
 
 def test_the_picture_is_a_map_seen_from_the_cameras_side(tmp_path: Path) -> None:
-    """All cameras look along +z from the plane z = 0: x is right, y is down. Five units and a twentieth more at either
-    side fill 840 of 960 px, so a unit takes 840 / 5.5 px about the middle, (0, 2.5)."""
+    """All cameras look along +z from the plane z = 0: x is right, y is down. Five units and a
+    twentieth more at either side fill 840 of 960 px, so a unit takes 840 / 5.5 px about the middle,
+    (0, 2.5)."""
     draw_cloud(model_of(CENTERS), tmp_path / "cloud.png", "hand-made")
     pixels = np.asarray(Image.open(tmp_path / "cloud.png").convert("RGB")).astype(int)
     assert pixels.shape == (960, 960, 3)
@@ -244,14 +279,22 @@ def test_points_are_drawn_smaller_the_more_there_are(tmp_path: Path) -> None:
     inked = []
     for others in (1, 6_000, 60_000):
         model = pycolmap.Reconstruction()
-        model.add_camera_with_trivial_rig(pycolmap.Camera.create_from_model_name(1, "PINHOLE", 100.0, 100, 80))
+        model.add_camera_with_trivial_rig(
+            pycolmap.Camera.create_from_model_name(1, "PINHOLE", 100.0, 100, 80)
+        )
         for index, (x, y) in enumerate(((0.0, 0.0), (8.0, 5.0)), start=1):
             pose = pycolmap.Rigid3d(np.column_stack([np.eye(3), [-x, -y, 0]]))
-            image = pycolmap.Image(name=f"{index}", keypoints=np.zeros((1, 2)), camera_id=1, image_id=index)
+            image = pycolmap.Image(
+                name=f"{index}", keypoints=np.zeros((1, 2)), camera_id=1, image_id=index
+            )
             model.add_image_with_trivial_frame(image, pose)
         for _ in range(others):
-            model.add_point3D(np.array([1.0, 1.0, 5.0]), pycolmap.Track(), np.array([10, 20, 30], dtype=np.uint8))
-        model.add_point3D(np.array([6.0, 4.0, 5.0]), pycolmap.Track(), np.array([30, 90, 30], dtype=np.uint8))
+            model.add_point3D(
+                np.array([1.0, 1.0, 5.0]), pycolmap.Track(), np.array([10, 20, 30], dtype=np.uint8)
+            )
+        model.add_point3D(
+            np.array([6.0, 4.0, 5.0]), pycolmap.Track(), np.array([30, 90, 30], dtype=np.uint8)
+        )
         draw_cloud(model, tmp_path / "cloud.png", "hand-made")
         pixels = np.asarray(Image.open(tmp_path / "cloud.png").convert("RGB"))
         inked.append(int((pixels == [30, 90, 30]).all(axis=-1).sum()))

@@ -22,7 +22,9 @@ from tests.scene.courtyard.surfaces import surface_distance
 
 
 def digest(model: Path) -> str:
-    return hashlib.sha256(b"".join(file.read_bytes() for file in sorted(model.glob("*.bin")))).hexdigest()
+    return hashlib.sha256(
+        b"".join(file.read_bytes() for file in sorted(model.glob("*.bin")))
+    ).hexdigest()
 
 
 def picture(path: Path, pixels: np.ndarray) -> None:
@@ -49,10 +51,14 @@ def told() -> list[tuple[str, int, int | None]]:
 
 @pytest.fixture(scope="module")
 def shared(
-    courtyard: Capture, told: list[tuple[str, int, int | None]], tmp_path_factory: pytest.TempPathFactory
+    courtyard: Capture,
+    told: list[tuple[str, int, int | None]],
+    tmp_path_factory: pytest.TempPathFactory,
 ) -> tuple[InitReport, Path]:
     output = tmp_path_factory.mktemp("shared")
-    return Sfm().run(courtyard, output, lambda phase, done, total, note="": told.append((phase, done, total))), output
+    return Sfm().run(
+        courtyard, output, lambda phase, done, total, note="": told.append((phase, done, total))
+    ), output
 
 
 @pytest.mark.slow
@@ -62,7 +68,8 @@ def test_own_poses_agree_with_the_exact_ones(own: tuple[InitReport, Path]):
     assert report.pose_errors is not None
     assert report.pose_errors.exact
     assert report.pose_errors.center_max < 0.02  # m, on a ring of 4.5 m radius
-    assert report.pose_errors.rotation_max_deg < 1.5  # an arc of 52 degrees fixes the turn about itself weakly
+    # an arc of 52 degrees fixes the turn about itself weakly
+    assert report.pose_errors.rotation_max_deg < 1.5
     assert report.focal_lengths[0] == pytest.approx(300.9, rel=0.01)  # 320 / (2 tan 28 degrees)
     assert report.mean_reprojection_error < 0.5
     assert report.warnings == ()
@@ -89,39 +96,54 @@ def test_jittered_is_sfm_with_copies_nearby(
 
 def test_own_model_is_written_in_both_gauges(own: tuple[InitReport, Path], courtyard: Capture):
     report, output = own
-    aligned, raw = pycolmap.Reconstruction(output / MODEL_FOLDER), pycolmap.Reconstruction(output / OWN_GAUGE_FOLDER)
+    aligned, raw = (
+        pycolmap.Reconstruction(output / MODEL_FOLDER),
+        pycolmap.Reconstruction(output / OWN_GAUGE_FOLDER),
+    )
     scale = report.own_gauge.scale_to_reference
     assert report.gauge.scale_to_reference == 1.0
     first, second = (
-        {image.name: image.projection_center() for image in model.images.values()} for model in (aligned, raw)
+        {image.name: image.projection_center() for image in model.images.values()}
+        for model in (aligned, raw)
     )
     ratio = np.linalg.norm(first["0000.png"] - first["0007.png"]) / np.linalg.norm(
         second["0000.png"] - second["0007.png"]
     )
     assert ratio == pytest.approx(scale, rel=1e-9)
-    assert report.gauge.scene_extent == pytest.approx(report.own_gauge.scene_extent * scale, rel=1e-9)
+    assert report.gauge.scene_extent == pytest.approx(
+        report.own_gauge.scene_extent * scale, rel=1e-9
+    )
     assert report.own_gauge.threshold_in_reference == pytest.approx(0.03 * scale**3, rel=1e-12)
     exact = pycolmap.Reconstruction(courtyard.model)
     for image in exact.images.values():
         np.testing.assert_allclose(first[image.name], image.projection_center(), atol=0.02)
 
 
-def test_known_poses_give_points_on_the_true_surfaces(shared: tuple[InitReport, Path], courtyard: Capture):
+def test_known_poses_give_points_on_the_true_surfaces(
+    shared: tuple[InitReport, Path], courtyard: Capture
+):
     report, output = shared
     assert report.poses == "shared"
     assert report.pose_errors is None
-    assert np.median(surface_distance(read_cloud(output / MODEL_FOLDER).points)) < 0.02  # m; a pixel covers 0.015 m
-    model, exact = pycolmap.Reconstruction(output / MODEL_FOLDER), pycolmap.Reconstruction(courtyard.model)
+    # m; a pixel covers 0.015 m
+    assert np.median(surface_distance(read_cloud(output / MODEL_FOLDER).points)) < 0.02
+    model, exact = (
+        pycolmap.Reconstruction(output / MODEL_FOLDER),
+        pycolmap.Reconstruction(courtyard.model),
+    )
     for image in exact.images.values():  # the cameras are the reference's, to the bit
         np.testing.assert_array_equal(
-            model.find_image_with_name(image.name).cam_from_world().matrix(), image.cam_from_world().matrix()
+            model.find_image_with_name(image.name).cam_from_world().matrix(),
+            image.cam_from_world().matrix(),
         )
 
 
 def test_colours_are_the_photographs(shared: tuple[InitReport, Path], courtyard: Capture):
     _, output = shared
     model = pycolmap.Reconstruction(output / MODEL_FOLDER)
-    pixels = {name: np.asarray(Image.open(courtyard.images / name)) for name in courtyard.image_names}
+    pixels = {
+        name: np.asarray(Image.open(courtyard.images / name)) for name in courtyard.image_names
+    }
     differences = []
     for point in model.points3D.values():
         seen = []
@@ -142,7 +164,9 @@ def test_output_is_complete_and_the_work_folder_is_gone(shared: tuple[InitReport
     assert not (output / WORK_FOLDER).exists()
 
 
-def test_every_phase_is_told_from_its_start_to_its_end(shared: tuple[InitReport, Path], told: list) -> None:
+def test_every_phase_is_told_from_its_start_to_its_end(
+    shared: tuple[InitReport, Path], told: list
+) -> None:
     phases = {phase: [state for state in told if state[0] == phase] for phase, _, _ in told}
     assert list(phases) == ["extract", "match", "triangulate"]
     for (_, first, _), *_, (_, last, total) in phases.values():
@@ -166,7 +190,9 @@ def test_whose_cameras_are_taken_and_which_photographs_are_used(
     """Of four photographs, b is a test view and a is not in the reference."""
     options = Sfm(poses=poses, intrinsics=intrinsics, points_from=points_from)  # type: ignore[arg-type]
     capture = Capture("x", Path("x"), ("a", "b", "c", "d"), ("b",), None, False, "0")
-    made = pycolmap.SyntheticDatasetOptions(num_rigs=1, num_cameras_per_rig=1, num_frames_per_rig=3, num_points3D=3)
+    made = pycolmap.SyntheticDatasetOptions(
+        num_rigs=1, num_cameras_per_rig=1, num_frames_per_rig=3, num_points3D=3
+    )
     reference = pycolmap.synthesize_dataset(made)
     for image, name in zip(reference.images.values(), "dcb", strict=True):
         image.name = name
@@ -186,14 +212,18 @@ def test_two_runs_are_equal_to_the_bit_on_any_number_of_threads(
 
 
 @pytest.mark.slow
-def test_bare_photos_get_poses_of_their_own_and_serve_as_reference(bare_photos: Capture, tmp_path: Path):
+def test_bare_photos_get_poses_of_their_own_and_serve_as_reference(
+    bare_photos: Capture, tmp_path: Path
+):
     assert not Sfm().needs_reference(bare_photos)
     report = Sfm().run(bare_photos, tmp_path / "sfm")
     assert report.poses == "own"
     assert report.pose_errors is None
     assert report.gauge.scale_to_reference is None
     assert SfmDense().needs_reference(bare_photos)
-    dense = SfmDense().run(bare_photos, tmp_path / "dense", reference=tmp_path / "sfm" / MODEL_FOLDER)
+    dense = SfmDense().run(
+        bare_photos, tmp_path / "dense", reference=tmp_path / "sfm" / MODEL_FOLDER
+    )
     assert dense.poses == "shared"
     assert dense.gauge.scene_extent == pytest.approx(report.gauge.scene_extent, rel=1e-12)
     assert dense.num_points > report.num_points
@@ -214,7 +244,10 @@ def test_names_with_spaces_and_photos_of_two_sizes(courtyard: Capture, tmp_path:
     model = pycolmap.Reconstruction(tmp_path / "out" / MODEL_FOLDER)
     for image in model.images.values():  # one camera for each size, the size of the file
         with Image.open(images / image.name) as file:
-            assert (model.cameras[image.camera_id].width, model.cameras[image.camera_id].height) == file.size
+            assert (
+                model.cameras[image.camera_id].width,
+                model.cameras[image.camera_id].height,
+            ) == file.size
     assert len(model.cameras) == 2
 
 
@@ -223,7 +256,10 @@ def test_webp_photos_give_what_png_ones_give(courtyard: Capture, tmp_path: Path)
     """COLMAP cannot read WebP; lossless copies must lead to the same points."""
     images = tmp_path / "images"
     images.mkdir()
-    names = [f"{Path(name).stem}{'.webp' if index % 2 else '.png'}" for index, name in enumerate(courtyard.image_names)]
+    names = [
+        f"{Path(name).stem}{'.webp' if index % 2 else '.png'}"
+        for index, name in enumerate(courtyard.image_names)
+    ]
     for name, new in zip(courtyard.image_names, names, strict=True):
         Image.open(courtyard.images / name).save(images / new, lossless=True)
     Sfm().run(capture_of(images), tmp_path / "webp")
@@ -233,7 +269,9 @@ def test_webp_photos_give_what_png_ones_give(courtyard: Capture, tmp_path: Path)
     np.testing.assert_array_equal(first.colors, second.colors)
 
 
-def test_detection_at_a_smaller_size_comes_back_at_the_files_size(courtyard: Capture, tmp_path: Path):
+def test_detection_at_a_smaller_size_comes_back_at_the_files_size(
+    courtyard: Capture, tmp_path: Path
+):
     Sfm(max_image_size=200).run(courtyard, tmp_path)
     assert np.median(surface_distance(read_cloud(tmp_path / MODEL_FOLDER).points)) < 0.06
 
@@ -288,13 +326,19 @@ def test_too_few_photos(courtyard: Capture, tmp_path: Path):
     ("options", "message"),
     [
         ({"poses": "both"}, "init.poses must be 'shared' or 'own', got 'both'"),
-        ({"camera_model": "THIN_PRISM"}, "init.camera_model must be 'SIMPLE_PINHOLE', .*, got 'THIN_PRISM'"),
+        (
+            {"camera_model": "THIN_PRISM"},
+            "init.camera_model must be 'SIMPLE_PINHOLE', .*, got 'THIN_PRISM'",
+        ),
         ({"pairs": "all"}, "init.pairs must be .* got 'all'"),
         ({"max_ratio": 1.5}, r"init.max_ratio must be a number in \(0, 1\], got 1.5"),
         ({"max_image_size": 0}, "init.max_image_size must be a whole number of at least 32, got 0"),
         ({"threads": 0}, r"init.threads must be a whole number in \[1, 4096\] or 'auto', got 0"),
         ({"seed": 0.5}, "init.seed must be a whole number in .*, got 0.5"),
-        ({"focal_length": float("nan")}, "init.focal_length must be a number above 0 or null, got nan"),
+        (
+            {"focal_length": float("nan")},
+            "init.focal_length must be a number above 0 or null, got nan",
+        ),
     ],
 )
 def test_settings_are_checked_by_name(options: dict[str, object], message: str):

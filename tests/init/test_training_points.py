@@ -29,7 +29,8 @@ def quick_sfm(**options: Any) -> Sfm:
 
 @pytest.fixture(scope="module")
 def with_points(courtyard: Capture, tmp_path_factory: pytest.TempPathFactory) -> Capture:
-    """The courtyard with a model whose points all views made, its images numbered against their names."""
+    """The courtyard with a model whose points all views made, its images numbered against their
+    names."""
     folder = tmp_path_factory.mktemp("points")
     quick_sfm().run(courtyard, folder)
     model, turned = read_model(folder / MODEL_FOLDER), pycolmap.Reconstruction()
@@ -38,10 +39,14 @@ def with_points(courtyard: Capture, tmp_path_factory: pytest.TempPathFactory) ->
     ids = {image_id: 100 - image_id for image_id in model.images}
     for image_id, image in model.images.items():
         points = np.array([point.xy for point in image.points2D])
-        copy = pycolmap.Image(name=image.name, keypoints=points, camera_id=camera.camera_id, image_id=ids[image_id])
+        copy = pycolmap.Image(
+            name=image.name, keypoints=points, camera_id=camera.camera_id, image_id=ids[image_id]
+        )
         turned.add_image_with_trivial_frame(copy, image.cam_from_world())
     for point in model.points3D.values():
-        elements = [pycolmap.TrackElement(ids[e.image_id], e.point2D_idx) for e in point.track.elements]
+        elements = [
+            pycolmap.TrackElement(ids[e.image_id], e.point2D_idx) for e in point.track.elements
+        ]
         turned.add_point3D(point.xyz, pycolmap.Track(elements), point.color)
     (folder / "turned").mkdir()
     turned.write_binary(folder / "turned")
@@ -50,13 +55,16 @@ def with_points(courtyard: Capture, tmp_path_factory: pytest.TempPathFactory) ->
 
 def seen_by(model: pycolmap.Reconstruction) -> list[set[str]]:
     return [
-        {model.images[element.image_id].name for element in point.track.elements} for point in model.points3D.values()
+        {model.images[element.image_id].name for element in point.track.elements}
+        for point in model.points3D.values()
     ]
 
 
 def poses(folder: Path) -> dict[str, bytes]:
     model = read_model(folder / MODEL_FOLDER)
-    return {image.name: image.cam_from_world().matrix().tobytes() for image in model.images.values()}
+    return {
+        image.name: image.cam_from_world().matrix().tobytes() for image in model.images.values()
+    }
 
 
 @pytest.mark.slow
@@ -77,7 +85,11 @@ def test_dataset_keeps_what_two_training_views_see(with_points: Capture, tmp_pat
     assert len(after.images) == len(before.images), "test views keep their cameras"
     points = report.training_points
     assert points is not None
-    assert (points.choice, points.kept, points.total) == ("train", len(wanted), before.num_points3D())
+    assert (points.choice, points.kept, points.total) == (
+        "train",
+        len(wanted),
+        before.num_points3D(),
+    )
     assert points.removed == pytest.approx(1 - len(wanted) / before.num_points3D())
     said = json.loads((tmp_path / REPORT_FILE).read_text())["training_points"]
     assert said["removed"] == points.removed
@@ -89,7 +101,8 @@ def test_colours_come_from_training_photographs(with_points: Capture, tmp_path: 
     Dataset(points_from="train").run(with_points, tmp_path)
     model = read_model(tmp_path / MODEL_FOLDER)
     pictures = {
-        name: np.asarray(Image.open(with_points.images / name)).astype(float) for name in with_points.image_names
+        name: np.asarray(Image.open(with_points.images / name)).astype(float)
+        for name in with_points.image_names
     }
     for point in list(model.points3D.values())[::50]:
         samples = []
@@ -111,7 +124,9 @@ def with_noise(capture: Capture, folder: Path) -> Capture:
     rng = np.random.default_rng(0)
     for name in capture.test_names:
         width, height = Image.open(folder / name).size
-        Image.fromarray(rng.integers(0, 256, (height, width, 3), dtype=np.uint8)).save(folder / name)
+        Image.fromarray(rng.integers(0, 256, (height, width, 3), dtype=np.uint8)).save(
+            folder / name
+        )
     return replace(capture, images=folder)
 
 
@@ -122,9 +137,12 @@ MAKERS: dict[str, Callable[[PointsFrom], Initializer]] = {
 }
 
 
-@pytest.mark.parametrize("name", ["sfm", "dataset", "sift_kornia"])  # the last: the path of dim, without weights
+# the last: the path of dim, without weights
+@pytest.mark.parametrize("name", ["sfm", "dataset", "sift_kornia"])
 @pytest.mark.slow
-def test_not_one_bit_of_a_test_photograph_is_in_the_cloud(with_points: Capture, tmp_path: Path, name: str) -> None:
+def test_not_one_bit_of_a_test_photograph_is_in_the_cloud(
+    with_points: Capture, tmp_path: Path, name: str
+) -> None:
     clouds = []
     for capture, place in ((with_points, "a"), (with_noise(with_points, tmp_path / "noise"), "b")):
         MAKERS[name]("train").run(capture, tmp_path / place)
@@ -144,7 +162,9 @@ def test_noise_would_be_seen_in_points_from_all(with_points: Capture, tmp_path: 
 
 
 @pytest.mark.slow
-def test_estimated_cameras_keep_all_views_and_points_of_training_views(bare_photos: Capture, tmp_path: Path) -> None:
+def test_estimated_cameras_keep_all_views_and_points_of_training_views(
+    bare_photos: Capture, tmp_path: Path
+) -> None:
     capture = replace(bare_photos, test_names=bare_photos.image_names[3:5])
     report = Sfm(points_from="train", threads=1).run(capture, tmp_path)
     model, test = read_model(tmp_path / MODEL_FOLDER), set(capture.test_names)

@@ -1,4 +1,5 @@
-"""Declaring the metric of a verdict: recorded before trials run, visible when changed, and nothing is computed anew."""
+"""Declaring the metric of a verdict: recorded before trials run, visible when changed, and nothing
+is computed anew."""
 
 from __future__ import annotations
 
@@ -20,7 +21,14 @@ from tests.end_to_end.conftest import SMALL
 
 # later words win: a trial of seconds
 TINY = [
-    *(*SMALL, "train.iterations=2", "scene.views=9", "scene.width=48", "scene.height=36", "init.count=200"),
+    *(
+        *SMALL,
+        "train.iterations=2",
+        "scene.views=9",
+        "scene.width=48",
+        "scene.height=36",
+        "init.count=200",
+    ),
     *("raster=reference", "eval.lpips=[]", "eval.flip=false", "tracking=none", "densify=none"),
 ]
 
@@ -56,9 +64,14 @@ def test_trials_are_declared_with_the_metric_and_those_of_later_commands_are_add
         return [json.loads(line)["trials"] for line in lines]
 
     psnr = "eval.primary=psnr"
-    (first,) = say((psnr, "densify=adc"), (psnr, "densify=adc", "seed=1"), (psnr, "densify=volumetric"))
+    (first,) = say(
+        (psnr, "densify=adc"), (psnr, "densify=adc", "seed=1"), (psnr, "densify=volumetric")
+    )
     assert sorted(first.values()) == [[0], [0, 1]]
-    assert {key.rpartition("/")[0] for key in first} == {"courtyard/sfm-adc", "courtyard/sfm-volumetric"}
+    assert {key.rpartition("/")[0] for key in first} == {
+        "courtyard/sfm-adc",
+        "courtyard/sfm-volumetric",
+    }
     assert say((psnr, "densify=adc", "seed=1")) == [first]  # a part of it: nothing new
     assert not caplog.text
     with caplog.at_level(logging.WARNING):  # a further seed, by a command that declares nothing
@@ -71,20 +84,25 @@ def test_trials_are_declared_with_the_metric_and_those_of_later_commands_are_add
 
 def test_one_command_cannot_declare_two(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     trials = [composed(tmp_path, f"eval.primary={metric}") for metric in ("psnr", "ssim")]
-    with pytest.raises(InputError, match=r"trials of exp declare eval\.primary=psnr and eval\.primary=ssim"):
+    with pytest.raises(
+        InputError, match=r"trials of exp declare eval\.primary=psnr and eval\.primary=ssim"
+    ):
         declared_metrics(trials)
     assert run(["-m", *TINY, "eval.primary=psnr,ssim", f"runs={tmp_path}"]) == 2
     assert "eval.primary does not make a different trial" in capsys.readouterr().err
 
 
-def test_claims_are_kept_beside_declared_metrics(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_claims_are_kept_beside_declared_metrics(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     home = tmp_path / "exp"
 
     def claims(metric: str, moment: str) -> Declaration:
         return Declaration(time=moment, questions=(Question(metric=metric, name="claim"),))
 
     first = declare_questions(home, claims("psnr", "2020-01-01T00:00:00Z"))
-    assert declare_questions(home, claims("psnr", "2021-01-01T00:00:00Z")) == first  # it stands, with its time
+    # it stands, with its time
+    assert declare_questions(home, claims("psnr", "2021-01-01T00:00:00Z")) == first
     declared = [composed(tmp_path, "eval.primary=psnr")]
     declare(declared)
     assert not caplog.text
@@ -118,9 +136,14 @@ def test_results_keep_what_was_declared_and_a_change_computes_nothing(tmp_path: 
     assert {path: path.stat().st_mtime_ns for path in tmp_path.glob("store/*/*")} == store
     found = active_declaration(experiment.folder, load_experiment(tmp_path, "exp").trials)
     assert found is not None
-    assert (found.metric, len(found.seen), [one.primary for one in found.earlier]) == ("ssim", 1, ["psnr"])
+    assert (found.metric, len(found.seen), [one.primary for one in found.earlier]) == (
+        "ssim",
+        1,
+        ["psnr"],
+    )
 
-    # another name gets the same numbers from the store: they were there before, and are known to have been
+    # another name gets the same numbers from the store: they were there before, and are known to
+    # have been
     assert run([*words, "name=again", "eval.primary=ssim"]) == 0
     again = load_experiment(tmp_path, "again")
     found = active_declaration(again.folder, again.trials)

@@ -57,7 +57,9 @@ def test_one_trial_of_each_cloud_begins_first() -> None:
     ]
 
 
-def test_a_link_of_submitits_does_not_refuse_the_next_submission_and_any_other_does(tmp_path: Path) -> None:
+def test_a_link_of_submitits_does_not_refuse_the_next_submission_and_any_other_does(
+    tmp_path: Path,
+) -> None:
     values = compose_one(["name=cluster", f"runs={tmp_path}"]).values
     folder = job_folder(values)
     script = folder / "2_submission.sh"

@@ -14,14 +14,18 @@ OWN = "densify._target_=mine.Patient"
     ("words", "said"),
     [
         (["densify=adc", OWN], ["densify.name=patient"]),
-        (["densify=adc", OWN, "densify.name=volumetric"], ["densify.name=patient"]),  # the name of yet another one
+        # the name of yet another one
+        (["densify=adc", OWN, "densify.name=volumetric"], ["densify.name=patient"]),
         (["densify=adc", OWN, "densify.name=mine"], []),
         (["init=random", "init._target_=mine.Shell"], ["init.name=shell"]),
-        (["densify=adc", "densify._target_=gsbench.densify.AbsGS"], []),  # ours by another class: settings tell
+        # ours by another class: settings tell
+        (["densify=adc", "densify._target_=gsbench.densify.AbsGS"], []),
         (["densify=adc"], []),
     ],
 )
-def test_a_class_of_ones_own_under_a_name_of_ours_is_told(words: list[str], said: list[str]) -> None:
+def test_a_class_of_ones_own_under_a_name_of_ours_is_told(
+    words: list[str], said: list[str]
+) -> None:
     trials = [compose_one([*words, "allow_targets=[mine]", f"seed={seed}"]) for seed in (0, 1)]
     lines = borrowed_names(trials)
     assert len(lines) == len(said)

@@ -26,34 +26,61 @@ def begin(runs: Path, arm: str, seed: int) -> Path:
 def sweep(tmp_path: Path) -> dict[tuple[str, int], Path]:
     """A sweep: of adc all trials are done, of volumetric one is done, one failed, and one began."""
     folders = {(arm, seed): begin(tmp_path, arm, seed) for arm in ARMS for seed in SEEDS}
-    # In the only seed that both have, adc is better; in the mean over all of its own trials it is worse.
+    # In the only seed that both have, adc is better; in the mean over all of its own trials it is
+    # worse.
     psnr = {("adc", 0): 25.0, ("adc", 1): 10.0, ("adc", 2): 10.0, ("volumetric", 0): 20.0}
     for (arm, seed), value in psnr.items():
-        write_trial(folders[arm, seed], trial_values(tmp_path, seed, "swept") | {"densify": {"name": arm}}, psnr=value)
+        write_trial(
+            folders[arm, seed],
+            trial_values(tmp_path, seed, "swept") | {"densify": {"name": arm}},
+            psnr=value,
+        )
     (folders["volumetric", 1] / "failed.json").write_text(json.dumps({"message": "x"}))
     return folders
 
 
-def test_states_speed_time_left_and_leader(sweep: dict[tuple[str, int], Path], tmp_path: Path) -> None:
+def test_states_speed_time_left_and_leader(
+    sweep: dict[tuple[str, int], Path], tmp_path: Path
+) -> None:
     running = sweep["volumetric", 2]
     building = tmp_path / "store" / "train" / "now"
     building.mkdir(parents=True)
-    (building / "metrics.jsonl").write_text('{"step": 50, "seconds": 5.0}\n{"step": 75, "seconds": 10.0}\n')
+    (building / "metrics.jsonl").write_text(
+        '{"step": 50, "seconds": 5.0}\n{"step": 75, "seconds": 10.0}\n'
+    )
     (running / "building.json").write_text(json.dumps({"stage": "train", "folder": str(building)}))
     with hold(running / ".lock", "a trial"):
         frame = progress_frame(tmp_path, "swept").set_index("arm")
-    assert frame.loc["a_init-adc", ["done", "running", "failed", "waiting"]].to_list() == [3, 0, 0, 0]
-    assert frame.loc["a_init-volumetric", ["done", "running", "failed", "waiting"]].to_list() == [1, 1, 1, 0]
+    assert frame.loc["a_init-adc", ["done", "running", "failed", "waiting"]].to_list() == [
+        3,
+        0,
+        0,
+        0,
+    ]
+    assert frame.loc["a_init-volumetric", ["done", "running", "failed", "waiting"]].to_list() == [
+        1,
+        1,
+        1,
+        0,
+    ]
     assert frame.loc["a_init-volumetric", "iterations_per_second"] == pytest.approx(7.5)
-    assert frame.attrs["seconds_left"] == pytest.approx(1.0)  # half of 150 iterations, of trials that take 2 s
-    assert frame.attrs["leader"].startswith("a_init-adc leads so far: PSNR (dB) 25.00, mean of the 1 ")
+    # half of 150 iterations, of trials that take 2 s
+    assert frame.attrs["seconds_left"] == pytest.approx(1.0)
+    assert frame.attrs["leader"].startswith(
+        "a_init-adc leads so far: PSNR (dB) 25.00, mean of the 1 "
+    )
     assert "not a verdict" in frame.attrs["leader"]
 
 
 def test_a_trial_that_nobody_runs_waits(sweep: dict[tuple[str, int], Path]) -> None:
     home = TrialFolder(sweep["adc", 0]).home
     progress = progress_of(home)
-    assert progress.cells["a_init-volumetric", "a_scene"] == {"done": 1, "running": 0, "failed": 1, "waiting": 1}
+    assert progress.cells["a_init-volumetric", "a_scene"] == {
+        "done": 1,
+        "running": 0,
+        "failed": 1,
+        "waiting": 1,
+    }
     assert not progress.has_ended
     assert progress.speeds == {}
 
@@ -82,7 +109,10 @@ def test_the_table_stays_once_all_have_ended(
 
 @pytest.mark.parametrize("words", [["status", "--watch"], ["status", "nothing", "--watch"]])
 def test_what_cannot_be_watched_is_one_line(
-    words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    words: list[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path))
     assert run(words) == 2

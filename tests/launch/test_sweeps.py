@@ -66,7 +66,8 @@ def finish(
     unavailable: dict[str, str] | None = None,
     awaited: Sequence[str] = (),
 ) -> TrialRecord:
-    """Make the files of a finished trial, with one stage result in the store and one source file."""
+    """Make the files of a finished trial, with one stage result in the store and one source
+    file."""
     folder = TrialFolder.of(values)
     folder.path.mkdir(parents=True, exist_ok=True)
     source = folder.runs.parent / "photos" / "a.jpg"
@@ -86,7 +87,9 @@ def finish(
         resolution=(400, 300),
         awaited=list(awaited),
     )
-    folder.write_finished(values, results, [source], {"train": entry.path}, [folder.path / "table.csv"])
+    folder.write_finished(
+        values, results, [source], {"train": entry.path}, [folder.path / "table.csv"]
+    )
     return results
 
 
@@ -99,17 +102,29 @@ def experiment(name: str) -> list[Trial]:
     return compose_trials([f"+experiment={name}"])
 
 
-PROGRAM = ["densify.version=1.0", "allow_targets=[mine,python,git,brush,opensplat,bash,LichtFeld-Studio]"]
+PROGRAM = [
+    "densify.version=1.0",
+    "allow_targets=[mine,python,git,brush,opensplat,bash,LichtFeld-Studio]",
+]
 WITH_CODE = [*PROGRAM, "densify.options.code=/code"]
 NEEDED = {  # what a YAML leaves to its user
     ("train", "none"): ["densify=none"],
     **{("init", name): ["init.path=/somewhere"] for name in ("ply", "points")},
-    ("densify", "external/program"): [*PROGRAM, "densify.command=[mine]", "densify.result=mine.ply"],
+    ("densify", "external/program"): [
+        *PROGRAM,
+        "densify.command=[mine]",
+        "densify.result=mine.ply",
+    ],
     ("densify", "external/3dgs"): WITH_CODE,
     ("densify", "external/gsplat"): WITH_CODE,
-    **{("densify", f"external/{name}"): PROGRAM for name in ("brush", "fvdb", "lichtfeld", "nerfstudio", "opensplat")},
+    **{
+        ("densify", f"external/{name}"): PROGRAM
+        for name in ("brush", "fvdb", "lichtfeld", "nerfstudio", "opensplat")
+    },
 }
-NAMES = {  # where the name of a YAML is not that of its last part: captures of one's own are called after their folder
+# where the name of a YAML is not that of its last part: captures of one's own are called after
+# their folder
+NAMES = {
     ("densify", "external/program"): "external",
     **{("scene", name): "somewhere" for name in ("blender", "colmap", "photos", "transforms")},
 }
@@ -121,7 +136,8 @@ def test_every_yaml_composes(group: str) -> None:
     assert options(group)
     for name in options(group):
         if group == "experiment":
-            assert len(compose_trials([f"+experiment={name}", "scene=courtyard"])) >= 2  # not the paper's 13 scenes
+            # not the paper's 13 scenes
+            assert len(compose_trials([f"+experiment={name}", "scene=courtyard"])) >= 2
         else:
             scene = f"scene={name}" if group == "scene" else "scene=colmap"
             path = [] if name == "courtyard" else ["scene.path=/somewhere"]
@@ -135,7 +151,8 @@ def test_paper_experiments_have_the_papers_trials_and_share_them() -> None:
     table1, table2 = experiment("table1"), experiment("table2")
     assert (len(table1), len(table2)) == (78, 144)
     leaves = [
-        {(t.values["scene"]["name"], TrialFolder.of(t.values).path.name) for t in table} for table in (table1, table2)
+        {(t.values["scene"]["name"], TrialFolder.of(t.values).path.name) for t in table}
+        for table in (table1, table2)
     ]
     assert [len(leaf) for leaf in leaves] == [78, 144]
     assert len(leaves[0] | leaves[1]) == 150
@@ -148,8 +165,13 @@ def test_paper_experiments_have_the_papers_trials_and_share_them() -> None:
 
 def test_grid_is_the_product_with_the_command_line_over_the_file() -> None:
     trials = compose_trials(["+experiment=demo", "seed=5,7", "densify=adc"])
-    assert [(t.values["densify"]["name"], t.values["seed"]) for t in trials] == [("adc", 5), ("adc", 7)]
-    trials = compose_trials(["densify=adc,mcmc", "seed=range(3)", "train.iterations=10"], multirun=True)
+    assert [(t.values["densify"]["name"], t.values["seed"]) for t in trials] == [
+        ("adc", 5),
+        ("adc", 7),
+    ]
+    trials = compose_trials(
+        ["densify=adc,mcmc", "seed=range(3)", "train.iterations=10"], multirun=True
+    )
     assert [(t.values["densify"]["name"], t.values["seed"]) for t in trials] == [
         (d, s) for d in ("adc", "mcmc") for s in range(3)
     ]
@@ -158,10 +180,18 @@ def test_grid_is_the_product_with_the_command_line_over_the_file() -> None:
 
 def test_name_seed_and_machine_are_in_no_hash_and_settings_are() -> None:
     hash_of = lambda *words: config_hash(trial_values(*words))  # noqa: E731
-    assert hash_of() == hash_of("name=other", "seed=9", "device=cpu", "threads=1", "launch=local", "tracking=none")
+    assert hash_of() == hash_of(
+        "name=other", "seed=9", "device=cpu", "threads=1", "launch=local", "tracking=none"
+    )
     others = [
         hash_of(word)
-        for word in ("densify=adc", "train.iterations=7", "init.seed=3", "scene.width=99", "eval=standard")
+        for word in (
+            "densify=adc",
+            "train.iterations=7",
+            "init.seed=3",
+            "scene.width=99",
+            "eval=standard",
+        )
     ]
     assert len({hash_of(), *others}) == 6
 
@@ -169,11 +199,20 @@ def test_name_seed_and_machine_are_in_no_hash_and_settings_are() -> None:
 @pytest.mark.parametrize(
     ("words", "parts"),
     [
-        (["densify.grad_threshold=1"], ["densify.grad_threshold is not a setting", "did you mean gradient_threshold"]),
-        (["densify=volumetrik"], ["densify=volumetrik does not exist", "did you mean volumetric", "adc"]),
+        (
+            ["densify.grad_threshold=1"],
+            ["densify.grad_threshold is not a setting", "did you mean gradient_threshold"],
+        ),
+        (
+            ["densify=volumetrik"],
+            ["densify=volumetrik does not exist", "did you mean volumetric", "adc"],
+        ),
         (["densfy=adc"], ["densfy is not a setting", "did you mean densify"]),
         (["+experiment=tabel1"], ["tabel1 does not exist", "did you mean table1"]),
-        (["train.iterations=many"], ["train.iterations must be a whole number of at least 0, got 'many'"]),
+        (
+            ["train.iterations=many"],
+            ["train.iterations must be a whole number of at least 0, got 'many'"],
+        ),
         (["train.iterations=0"], ["train.iterations=0 trains nothing", "add densify=none"]),
         (["raster=gpu"], ["raster=gpu does not exist", "gsplat"]),
         (["eval.lpips=3"], ["eval.lpips must be a list of vgg_raw, vgg, alex, squeeze", "got 3"]),
@@ -198,7 +237,9 @@ def test_mistakes_are_one_line_with_what_is_allowed(words: list[str], parts: lis
 
 def test_mistake_in_a_users_yaml_names_the_file(tmp_path: Path) -> None:
     (tmp_path / "own" / "train").mkdir(parents=True)
-    (tmp_path / "own" / "train" / "mine.yaml").write_text("defaults: [paper, _self_]\nname: mine\niteratons: 5\n")
+    (tmp_path / "own" / "train" / "mine.yaml").write_text(
+        "defaults: [paper, _self_]\nname: mine\niteratons: 5\n"
+    )
     words, _, _ = parse(["--config-dir", "own", "train=mine"])
     with pytest.raises(InputError, match=r"iteratons is not a setting in train/mine.*iterations"):
         compose_trials(words)
@@ -216,8 +257,16 @@ def test_a_folder_that_is_not_there_stops_a_sweep_before_its_first_trial(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("GSBENCH_DATA", str(tmp_path / "data"))
-    words = ["-m", "scene=courtyard,garden,truck", "init=dataset", "tracking=none", "train.iterations=1"]
-    with pytest.raises(InputError, match=r"scene garden: .*garden does not exist.*; scene truck: .* does not exist"):
+    words = [
+        "-m",
+        "scene=courtyard,garden,truck",
+        "init=dataset",
+        "tracking=none",
+        "train.iterations=1",
+    ]
+    with pytest.raises(
+        InputError, match=r"scene garden: .*garden does not exist.*; scene truck: .* does not exist"
+    ):
         launch(words)
     assert not list((tmp_path / "runs").glob("*/*/*/*-seed*"))  # nothing to clean up after the mend
     assert launch([*words, "--dry-run"]) == 0
@@ -288,7 +337,9 @@ def test_finished_trial_is_recognised_until_something_changes(runs: Path) -> Non
         ("half a file", "results.json is not JSON"),
     ],
 )
-def test_changes_are_noticed_and_named(change: str, names: str, runs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_changes_are_noticed_and_named(
+    change: str, names: str, runs: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     values = trial_values()
     finish(values, awaited=["lpips_vgg"] if change == "weights" else ())
     folder = TrialFolder.of(values).path
@@ -310,7 +361,11 @@ def test_changes_are_noticed_and_named(change: str, names: str, runs: Path, monk
     elif change == "store gone":
         shutil.rmtree(runs / "store")
     elif change == "stage":
-        monkeypatch.setattr(trial_folder, "STAGES", [replace(stage, version=2) for stage in trial_folder.STAGES[2:3]])
+        monkeypatch.setattr(
+            trial_folder,
+            "STAGES",
+            [replace(stage, version=2) for stage in trial_folder.STAGES[2:3]],
+        )
         record["stages"] = {"train": 1}
     elif change == "package":
         record["pycolmap"] = "0.1"
@@ -335,14 +390,19 @@ def test_a_dry_run_says_what_has_changed(runs: Path) -> None:
     trial = replace(_composed(), values=values)
     assert describe_plan([trial])[0].startswith("done     courtyard/sfm-volumetric seed 0")
     (runs.parent / "photos" / "a.jpg").write_bytes(b"other")
-    assert describe_plan([trial])[0].endswith(f"  will be checked: {runs.parent / 'photos' / 'a.jpg'} has changed")
+    assert describe_plan([trial])[0].endswith(
+        f"  will be checked: {runs.parent / 'photos' / 'a.jpg'} has changed"
+    )
 
 
 def test_metric_that_cannot_come_later_does_not_hinder() -> None:
     values = trial_values()
     finish(
         values,
-        unavailable={"flip": "not asked for (eval.flip)", "lpips_alex": "a view is 20x20 px, below 63 px a side"},
+        unavailable={
+            "flip": "not asked for (eval.flip)",
+            "lpips_alex": "a view is 20x20 px, below 63 px a side",
+        },
     )
     assert not why_not_done(values)
 
@@ -359,7 +419,11 @@ def test_weights_that_are_still_missing_do_not_hinder_and_new_ones_do() -> None:
 
 def test_what_is_awaited_is_not_read_from_the_prose_of_reasons() -> None:
     values = trial_values("seed=3")
-    finish(values, unavailable={"lpips_vgg": "weights not found", "own": "no reason that anyone knows"}, awaited=[])
+    finish(
+        values,
+        unavailable={"lpips_vgg": "weights not found", "own": "no reason that anyone knows"},
+        awaited=[],
+    )
     assert not why_not_done(values)
     finish(values, unavailable={"lpips_vgg": "a view is too small"}, awaited=["lpips_vgg"])
     assert why_not_done(values)
@@ -391,7 +455,9 @@ def test_plan_keeps_what_was_asked_for_and_names_what_is_missing(runs: Path) -> 
     assert len(states_of_experiment(runs / "x")) == 3
 
 
-def test_damaged_plan_is_named_and_the_next_command_mends_it(runs: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_damaged_plan_is_named_and_the_next_command_mends_it(
+    runs: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     (runs / "x").mkdir(parents=True)
     (runs / "x" / "plan.json").write_text("{")
     assert read_plan(runs / "x") == {}
@@ -420,12 +486,20 @@ def test_dry_run_tells_states_and_time(runs: Path) -> None:
     ]
 
 
-def test_estimate_prefers_the_same_scene_and_densifier_and_scales_with_iterations(runs: Path) -> None:
+def test_estimate_prefers_the_same_scene_and_densifier_and_scales_with_iterations(
+    runs: Path,
+) -> None:
     finish(trial_values("densify=adc", "train.iterations=100"), seconds=10)
     finish(trial_values("densify=mcmc", "train.iterations=100"), seconds=30)
     finished = FinishedTrials(runs)
-    assert finished.estimate(trial_values("densify=adc", "train.iterations=1000")) == (pytest.approx(100), 1)
-    assert finished.estimate(trial_values("densify=none", "train.iterations=1000")) == (pytest.approx(200), 2)
+    assert finished.estimate(trial_values("densify=adc", "train.iterations=1000")) == (
+        pytest.approx(100),
+        1,
+    )
+    assert finished.estimate(trial_values("densify=none", "train.iterations=1000")) == (
+        pytest.approx(200),
+        2,
+    )
 
 
 def test_estimate_is_of_the_same_scene_size_and_rasterizer_or_is_none(runs: Path) -> None:
@@ -465,7 +539,10 @@ def fake_trial(monkeypatch: pytest.MonkeyPatch):  # type: ignore[no-untyped-def]
 
 
 def sweep() -> list[Trial]:
-    return [replace(trial, values=trial.values | {"runs": os.environ["GSBENCH_RUNS"]}) for trial in _composed_sweep()]
+    return [
+        replace(trial, values=trial.values | {"runs": os.environ["GSBENCH_RUNS"]})
+        for trial in _composed_sweep()
+    ]
 
 
 @cache
@@ -473,7 +550,9 @@ def _composed_sweep() -> list[Trial]:
     return compose_trials(["name=x", "densify=adc", "seed=0,1,2"], multirun=True)
 
 
-def test_failed_trial_does_not_stop_the_others(fake_trial: Any, capsys: pytest.CaptureFixture[str]) -> None:
+def test_failed_trial_does_not_stop_the_others(
+    fake_trial: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
     behaviour, order = fake_trial
     behaviour[1] = RuntimeError("broken")
     set_up_logging()  # as the command line does
@@ -568,7 +647,11 @@ def test_what_is_done_is_found_in_a_folder_that_may_not_be_written_to(
     def refuse(*arguments: object, **named: object) -> None:
         raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(runs))
 
-    for name in ("gsbench.files.TemporaryDirectory", "gsbench.files.atomic", "gsbench.launch.record.hold"):
+    for name in (
+        "gsbench.files.TemporaryDirectory",
+        "gsbench.files.atomic",
+        "gsbench.launch.record.hold",
+    ):
         monkeypatch.setattr(name, refuse)
     (outcome,) = run_batch(trials)
     assert outcome.status == "done"
@@ -582,6 +665,9 @@ def test_lock_is_seen_and_freed(tmp_path: Path) -> None:
     assert not is_held(path)
     with hold(path, "work"):
         assert is_held(path)
-        with pytest.raises(BusyError, match=rf"work: process {os.getpid()}"), hold(path, "work", wait=False):
+        with (
+            pytest.raises(BusyError, match=rf"work: process {os.getpid()}"),
+            hold(path, "work", wait=False),
+        ):
             raise AssertionError("taken twice")
     assert not is_held(path)

@@ -1,4 +1,5 @@
-"""The notebooks run from top to bottom, and each .ipynb is what its .py says, with small outputs."""
+"""The notebooks run from top to bottom, and each .ipynb is what its .py says, with small
+outputs."""
 
 from __future__ import annotations
 
@@ -17,7 +18,9 @@ TIMEOUT = 300  # s for a cell; on a fresh machine the first one also compiles th
 
 
 def test_every_notebook_is_a_pair() -> None:
-    assert [path.stem for path in NOTEBOOKS] == [path.stem for path in sorted((ROOT / "notebooks").glob("*.ipynb"))]
+    assert [path.stem for path in NOTEBOOKS] == [
+        path.stem for path in sorted((ROOT / "notebooks").glob("*.ipynb"))
+    ]
     assert len(NOTEBOOKS) >= 4
 
 
@@ -29,8 +32,12 @@ def test_pair_is_equal_and_carries_small_outputs(path: Path) -> None:
     notebook = nbformat.read(path.with_suffix(".ipynb"), as_version=4)
     nbformat.validate(notebook)
     mend = f"make notebooks, after an edit of {path.name}"
-    cells = [(cell.cell_type, cell.source, cell.metadata.get("tags", [])) for cell in notebook.cells]
-    assert cells == [(cell.cell_type, cell.source, cell.metadata.get("tags", [])) for cell in source.cells], mend
+    cells = [
+        (cell.cell_type, cell.source, cell.metadata.get("tags", [])) for cell in notebook.cells
+    ]
+    assert cells == [
+        (cell.cell_type, cell.source, cell.metadata.get("tags", [])) for cell in source.cells
+    ], mend
     outputs = [output for cell in notebook.cells for output in cell.get("outputs", [])]
     assert any("image/png" in output.get("data", {}) for output in outputs), mend
     assert not [output for output in outputs if output.output_type == "error"]
@@ -61,10 +68,15 @@ def test_notebook_runs(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPat
     monkeypatch.setenv("MPLBACKEND", "module://matplotlib_inline.backend_inline")
     notebook = nbformat.read(path.with_suffix(".ipynb"), as_version=4)
     resources = {"metadata": {"path": str(tmp_path)}}
-    client = nbclient.NotebookClient(notebook, timeout=TIMEOUT, kernel_name="python3", resources=resources)
+    client = nbclient.NotebookClient(
+        notebook, timeout=TIMEOUT, kernel_name="python3", resources=resources
+    )
     client.execute()
     pictures = [
-        output for cell in notebook.cells for output in cell.get("outputs", []) if "image/png" in output.get("data", {})
+        output
+        for cell in notebook.cells
+        for output in cell.get("outputs", [])
+        if "image/png" in output.get("data", {})
     ]
     assert pictures
     keep = os.environ.get("KEEP_NOTEBOOKS")  # a folder: look at what came out

@@ -58,12 +58,18 @@ def inputs(fps: list[int] | None = None, **options: Any) -> dict[str, Any]:
     return dict(step.inputs)
 
 
-def test_an_evaluation_that_asks_for_nothing_new_has_the_key_that_it_had(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_evaluation_that_asks_for_nothing_new_has_the_key_that_it_had(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(keys, "edited", lambda files: {})  # as in a release
     old = {"train": TRAINED.key, "protocol": "paper-1", "unavailable": FOUR_LPIPS, "maps": False}
     assert inputs() == old
     assert inputs([640, 480]) == old | {"fps": [640, 480]}
-    assert inputs(more=["gmsd", "fsim"]) == old | {"more": ["fsim", "gmsd"]} == inputs(more=["fsim", "gmsd"])
+    assert (
+        inputs(more=["gmsd", "fsim"])
+        == old | {"more": ["fsim", "gmsd"]}
+        == inputs(more=["fsim", "gmsd"])
+    )
 
 
 def test_speed_is_measured_at_the_size_that_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -74,10 +80,14 @@ def test_speed_is_measured_at_the_size_that_is_asked_for(monkeypatch: pytest.Mon
             sizes.append((camera.width, camera.height))
             return super().render(gaussians, camera, *rest)
 
-    scene = Scene("made", (), (View("a", case.camera(), np.zeros((case.height, case.width, 3), np.uint8)),))
+    scene = Scene(
+        "made", (), (View("a", case.camera(), np.zeros((case.height, case.width, 3), np.uint8)),)
+    )
     clock = SimpleNamespace(perf_counter=iter((10.0, 12.0)).__next__)
     monkeypatch.setattr(evaluate_module, "time", clock)
-    found = measure_speed(Watched(), case.gaussians(), scene, torch.zeros(3, dtype=torch.float64), [64, 20])
+    found = measure_speed(
+        Watched(), case.gaussians(), scene, torch.zeros(3, dtype=torch.float64), [64, 20]
+    )
     assert sizes == [(64, 20)] * 6  # the first is not timed
     assert found == {"a": 2.5}
 
@@ -86,14 +96,17 @@ def test_speed_is_measured_at_the_size_that_is_asked_for(monkeypatch: pytest.Mon
 def told(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
     """The progress that an evaluation reports."""
     told: list[tuple[Any, ...]] = []
-    monkeypatch.setattr(evaluate_module, "progress", lambda title: nullcontext(lambda *counts: told.append(counts)))
+    monkeypatch.setattr(
+        evaluate_module, "progress", lambda title: nullcontext(lambda *counts: told.append(counts))
+    )
     return told
 
 
 def test_an_evaluation_measures_what_its_pictures_hold(
     tmp_path: Path, truth: Gaussians, tiny_scene: Scene, told: list[tuple[Any, ...]]
 ) -> None:
-    """Metrics by the formula from the PNG files; the nearest training view by trying all; an earlier model's means."""
+    """Metrics by the formula from the PNG files; the nearest training view by trying all; an
+    earlier model's means."""
     store, init = Store(tmp_path), Step(INIT, {}, lambda folder: None)
     masked = replace(tiny_scene.test[1], mask=np.arange(32 * 40).reshape(32, 40) % 4 > 0)
     scene = replace(tiny_scene, test=(tiny_scene.test[0], masked))
@@ -123,7 +136,9 @@ def test_an_evaluation_measures_what_its_pictures_hold(
         rows = {row["view"]: row for row in csv.DictReader(stream)}
 
     def rendered(model: Gaussians, view: View) -> np.ndarray:
-        image = ReferenceRasterizer().render(model, view.camera, 3, torch.tensor([0.1, 0.2, 0.3])).image
+        image = (
+            ReferenceRasterizer().render(model, view.camera, 3, torch.tensor([0.1, 0.2, 0.3])).image
+        )
         return np.floor(255 * image.detach().clamp(0, 1).numpy() + 0.5)
 
     means = {"last": 0.0, "earlier": 0.0}
@@ -135,9 +150,14 @@ def test_an_evaluation_measures_what_its_pictures_hold(
             means[name] += 0.5 * 10 * np.log10(255**2 / ((image - view.image)[counted] ** 2).mean())
         row = rows[view.name]
         errors = (picture - view.image)[counted]
-        assert float(row["psnr"]) == pytest.approx(10 * np.log10(255**2 / (errors**2).mean()), abs=1e-5)
+        assert float(row["psnr"]) == pytest.approx(
+            10 * np.log10(255**2 / (errors**2).mean()), abs=1e-5
+        )
         assert float(row[COUNTED]) == pytest.approx(counted.mean())
-        angles = [np.arccos(min(1.0, view.camera.rotation[2] @ other.camera.rotation[2])) for other in scene.train]
+        angles = [
+            np.arccos(min(1.0, view.camera.rotation[2] @ other.camera.rotation[2]))
+            for other in scene.train
+        ]
         assert float(row[ANGLE]) == pytest.approx(np.degrees(min(angles)), abs=1e-5)
         places = [np.linalg.norm(view.camera.center - other.camera.center) for other in scene.train]
         assert float(row[DISTANCE]) == pytest.approx(min(places) / scene.extent)
@@ -147,9 +167,14 @@ def test_an_evaluation_measures_what_its_pictures_hold(
     assert metrics["at"].keys() == {"7"}
     assert metrics["at"]["7"]["num_gaussians"] == 50
     assert metrics["at"]["7"]["metrics"]["psnr"] == pytest.approx(means["earlier"], abs=1e-3)
-    assert {path.name for path in (folder / "renders").iterdir()} == {view.name for view in scene.test}
+    assert {path.name for path in (folder / "renders").iterdir()} == {
+        view.name for view in scene.test
+    }
     figure = np.asarray(Image.open(folder / "figures" / "ellipsoids.png"))[:32].astype(int)
-    unlike = [np.abs(figure - np.asarray(Image.open(folder / "renders" / view.name))).mean() for view in scene.test]
+    unlike = [
+        np.abs(figure - np.asarray(Image.open(folder / "renders" / view.name))).mean()
+        for view in scene.test
+    ]
     assert figure.shape == (32, 40, 3)
     assert unlike[0] < unlike[1]  # it is of the first view
     assert told == [("views", 1, 2), ("views", 2, 2), ("iteration 7", 1, 2), ("iteration 7", 2, 2)]

@@ -1,4 +1,5 @@
-"""Under which keys the results of one known trial lie in the store: a key that moves throws stored results away."""
+"""Under which keys the results of one known trial lie in the store: a key that moves throws stored
+results away."""
 
 from __future__ import annotations
 
@@ -18,10 +19,21 @@ from gsbench.runs.store import Store
 from gsbench.scene.types import Capture
 
 WORDS = [
-    "scene=garden", "scene.path=photos", "init=random", "densify=volumetric", "densify.volume_threshold=0.05",
-    "eval.lpips=[]", "eval.flip=false", "raster=cpu", "device=cpu", "threads=1", "seed=3",
-]  # fmt: skip
-BARE = Capture("garden", Path("photos"), ("a.jpg", "b.jpg", "c.jpg"), ("a.jpg",), None, False, "0" * 64)
+    "scene=garden",
+    "scene.path=photos",
+    "init=random",
+    "densify=volumetric",
+    "densify.volume_threshold=0.05",
+    "eval.lpips=[]",
+    "eval.flip=false",
+    "raster=cpu",
+    "device=cpu",
+    "threads=1",
+    "seed=3",
+]
+BARE = Capture(
+    "garden", Path("photos"), ("a.jpg", "b.jpg", "c.jpg"), ("a.jpg",), None, False, "0" * 64
+)
 KEYS = [
     ("config", "efb880968c80cdd904651c24a9fa44e607e6283f150f6dbad8f47651f0e9d49f"),
     ("init", "b5ba65df7105e9263ad05addef8425d35e29fe982775d730fbe604647ec2a9ae"),  # of the cameras
@@ -38,11 +50,15 @@ class BareSource(CaptureSource):
 
 
 def test_the_keys_of_a_known_trial_stay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A photographs' trial without cameras: so the keys of the cameras that stand in for them are seen as well."""
+    """A photographs' trial without cameras: so the keys of the cameras that stand in for them are
+    seen as well."""
     monkeypatch.setattr(scene_module, "version_of", lambda package: "4.0.0")
     monkeypatch.setattr(keys, "edited", lambda files: {})  # as in a release
     values = compose_one(WORDS).values
     monkeypatch.setattr(pipeline_trial, "CaptureSource", BareSource)
     trial = TrialSteps(Parts(values), Store(tmp_path / "store"))
-    found = [("config", config_hash(values)), *((step.stage.name, step.key) for step in trial.steps())]
+    found = [
+        ("config", config_hash(values)),
+        *((step.stage.name, step.key) for step in trial.steps()),
+    ]
     assert found == KEYS

@@ -1,4 +1,5 @@
-"""Keys of trials with classes of the user's: whatever makes them compute something else, moves them."""
+"""Keys of trials with classes of the user's: whatever makes them compute something else, moves
+them."""
 
 from __future__ import annotations
 
@@ -20,13 +21,19 @@ from tests.pipeline.test_keys import WORDS, BareSource
 
 MODULES = ("mine", "variant")
 METRIC = (
-    "class M:\n    direction = 1\n    value = {}\n    def measure(self, image, truth):\n        return self.value\n"
+    "class M:\n    direction = 1\n    value = {}\n    def measure(self, image, truth):\n     "
+    "   return self.value\n"
 )
 FROM_A_FUNCTION = "def metric_of(x):\n{}    return M\nM = metric_of({{}})\n".format(
     "".join(f"    {line}\n" for line in METRIC.format("x").splitlines())
 )
-WITHIN = "class Outer:\n{}M = Outer.M\n".format("".join(f"    {line}\n" for line in METRIC.splitlines()))
-WRAPPED = f"import functools\ndef same(cls):\n    return type(cls.__name__, (cls,), {{{{}}}})\n@same\n{METRIC}"
+WITHIN = "class Outer:\n{}M = Outer.M\n".format(
+    "".join(f"    {line}\n" for line in METRIC.splitlines())
+)
+WRAPPED = (
+    "import functools\ndef same(cls):\n    return type(cls.__name__, (cls,), "
+    f"{{{{}}}})\n@same\n{METRIC}"
+)
 
 
 @pytest.fixture(autouse=True)
@@ -51,7 +58,8 @@ def bare_capture(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def keys_of(home: Path, *words: str) -> dict[str, str]:
-    """The keys of a trial as a new process would find them, by stage, and the hash of its configuration."""
+    """The keys of a trial as a new process would find them, by stage, and the hash of its
+    configuration."""
     _forget()
     values = compose_one([*WORDS, f"allow_targets=[{','.join(MODULES)}]", *words]).values
     steps = list(TrialSteps(Parts(values), Store(home / "store")).steps())
@@ -63,7 +71,9 @@ def moved(one: dict[str, str], other: dict[str, str]) -> set[str]:
 
 
 @pytest.mark.parametrize(
-    "text", [METRIC, FROM_A_FUNCTION, WITHIN, WRAPPED], ids=["plain", "made by a function", "in a class", "wrapped"]
+    "text",
+    [METRIC, FROM_A_FUNCTION, WITHIN, WRAPPED],
+    ids=["plain", "made by a function", "in a class", "wrapped"],
 )
 def test_an_edited_metric_is_computed_anew_however_its_class_is_made(home: Path, text: str) -> None:
     words = ["+eval.extra.m._target_=mine.M"]
@@ -84,7 +94,9 @@ def test_what_passes_a_class_on_counts_as_well(home: Path) -> None:
     assert moved(*found) == {"config", "evaluate"}
     found = []
     for value in ("3.0", "4.0"):  # one of gsbench's own classes
-        (home / "variant.py").write_text(f"from gsbench.densify import Volumetric\nVolumetric.extra = {value}\n")
+        (home / "variant.py").write_text(
+            f"from gsbench.densify import Volumetric\nVolumetric.extra = {value}\n"
+        )
         found.append(keys_of(home, "densify._target_=variant.Volumetric"))
     from gsbench.densify import Volumetric
 
@@ -95,21 +107,33 @@ def test_what_passes_a_class_on_counts_as_well(home: Path) -> None:
 def test_options_of_ones_own_class_have_an_effect_whatever_they_are_called(home: Path) -> None:
     text = (
         "from dataclasses import dataclass\nfrom gsbench.densify import Volumetric\n"
-        "@dataclass(kw_only=True)\nclass Mine(Volumetric):\n    weights: float = 1.0\n    threads: int = 1\n"
+        "@dataclass(kw_only=True)\nclass Mine(Volumetric):\n    weights: float = 1.0\n    "
+        "threads: int = 1\n"
     )
     (home / "mine.py").write_text(text)
     own = ["densify._target_=mine.Mine", "+densify.weights=1.0"]
     for change in ("densify.weights=9.0", "+densify.threads=2"):
-        assert moved(keys_of(home, *own), keys_of(home, *own, change)) == {"config", "train", "evaluate"}
+        assert moved(keys_of(home, *own), keys_of(home, *own, change)) == {
+            "config",
+            "train",
+            "evaluate",
+        }
     (home / "mine.py").write_text(
         f"from dataclasses import dataclass\n@dataclass\n{METRIC.format(1)}    weights: int = 1\n"
     )
     words = ["+eval.extra.m._target_=mine.M", "+eval.extra.m.weights=1"]
-    assert moved(keys_of(home, *words), keys_of(home, *words, "eval.extra.m.weights=3")) == {"config", "evaluate"}
+    assert moved(keys_of(home, *words), keys_of(home, *words, "eval.extra.m.weights=3")) == {
+        "config",
+        "evaluate",
+    }
 
 
-def test_the_cache_of_prepared_photographs_knows_the_code_that_prepared_them(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gsbench.pipeline.steps.scene.edited", lambda rooms: dict.fromkeys(rooms, "edited"))
+def test_the_cache_of_prepared_photographs_knows_the_code_that_prepared_them(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(
+        "gsbench.pipeline.steps.scene.edited", lambda rooms: dict.fromkeys(rooms, "edited")
+    )
     view_versions.cache_clear()
     found = view_versions()
     view_versions.cache_clear()

@@ -1,4 +1,5 @@
-"""What results.json says of a training by gsbench, of another program's and of none, and of what it was made."""
+"""What results.json says of a training by gsbench, of another program's and of none, and of what it
+was made."""
 
 from __future__ import annotations
 
@@ -20,10 +21,21 @@ from gsbench.runs.trial_record import TrialRecord
 from gsbench.scene.types import Capture, Scene
 
 TRAINING = {
-    "iterations": 7, "num_init_points": 3, "num_gaussians": 5, "causes": {"initial": 5}, "scene_extent": 4.5,
-    "seconds": 60.0, "peak_memory_mb": 100.0, "machine": {"cpu": "c"}, "checkout": {"commit": "abc", "edited": True},
-}  # fmt: skip
-PROGRAM = {"trained_by": {"program": "other", "version": "2"}, "evaluated_from": "model", "checkout": {}}
+    "iterations": 7,
+    "num_init_points": 3,
+    "num_gaussians": 5,
+    "causes": {"initial": 5},
+    "scene_extent": 4.5,
+    "seconds": 60.0,
+    "peak_memory_mb": 100.0,
+    "machine": {"cpu": "c"},
+    "checkout": {"commit": "abc", "edited": True},
+}
+PROGRAM = {
+    "trained_by": {"program": "other", "version": "2"},
+    "evaluated_from": "model",
+    "checkout": {},
+}
 EVENTS = [{"step": 1, "cloned": 2, "pruned_size": 1}, {"step": 2, "cloned": 3}]
 
 
@@ -36,7 +48,9 @@ def write(files: dict[str, Any], folder: Path) -> None:
 @pytest.fixture
 def made(tmp_path: Path, tiny_scene: Scene) -> Any:
     """A function that makes the results of a trial whose training is ``TRAINING`` with changes."""
-    values = compose_one(["scene=courtyard", "name=x", f"runs={tmp_path}", "eval.primary=psnr", "seed=4"]).values
+    values = compose_one(
+        ["scene=courtyard", "name=x", f"runs={tmp_path}", "eval.primary=psnr", "seed=4"]
+    ).values
     store = Store(tmp_path / "store")
     capture = Capture("made", tmp_path, (), (), None, False, "0abc", "every eighth view")
     larger = replace(tiny_scene.test[0], camera=tiny_scene.test[0].camera.resized(80, 64))
@@ -44,16 +58,29 @@ def made(tmp_path: Path, tiny_scene: Scene) -> Any:
 
     def make(**changes: Any) -> TrialRecord:
         training = TRAINING | changes
-        evaluation = {"metrics": {"psnr": 20.0}, "unavailable": {"flip": "off"}, "awaited": ["flip"]}
+        evaluation = {
+            "metrics": {"psnr": 20.0},
+            "unavailable": {"flip": "off"},
+            "awaited": ["flip"],
+        }
         events = "".join(json.dumps(event) + "\n" for event in EVENTS)
         files = {
-            INIT: {REPORT_FILE: {"num_points": 3}, f"{MODEL_FOLDER}/a.bin": "a", GAUSSIANS_FILE: "b", "other": "c"},
+            INIT: {
+                REPORT_FILE: {"num_points": 3},
+                f"{MODEL_FOLDER}/a.bin": "a",
+                GAUSSIANS_FILE: "b",
+                "other": "c",
+            },
             TRAIN: {"training.json": training, "events.jsonl": events},
             EVALUATE: {"metrics.json": evaluation},
         }
         entries = {
             stage.name: store.get(
-                Step(stage, {"protocol": "paper-1", "training": training}, lambda folder, own=own: write(own, folder))
+                Step(
+                    stage,
+                    {"protocol": "paper-1", "training": training},
+                    lambda folder, own=own: write(own, folder),
+                )
             )
             for stage, own in files.items()
         }
@@ -65,17 +92,40 @@ def made(tmp_path: Path, tiny_scene: Scene) -> Any:
 
 def test_results_are_put_together_from_the_steps(made: Any) -> None:
     found = made()
-    assert (found.experiment, found.scene, found.init, found.densify) == ("x", "courtyard", "sfm", "volumetric")
-    assert (found.seed, found.raster, found.protocol, found.iterations) == (4, "reference", "paper-1", 7)
-    assert (found.num_init_points, found.num_gaussians, found.scene_extent, found.peak_memory_mb) == (3, 5, 4.5, 100.0)
-    assert (found.metrics, found.unavailable, found.awaited) == ({"psnr": 20.0}, {"flip": "off"}, ["flip"])
+    assert (found.experiment, found.scene, found.init, found.densify) == (
+        "x",
+        "courtyard",
+        "sfm",
+        "volumetric",
+    )
+    assert (found.seed, found.raster, found.protocol, found.iterations) == (
+        4,
+        "reference",
+        "paper-1",
+        7,
+    )
+    assert (
+        found.num_init_points,
+        found.num_gaussians,
+        found.scene_extent,
+        found.peak_memory_mb,
+    ) == (3, 5, 4.5, 100.0)
+    assert (found.metrics, found.unavailable, found.awaited) == (
+        {"psnr": 20.0},
+        {"flip": "off"},
+        ["flip"],
+    )
     assert found.seconds.keys() == {"init", "train", "evaluate"}
     assert found.seconds["train"] == 60.0
     assert (found.train_views, found.test_views, found.resolution) == (8, 2, (80, 64))
     assert (found.hashes["data"], found.held_out) == ("0abc", "every eighth view")
     assert (found.events["cloned"], found.events["pruned_size"], found.events["added"]) == (5, 1, 0)
     assert found.init_report == {"num_points": 3}
-    assert (found.code.commit, found.code.edited, found.code.rooms) == ("abc", True, {"init": "1", "train": "2"})
+    assert (found.code.commit, found.code.edited, found.code.rooms) == (
+        "abc",
+        True,
+        {"init": "1", "train": "2"},
+    )
     assert found.code.stages == {stage.name: stage.version for stage in STAGES}
     assert (found.evaluated_from, found.trained_by, found.declared) == (None, None, None)
 
@@ -87,11 +137,22 @@ def test_results_are_put_together_from_the_steps(made: Any) -> None:
         (PROGRAM, "model", "reference", set(), True),
         (PROGRAM | {"iterations": 0}, "model", "reference", set(), True),
         (PROGRAM | {"peak_memory_mb": None}, "model", "reference", {"peak_memory_mb"}, True),
-        (PROGRAM | {"evaluated_from": "renders", "num_gaussians": None}, "renders", "unknown", {"gaussians"}, True),
+        (
+            PROGRAM | {"evaluated_from": "renders", "num_gaussians": None},
+            "renders",
+            "unknown",
+            {"gaussians"},
+            True,
+        ),
     ],
 )
 def test_what_nobody_knows_is_unavailable(
-    made: Any, changes: dict[str, Any], evaluated_from: str, raster: str, unknown: set[str], timed: bool
+    made: Any,
+    changes: dict[str, Any],
+    evaluated_from: str,
+    raster: str,
+    unknown: set[str],
+    timed: bool,
 ) -> None:
     found = made(**changes)
     assert (found.evaluated_from, found.raster) == (evaluated_from, raster)
@@ -106,7 +167,9 @@ def test_the_newest_declaration_of_the_metric_is_repeated(made: Any) -> None:
     times = [f"2026-01-01T0{hour}:00:00Z" for hour in range(4)]
     asked = [(open_question("psnr"),), (open_question("psnr"),), (open_question("ssim"),)]
     claimed = Declaration(time=times[3], questions=(Question(metric="psnr", name="a claim"),))
-    declared = [Declaration(time=when, questions=own) for when, own in zip(times[:3], asked, strict=True)]
+    declared = [
+        Declaration(time=when, questions=own) for when, own in zip(times[:3], asked, strict=True)
+    ]
     (home / "declared.jsonl").write_text(record_text([*declared, claimed]))
     assert made().declared == declared[1].summary()
 
@@ -116,11 +179,22 @@ def test_the_hash_of_a_cloud_is_of_its_model_and_its_gaussians(tmp_path: Path) -
 
     def hash_of(number: int, **changes: str) -> str:
         files = {f"{MODEL_FOLDER}/a.bin": "a", GAUSSIANS_FILE: "b", "report.json": "c"} | changes
-        return cloud_hash(store.get(Step(INIT, {"number": number}, lambda folder: write(files, folder))).path)
+        return cloud_hash(
+            store.get(Step(INIT, {"number": number}, lambda folder: write(files, folder))).path
+        )
 
     first = hash_of(0)
     assert hash_of(1, **{"report.json": "other"}) == first != sha256_of({})
-    assert len({first, hash_of(2, **{f"{MODEL_FOLDER}/a.bin": "x"}), hash_of(3, **{GAUSSIANS_FILE: "x"})}) == 3
+    assert (
+        len(
+            {
+                first,
+                hash_of(2, **{f"{MODEL_FOLDER}/a.bin": "x"}),
+                hash_of(3, **{GAUSSIANS_FILE: "x"}),
+            }
+        )
+        == 3
+    )
 
 
 def test_versions_are_those_of_installed_packages() -> None:
@@ -138,7 +212,9 @@ def test_the_users_files_are_what_a_capture_was_read_from(tmp_path: Path) -> Non
     capture = Capture("own", tmp_path, ("a.png", "b.png"), (), None, False, "0")
     images = [tmp_path / "a.png", tmp_path / "b.png"]
     assert source_files(capture, store) == images
-    more = replace(capture, masks={"a.png": tmp_path / "m.png"}, read_from=(tmp_path / "transforms.json",))
+    more = replace(
+        capture, masks={"a.png": tmp_path / "m.png"}, read_from=(tmp_path / "transforms.json",)
+    )
     assert source_files(more, store) == [*images, tmp_path / "m.png", tmp_path / "transforms.json"]
     with_model = source_files(replace(capture, model=tmp_path / "model"), store)
     assert with_model[:2] == images

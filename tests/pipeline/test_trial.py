@@ -21,7 +21,10 @@ from gsbench.runs.trial_folder import TrialFolder
 def test_code_that_ends_the_process_is_a_failure(code: int | str | None, tmp_path: Path) -> None:
     folder = TrialFolder(tmp_path / "a" / "b" / "c" / "d" / "x")
     folder.path.mkdir(parents=True)
-    with pytest.raises(TrainingError, match="ended the process"), _recorded_failures({"seed": 0}, folder):
+    with (
+        pytest.raises(TrainingError, match="ended the process"),
+        _recorded_failures({"seed": 0}, folder),
+    ):
         sys.exit(code)
     assert "ended the process" in json.loads((folder.path / "failed.json").read_text())["message"]
 
@@ -33,7 +36,11 @@ def test_code_that_ends_the_process_is_a_failure(code: int | str | None, tmp_pat
         (["raster=cpu"], True, None),
         (["raster=gsplat"], False, None),  # where it will run there may be a GPU
         (["raster=gsplat"], True, "raster=gsplat runs on device=cuda"),
-        (["raster=gsplat", "densify=taming"], False, "densify=taming .*; take raster=reference or raster=cpu"),
+        (
+            ["raster=gsplat", "densify=taming"],
+            False,
+            "densify=taming .*; take raster=reference or raster=cpu",
+        ),
         (["raster=auto", "densify=taming"], False, None),
         (["raster=cpu", "densify=taming"], True, None),
     ],
@@ -49,7 +56,9 @@ def test_a_rasterizer_that_cannot_run_or_offer_what_is_asked_is_refused_before_a
             parts.check(here)
 
 
-def test_threads_are_those_that_are_set_or_what_parallel_trials_leave(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_threads_are_those_that_are_set_or_what_parallel_trials_leave(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr("gsbench.pipeline.parts.available_threads", lambda parallel: 100 + parallel)
     for words, threads in ((["threads=3"], 3), (["threads=auto", "launch.parallel=2"], 102)):
         assert Parts(compose_one(["scene=courtyard", *words]).values).threads == threads
@@ -57,7 +66,9 @@ def test_threads_are_those_that_are_set_or_what_parallel_trials_leave(monkeypatc
 
 def test_only_the_threads_that_are_left_open_are_those_of_the_trial() -> None:
     for word, threads in (("init.threads=auto", 3), ("init.threads=2", 2)):
-        initializer: Any = Parts(compose_one(["scene=courtyard", "init=sfm", "threads=3", word]).values).initializer
+        initializer: Any = Parts(
+            compose_one(["scene=courtyard", "init=sfm", "threads=3", word]).values
+        ).initializer
         assert initializer.threads == threads
 
 
@@ -75,7 +86,13 @@ def test_a_configuration_that_nobody_has_composed_may_run_no_more_than_one_that_
 
 def test_a_program_must_be_there_only_where_it_runs() -> None:
     command = "densify.command='/nowhere/program {data} {output}'"
-    words = ["scene=courtyard", "densify=external/program", command, "densify.result=a.ply", "densify.version=1"]
+    words = [
+        "scene=courtyard",
+        "densify=external/program",
+        command,
+        "densify.result=a.ply",
+        "densify.version=1",
+    ]
     parts = Parts(compose_one([*words, "allow_targets=[/nowhere/program]"]).values)
     parts.check(on_this_machine=False)
     with pytest.raises(InputError, match="program"):
@@ -131,14 +148,30 @@ def own_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     [
         ("densify", {"_target_": "own_classes.Picky", "least": 2.0}, None),
         ("densify", {"_target_": "own_classes.Picky", "lest": 2.0}, r"densify\.lest"),
-        ("densify", {"_target_": "own_classes.Picky", "least": -1.0}, r"own_classes\.Picky cannot be made .KeyError"),
-        ("raster", {"_target_": "own_classes.Bare", "least": 2.0}, "has options but is not a dataclass"),
+        (
+            "densify",
+            {"_target_": "own_classes.Picky", "least": -1.0},
+            r"own_classes\.Picky cannot be made .KeyError",
+        ),
+        (
+            "raster",
+            {"_target_": "own_classes.Bare", "least": 2.0},
+            "has options but is not a dataclass",
+        ),
         ("raster", {"_target_": "own_classes.Bare"}, None),
         ("densify", {"_target_": "own_classes.Ender"}, "cannot be made .SystemExit: 3"),
         ("densify", {"_target_": "own_classes.Nothing"}, "is not a class for densify: it has no "),
         ("densify", {"_target_": "own_classes.function"}, "is not a class for densify"),
-        ("densify", {"_target_": "gsbench.densify.ADC", "gradient_treshold": 1}, "did you mean gradient_threshold"),
-        ("densify", {"_target_": "gsbench.densify.ADC", "stop": 1, "start": 5}, r"densify\.stop must be above"),
+        (
+            "densify",
+            {"_target_": "gsbench.densify.ADC", "gradient_treshold": 1},
+            "did you mean gradient_threshold",
+        ),
+        (
+            "densify",
+            {"_target_": "gsbench.densify.ADC", "stop": 1, "start": 5},
+            r"densify\.stop must be above",
+        ),
         ("init", {"_target_": "gsbench.init.Random", "count": 0}, "init"),
     ],
 )
@@ -154,8 +187,12 @@ def test_a_part_that_cannot_be_made_is_refused_with_its_setting(
             build(group, values, ["own_classes"])
 
 
-@pytest.mark.parametrize(("name", "sound"), [("Named", True), ("Nameless", False), ("Taken", False)])
-def test_a_rasterizer_of_ones_own_goes_by_a_name_of_its_own(own_module: None, name: str, sound: bool) -> None:
+@pytest.mark.parametrize(
+    ("name", "sound"), [("Named", True), ("Nameless", False), ("Taken", False)]
+)
+def test_a_rasterizer_of_ones_own_goes_by_a_name_of_its_own(
+    own_module: None, name: str, sound: bool
+) -> None:
     values = {"name": "own", "_target_": f"own_classes.{name}"}
     if sound:
         assert build_own_rasterizer(values, ["own_classes"]).name == "named"
@@ -163,7 +200,12 @@ def test_a_rasterizer_of_ones_own_goes_by_a_name_of_its_own(own_module: None, na
         with pytest.raises(InputError, match="needs an attribute name"):
             build_own_rasterizer(values, ["own_classes"])
     for densify, given in (("adc", "auto"), ("adc", "own"), ("taming", "auto")):
-        words = ["scene=courtyard", "device=cpu", f"densify={densify}", "allow_targets=[own_classes]"]
+        words = [
+            "scene=courtyard",
+            "device=cpu",
+            f"densify={densify}",
+            "allow_targets=[own_classes]",
+        ]
         parts = Parts(compose_one(words).values | {"raster": values | {"name": given}})
         if sound and densify == "adc":
             parts.check(on_this_machine=True)
@@ -183,9 +225,11 @@ def test_nothing_is_written_through_a_link_in_the_runs_folder(tmp_path: Path, pl
     outside.mkdir()
     own = trial.files
     link = {
-        "scene": own.path.parents[1], "trial": own.path, "log.txt": own.path / "log.txt",
+        "scene": own.path.parents[1],
+        "trial": own.path,
+        "log.txt": own.path / "log.txt",
         "store/views": own.runs / layout.STORE / layout.VIEWS,
-    }[place]  # fmt: skip
+    }[place]
     link.parent.mkdir(parents=True)
     link.symlink_to(outside / "private" if place == "log.txt" else outside)
     with pytest.raises(InputError, match=r"not a regular file|is a link"):

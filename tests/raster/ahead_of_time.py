@@ -1,4 +1,5 @@
-"""Compile Triton kernels for GPUs that are not there, with the arguments of real launches, and read what came out."""
+"""Compile Triton kernels for GPUs that are not there, with the arguments of real launches, and read
+what came out."""
 
 from __future__ import annotations
 
@@ -49,7 +50,8 @@ def recorded(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Launch]]:
 
 
 def specialization(launch: Launch, compute_capability: int = 90) -> tuple[Any, ...]:
-    """What Triton compiles a kernel anew for: types, constants, and which arguments are divisible by 16."""
+    """What Triton compiles a kernel anew for: types, constants, and which arguments are divisible
+    by 16."""
     backend = make_backend(GPUTarget("cuda", compute_capability, 32))
     binder = create_function_from_signature(launch.kernel.signature, launch.kernel.params, backend)
     _, kinds, _ = binder(*launch.arguments, **launch.named)
@@ -78,7 +80,9 @@ def compile_for(launch: Launch, compute_capability: int) -> Compiled:
     kernel = launch.kernel
     binder = create_function_from_signature(kernel.signature, kernel.params, backend)
     bound, kinds, options = binder(*launch.arguments, **launch.named)
-    options, signature, constants, attributes = kernel._pack_args(backend, launch.named, bound, kinds, options)
+    options, signature, constants, attributes = kernel._pack_args(
+        backend, launch.named, bound, kinds, options
+    )
     source = ASTSource(kernel, signature, constants, attributes)
     made = triton.compile(source, target=target, options=options.__dict__)
     with tempfile.TemporaryDirectory() as folder:
@@ -87,11 +91,14 @@ def compile_for(launch: Launch, compute_capability: int) -> Compiled:
         usage = _run("cuobjdump", "--dump-resource-usage", str(binary))
         text = _run("nvdisasm", "--print-code", str(binary))
     found = {key: int(value) for key, value in re.findall(r"(REG|STACK|LOCAL|SHARED):(\d+)", usage)}
-    return Compiled(found["REG"], found["STACK"] + found["LOCAL"], found["SHARED"], innermost_loops(text), text)
+    return Compiled(
+        found["REG"], found["STACK"] + found["LOCAL"], found["SHARED"], innermost_loops(text), text
+    )
 
 
 def innermost_loops(text: str) -> dict[str, int]:
-    """Instructions between a label and a branch back to it, where no other such loop lies within."""
+    """Instructions between a label and a branch back to it, where no other such loop lies
+    within."""
     labels: dict[str, int] = {}
     loops: dict[str, tuple[int, int]] = {}
     place = 0
@@ -102,7 +109,8 @@ def innermost_loops(text: str) -> dict[str, int]:
             place += 1
             if (jump := re.search(r"\bBRA(?:\.U)?\b.*`\((\.L_\w+)\)", line)) and jump[1] in labels:
                 loops[jump[1]] = (labels[jump[1]], place)
-    loops = {label: (begin, end) for label, (begin, end) in loops.items() if end - begin > 1}  # not the trap at the end
+    # not the trap at the end
+    loops = {label: (begin, end) for label, (begin, end) in loops.items() if end - begin > 1}
     inner = {
         label
         for label, (begin, end) in loops.items()
@@ -116,4 +124,6 @@ def _run(tool: str, *arguments: str) -> str:
     command = str(path) if path.exists() else shutil.which(tool)
     if command is None:
         pytest.skip(f"this Triton has no {tool}")
-    return subprocess.run([command, *arguments], capture_output=True, text=True, check=True, timeout=120).stdout
+    return subprocess.run(
+        [command, *arguments], capture_output=True, text=True, check=True, timeout=120
+    ).stdout

@@ -1,9 +1,9 @@
-"""A stand-in for the module ``gsplat`` on the CPU: the signatures, shapes and habits that the CUDA code of 1.5 has;
-`head` is that of 1.6.
+"""A stand-in for the module ``gsplat`` on the CPU: the signatures, shapes and habits that the CUDA
+code of 1.5 has; `head` is that of 1.6.
 
-Projection, crossings and harmonics are gsplat's own torch definitions. Compositing is written here in plain torch,
-behind an autograd function that saves the means it was given and leaves the absolute gradient on them, as gsplat's
-does.
+Projection, crossings and harmonics are gsplat's own torch definitions. Compositing is written here
+in plain torch, behind an autograd function that saves the means it was given and leaves the
+absolute gradient on them, as gsplat's does.
 """
 
 from __future__ import annotations
@@ -23,7 +23,8 @@ ALPHA_MAX = 0.999  # gsplat 1.5; no gradient passes
 TRANSMITTANCE_MIN = 1e-4
 
 calls: list[str] = []  # what was called, by name
-graphs: list[weakref.ref] = []  # to every compositing in an autograd graph: dead when the graph is freed
+# to every compositing in an autograd graph: dead when the graph is freed
+graphs: list[weakref.ref] = []
 
 
 def fully_fused_projection(
@@ -40,7 +41,9 @@ def fully_fused_projection(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, None]:
     calls.append("fully_fused_projection")
     if len(means) == 0:
-        raise ZeroDivisionError("gsplat's kernel divides by the number of Gaussians, and the process dies")
+        raise ZeroDivisionError(
+            "gsplat's kernel divides by the number of Gaussians, and the process dies"
+        )
     covariances, _ = definitions._quat_scale_to_covar_preci(quats, scales, True, False)
     radii, means2d, depths, conics, _ = definitions._fully_fused_projection(
         means, covariances, viewmats, Ks, width, height, eps2d=eps2d, near_plane=near_plane
@@ -49,28 +52,42 @@ def fully_fused_projection(
 
 
 def isect_tiles(
-    means2d: Tensor, radii: Tensor, depths: Tensor, tile_size: int, tile_width: int, tile_height: int
+    means2d: Tensor,
+    radii: Tensor,
+    depths: Tensor,
+    tile_size: int,
+    tile_width: int,
+    tile_height: int,
 ) -> tuple[Tensor, Tensor, Tensor]:
     calls.append("isect_tiles")
     return definitions._isect_tiles(means2d, radii, depths, tile_size, tile_width, tile_height)
 
 
-def isect_offset_encode(isect_ids: Tensor, n_images: int, tile_width: int, tile_height: int) -> Tensor:
+def isect_offset_encode(
+    isect_ids: Tensor, n_images: int, tile_width: int, tile_height: int
+) -> Tensor:
     calls.append("isect_offset_encode")
     return definitions._isect_offset_encode(isect_ids, n_images, tile_width, tile_height)
 
 
-def spherical_harmonics(degrees_to_use: int, dirs: Tensor, coeffs: Tensor, masks: Tensor | None = None) -> Tensor:
+def spherical_harmonics(
+    degrees_to_use: int, dirs: Tensor, coeffs: Tensor, masks: Tensor | None = None
+) -> Tensor:
     calls.append("spherical_harmonics")
     colors = definitions._spherical_harmonics(degrees_to_use, dirs, coeffs)
     return colors if masks is None else torch.where(masks.unsqueeze(-1), colors, 0.0)
 
 
 def head() -> SimpleNamespace:
-    """gsplat 1.6, as far as it differs: its harmonics find the camera in the pose, and check every shape."""
+    """gsplat 1.6, as far as it differs: its harmonics find the camera in the pose, and check every
+    shape."""
 
     def spherical_harmonics(
-        degrees_to_use: int, means: Tensor, viewmats: Tensor, coeffs: Tensor, masks: Tensor | None = None
+        degrees_to_use: int,
+        means: Tensor,
+        viewmats: Tensor,
+        coeffs: Tensor,
+        masks: Tensor | None = None,
     ) -> Tensor:
         calls.append("spherical_harmonics of 1.6")
         cameras, count = len(viewmats), len(means)
@@ -78,8 +95,13 @@ def head() -> SimpleNamespace:
         assert viewmats.shape == (cameras, 4, 4)
         assert len(coeffs) == count
         assert masks is None or masks.shape == (cameras, count)
-        centers = -(viewmats[:, :3, :3].transpose(1, 2) @ viewmats[:, :3, 3:])[..., 0]  # [C, 3] -R^T t
-        colors = [definitions._spherical_harmonics(degrees_to_use, means - center, coeffs) for center in centers]
+        centers = -(viewmats[:, :3, :3].transpose(1, 2) @ viewmats[:, :3, 3:])[
+            ..., 0
+        ]  # [C, 3] -R^T t
+        colors = [
+            definitions._spherical_harmonics(degrees_to_use, means - center, coeffs)
+            for center in centers
+        ]
         found = torch.stack(colors)  # [C, N, 3]
         return found if masks is None else torch.where(masks.unsqueeze(-1), found, 0.0)
 
@@ -106,7 +128,8 @@ def rasterize_to_pixels(
 
 
 class _Rasterize(torch.autograd.Function):
-    """The picture again in ``backward``, with a copy of the means for each pixel: absolute values can be summed."""
+    """The picture again in ``backward``, with a copy of the means for each pixel: absolute values
+    can be summed."""
 
     @staticmethod
     def forward(ctx: Any, means2d: Tensor, *rest: Any) -> tuple[Tensor, Tensor]:
@@ -123,7 +146,11 @@ class _Rasterize(torch.autograd.Function):
         with torch.enable_grad():
             leaves = [tensor.detach().requires_grad_() for tensor in (means2d, *tensors[:3])]
             image, alpha, spread = _composite(*leaves, tensors[3], ctx.settings)
-            joined = (image * g_image).sum() + (alpha * g_alpha).sum() + 0 * sum(leaf.sum() for leaf in leaves)
+            joined = (
+                (image * g_image).sum()
+                + (alpha * g_alpha).sum()
+                + 0 * sum(leaf.sum() for leaf in leaves)
+            )
             wanted = [*leaves, *(copies for _, copies in spread)]
             found = torch.autograd.grad(joined, wanted, allow_unused=True)
         if ctx.settings[-1]:
@@ -135,9 +162,15 @@ class _Rasterize(torch.autograd.Function):
 
 
 def _composite(
-    means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor, backgrounds: Tensor, settings: Any
+    means2d: Tensor,
+    conics: Tensor,
+    colors: Tensor,
+    opacities: Tensor,
+    backgrounds: Tensor,
+    settings: Any,
 ) -> tuple[Tensor, Tensor, list[tuple[Tensor, Tensor]]]:
-    """Image [1, H, W, 3], alpha [1, H, W, 1], and a tile's Gaussians [K] with copies of their means [P, K, 2]."""
+    """Image [1, H, W, 3], alpha [1, H, W, 1], and a tile's Gaussians [K] with copies of their means
+    [P, K, 2]."""
     width, height, tile, offsets, members, _ = settings
     bounds = [*offsets.flatten().tolist(), len(members)]
     tiles_x = offsets.shape[-1]
@@ -150,10 +183,15 @@ def _composite(
         index = members[begin:end].long()
         x0, y0 = k % tiles_x * tile, k // tiles_x * tile
         x1, y1 = min(x0 + tile, width), min(y0 + tile, height)
-        rows, columns = torch.meshgrid(torch.arange(y0, y1) + 0.5, torch.arange(x0, x1) + 0.5, indexing="ij")
+        rows, columns = torch.meshgrid(
+            torch.arange(y0, y1) + 0.5, torch.arange(x0, x1) + 0.5, indexing="ij"
+        )
         copies = means2d[0, index].expand(rows.numel(), -1, -1)  # [P, K, 2]
         spread.append((index, copies))
-        dx, dy = copies[..., 0] - columns.reshape(-1, 1), copies[..., 1] - rows.reshape(-1, 1)  # [P, K]
+        dx, dy = (
+            copies[..., 0] - columns.reshape(-1, 1),
+            copies[..., 1] - rows.reshape(-1, 1),
+        )  # [P, K]
         a, b, c = conics[0, index].unbind(-1)
         sigma = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy
         raw = (opacities[0, index] * torch.exp(-sigma)).clamp_max(ALPHA_MAX)

@@ -1,4 +1,5 @@
-"""Every executor that runs here against the float64 reference: the contract of ``gsbench.raster.base``."""
+"""Every executor that runs here against the float64 reference: the contract of
+``gsbench.raster.base``."""
 
 from __future__ import annotations
 
@@ -36,7 +37,11 @@ def _home(executor: Executor) -> str:
 
 def _available() -> list[str]:
     places = {"cpu": True, "cuda": torch.cuda.is_available()}
-    here = [executor for executor in EXECUTORS if places[_home(executor)] and not executor.obstacle(_home(executor))]
+    here = [
+        executor
+        for executor in EXECUTORS
+        if places[_home(executor)] and not executor.obstacle(_home(executor))
+    ]
     return [executor.name for executor in here if executor.name not in PEERS]
 
 
@@ -47,11 +52,15 @@ def device(request: pytest.FixtureRequest) -> str:
 
 @pytest.fixture
 def rasterizer(request: pytest.FixtureRequest, device: str) -> Rasterizer:
-    return create_rasterizer(request.node.callspec.params["device"], torch.device(device), threads=2)
+    return create_rasterizer(
+        request.node.callspec.params["device"], torch.device(device), threads=2
+    )
 
 
 @pytest.mark.parametrize("case", CASES, ids=str)
-def test_values_and_gradients_match_the_reference(rasterizer: Rasterizer, device: str, case: Case) -> None:
+def test_values_and_gradients_match_the_reference(
+    rasterizer: Rasterizer, device: str, case: Case
+) -> None:
     expected, expected_gradients = render_with_gradients(ReferenceRasterizer(), case, torch.float64)
     output, gradients = render_with_gradients(rasterizer, case, torch.float32, device)
 
@@ -69,23 +78,34 @@ def test_values_and_gradients_match_the_reference(rasterizer: Rasterizer, device
     assert find_executor(rasterizer.name).has_footprint
     assert offers(rasterizer.name, "has_splitting_matrix")  # so it was compared
     assert "splitting_probe" in gradients
-    assert max(footprint_errors(output, expected).values()) < FOOTPRINT_TOLERANCE  # asked after the backward pass
+    # asked after the backward pass
+    assert max(footprint_errors(output, expected).values()) < FOOTPRINT_TOLERANCE
 
 
 def test_unused_coefficients_get_a_zero_gradient(rasterizer: Rasterizer, device: str) -> None:
-    _, gradients = render_with_gradients(rasterizer, Case(50, 37, 120, sh_degree=1), torch.float32, device)
+    _, gradients = render_with_gradients(
+        rasterizer, Case(50, 37, 120, sh_degree=1), torch.float32, device
+    )
     assert gradients["sh_rest"][:, :3].abs().max() > 0
     assert gradients["sh_rest"][:, 3:].abs().max() == 0
 
 
-def test_the_gradient_of_the_colour_clamp_passes_at_zero(rasterizer: Rasterizer, device: str) -> None:
+def test_the_gradient_of_the_colour_clamp_passes_at_zero(
+    rasterizer: Rasterizer, device: str
+) -> None:
     """max(0, SH + 0.5): no gradient below 0, all of it at exactly 0."""
     gaussians = _one_gaussian(device)
     c0 = math.sqrt(1 / (4 * math.pi))
     at_zero = np.float32(-0.5) / np.float32(c0)
-    candidates = [at_zero, np.nextafter(at_zero, np.float32(0)), np.nextafter(at_zero, np.float32(-9))]
+    candidates = [
+        at_zero,
+        np.nextafter(at_zero, np.float32(0)),
+        np.nextafter(at_zero, np.float32(-9)),
+    ]
     exact = next(float(v) for v in candidates if np.float32(c0) * v + np.float32(0.5) == 0)
-    gaussians.sh_dc = torch.tensor([[exact, exact - 1e-3, exact + 1e-3]], device=device, requires_grad=True)
+    gaussians.sh_dc = torch.tensor(
+        [[exact, exact - 1e-3, exact + 1e-3]], device=device, requires_grad=True
+    )
     output = rasterizer.render(gaussians, _camera(32, 32), 0, torch.zeros(3, device=device))
     output.image.sum().backward()
     gradient = gaussians.sh_dc.grad[0]
@@ -96,7 +116,10 @@ def test_the_gradient_of_the_colour_clamp_passes_at_zero(rasterizer: Rasterizer,
 
 def test_nothing_to_see_is_the_background(rasterizer: Rasterizer, device: str) -> None:
     background = torch.tensor([0.1, 0.2, 0.3], device=device)
-    for gaussians in (_one_gaussian(device, z=-5.0), _one_gaussian(device).select(torch.zeros(0, dtype=torch.long))):
+    for gaussians in (
+        _one_gaussian(device, z=-5.0),
+        _one_gaussian(device).select(torch.zeros(0, dtype=torch.long)),
+    ):
         leaves = gaussians.map(lambda tensor: tensor.detach().requires_grad_())
         output = rasterizer.render(leaves, _camera(20, 17), 3, background)
         assert torch.equal(output.image, background.expand(17, 20, 3))
@@ -115,10 +138,14 @@ def test_nothing_to_see_is_the_background(rasterizer: Rasterizer, device: str) -
     suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
 @given(gaussians=extreme_gaussians())
-def test_extreme_gaussians_give_finite_results(rasterizer: Rasterizer, device: str, gaussians: Gaussians) -> None:
+def test_extreme_gaussians_give_finite_results(
+    rasterizer: Rasterizer, device: str, gaussians: Gaussians
+) -> None:
     leaves = gaussians.map(lambda tensor: tensor.to(device).requires_grad_())
     background = torch.zeros(3, device=device)
-    output = rasterizer.render(leaves, _camera(37, 21), 3, background, absolute_gradient=True, splitting_matrix=True)  # type: ignore[call-arg]
+    output = rasterizer.render(
+        leaves, _camera(37, 21), 3, background, absolute_gradient=True, splitting_matrix=True
+    )  # type: ignore[call-arg]
     assert output.image.isfinite().all()
     assert ((output.alpha >= 0) & (output.alpha <= 1)).all()
     assert (output.radii >= 0).all()
@@ -130,9 +157,13 @@ def test_extreme_gaussians_give_finite_results(rasterizer: Rasterizer, device: s
     assert output.splitting_probe.grad is None or output.splitting_probe.grad.isfinite().all()
 
 
-@pytest.mark.parametrize("name", ["means", "log_scales", "quaternions", "opacity_logits", "sh_dc", "sh_rest"])
+@pytest.mark.parametrize(
+    "name", ["means", "log_scales", "quaternions", "opacity_logits", "sh_dc", "sh_rest"]
+)
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
-def test_values_that_are_not_finite_are_named(rasterizer: Rasterizer, device: str, name: str, value: float) -> None:
+def test_values_that_are_not_finite_are_named(
+    rasterizer: Rasterizer, device: str, name: str, value: float
+) -> None:
     gaussians = _one_gaussian(device)
     getattr(gaussians, name).flatten()[0] = value
     with pytest.raises(ValueError, match=name):
@@ -159,7 +190,9 @@ def test_inputs_that_cannot_be_used_are_named(rasterizer: Rasterizer, device: st
 
 
 def _camera(width: int, height: int, focal: float | None = None) -> Camera:
-    return Camera(width, height, focal or width, focal or width, width / 2, height / 2, np.eye(3), np.zeros(3))
+    return Camera(
+        width, height, focal or width, focal or width, width / 2, height / 2, np.eye(3), np.zeros(3)
+    )
 
 
 def _one_gaussian(device: str, z: float = 3.0) -> Gaussians:

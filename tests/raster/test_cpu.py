@@ -1,4 +1,5 @@
-"""What the compiled CPU rasterizer promises beyond the contract: the same bits, memory safe to keep, any host."""
+"""What the compiled CPU rasterizer promises beyond the contract: the same bits, memory safe to
+keep, any host."""
 
 from __future__ import annotations
 
@@ -19,7 +20,16 @@ from numba import types
 
 from gsbench.gaussians.model import Gaussians
 from gsbench.raster.base import RenderOutput
-from gsbench.raster.cpu import CpuRasterizer, binning, composite, executor, layout, shuffle, simd, workspace
+from gsbench.raster.cpu import (
+    CpuRasterizer,
+    binning,
+    composite,
+    executor,
+    layout,
+    shuffle,
+    simd,
+    workspace,
+)
 from gsbench.raster.cpu.workspace import Arena, ShardRunner, TensorPool
 from gsbench.raster.reference import ReferenceRasterizer, project, tile_rectangles
 from tests.raster.strategies import Case, render_with_gradients
@@ -37,7 +47,8 @@ def _bits(output: RenderOutput, gradients: dict[str, torch.Tensor]) -> list[byte
 def test_the_same_bits_on_every_run_and_for_any_number_of_threads() -> None:
     one = CpuRasterizer(threads=1)
     expected = _bits(*render_with_gradients(one, MANY, torch.float32))
-    assert _bits(*render_with_gradients(one, MANY, torch.float32)) == expected  # memory that was used before
+    # memory that was used before
+    assert _bits(*render_with_gradients(one, MANY, torch.float32)) == expected
     for threads in (2, 4):
         rasterizer = CpuRasterizer(threads=threads)
         for _ in range(3):
@@ -55,7 +66,11 @@ def test_equal_depths_are_blended_in_the_order_of_the_index() -> None:
     )
     camera = CASE.camera()
     image = CpuRasterizer(threads=2).render(gaussians, camera, 0, BLACK).image
-    reference = ReferenceRasterizer().render(gaussians.map(torch.Tensor.double), camera, 0, BLACK.double()).image
+    reference = (
+        ReferenceRasterizer()
+        .render(gaussians.map(torch.Tensor.double), camera, 0, BLACK.double())
+        .image
+    )
     assert (image - reference).abs().max() < 1e-5
     assert reference.max() > 0.5
 
@@ -64,7 +79,9 @@ def test_depths_are_sorted_as_numpy_sorts_them() -> None:
     generator = np.random.default_rng(0)
     depths = np.exp(generator.uniform(-1.6, 20, 500)).astype(np.float32)
     depths[generator.integers(0, 500, 60)] = depths[7]
-    keys = (depths.view(np.uint32).astype(np.uint64) << np.uint64(32)) | np.arange(500, dtype=np.uint64)
+    keys = (depths.view(np.uint32).astype(np.uint64) << np.uint64(32)) | np.arange(
+        500, dtype=np.uint64
+    )
     begins, visible = np.array([0, 200, 320]), np.array([150, 0, 180])
     order, spare = np.empty((2, 330), np.uint64)
     digits = np.empty((binning.PASSES, binning.BUCKETS), np.int64)
@@ -81,7 +98,9 @@ def test_depths_are_sorted_as_numpy_sorts_them() -> None:
         ([5, 5, 5, 5, 5, 5], 1, [0, 6]),
     ],
 )
-def test_tiles_are_divided_by_their_work(lengths: list[int], shards: int, bounds: list[int]) -> None:
+def test_tiles_are_divided_by_their_work(
+    lengths: list[int], shards: int, bounds: list[int]
+) -> None:
     starts = np.concatenate([[0], np.cumsum(lengths)])
     found, of_tile = np.full(shards + 1, -1), np.full(len(lengths), 99, np.uint8)
     binning.balance_tiles(starts, shards, found, of_tile)
@@ -90,8 +109,11 @@ def test_tiles_are_divided_by_their_work(lengths: list[int], shards: int, bounds
 
 
 def highest(records: np.ndarray, low_x: Any, low_y: Any, size: float) -> np.ndarray:
-    """The largest log2(alpha) of records [R, 16] in squares of side ``size``: at the mean, or else on an edge."""
-    mean_x, mean_y, shear, curve_t, curve_y, top = (records[:, k, None].astype(np.float64) for k in range(6))
+    """The largest log2(alpha) of records [R, 16] in squares of side ``size``: at the mean, or else
+    on an edge."""
+    mean_x, mean_y, shear, curve_t, curve_y, top = (
+        records[:, k, None].astype(np.float64) for k in range(6)
+    )
 
     def at(dx: np.ndarray, dy: np.ndarray) -> np.ndarray:
         return top + curve_t * (dx + shear * dy) ** 2 + curve_y * dy**2
@@ -100,7 +122,10 @@ def highest(records: np.ndarray, low_x: Any, low_y: Any, size: float) -> np.ndar
     right, lower = left + size, upper + size
     best = at(np.clip(0, left, right), np.clip(0, upper, lower))
     for dx in (left, right):
-        best = np.maximum(best, at(dx, np.clip(-curve_t * shear * dx / (curve_t * shear**2 + curve_y), upper, lower)))
+        best = np.maximum(
+            best,
+            at(dx, np.clip(-curve_t * shear * dx / (curve_t * shear**2 + curve_y), upper, lower)),
+        )
     for dy in (upper, lower):
         best = np.maximum(best, at(np.clip(-shear * dy, left, right), dy))
     return best
@@ -109,14 +134,21 @@ def highest(records: np.ndarray, low_x: Any, low_y: Any, size: float) -> np.ndar
 def test_tiles_and_blocks_are_those_that_a_contour_reaches() -> None:
     """All that have a pixel with alpha >= 1/255, and no others, up to a margin for rounding."""
     case = Case(96, 64, 150, sh_degree=0, log_scale=-2.5, logit=-3.0)  # faint: no pixel stops
-    output = CpuRasterizer(threads=1).render(case.gaussians().map(torch.Tensor.float), case.camera(), 0, BLACK)
+    output = CpuRasterizer(threads=1).render(
+        case.gaussians().map(torch.Tensor.float), case.camera(), 0, BLACK
+    )
     passed = output.footprint.args[0]  # type: ignore[union-attr]
     frame, edges = passed.frame, executor._edges(case.count)
     assert (frame.last == composite.NEVER_STOPPED).all()
     numbers = np.concatenate(
-        [np.arange(edge, edge + seen) for edge, seen in zip(edges[:-1], passed.visible, strict=True)]
+        [
+            np.arange(edge, edge + seen)
+            for edge, seen in zip(edges[:-1], passed.visible, strict=True)
+        ]
     )
-    records, integers = (array.reshape(-1, 16)[numbers] for array in (frame.records, frame.record_ints))
+    records, integers = (
+        array.reshape(-1, 16)[numbers] for array in (frame.records, frame.record_ints)
+    )
     place = {number: k for k, number in enumerate(numbers.tolist())}
     listed, masks = np.zeros((len(numbers), 24), bool), np.zeros((len(numbers), 24), int)
     for tile in range(24):
@@ -136,10 +168,15 @@ def test_tiles_and_blocks_are_those_that_a_contour_reaches() -> None:
     least = math.log2(1 / 255)
     pixel_y, pixel_x = np.divmod(np.arange(96 * 64), 96)
     reached = highest(records, pixel_x, pixel_y, 0.0) >= least
-    needed, needed_blocks = np.zeros((len(numbers), 24), bool), np.zeros((len(numbers), 24, 16), bool)
+    needed, needed_blocks = (
+        np.zeros((len(numbers), 24), bool),
+        np.zeros((len(numbers), 24, 16), bool),
+    )
     np.logical_or.at(needed, (slice(None), pixel_y // 16 * 6 + pixel_x // 16), reached)
     block = pixel_y % 16 // 4 * 4 + pixel_x % 16 // 4
-    np.logical_or.at(needed_blocks, (slice(None), pixel_y // 16 * 6 + pixel_x // 16, block), reached)
+    np.logical_or.at(
+        needed_blocks, (slice(None), pixel_y // 16 * 6 + pixel_x // 16, block), reached
+    )
     assert (listed >= (needed & in_square)).all()
     allowed = in_square & (highest(records, 16 * x - 0.1, 16 * y - 0.1, 15.2) >= least - 0.1)
     spans = integers[:, [layout.TILES_X, layout.TILES_Y]]
@@ -167,7 +204,9 @@ def test_tiles_and_blocks_are_those_that_a_contour_reaches() -> None:
 
 def test_the_backward_pass_skips_entries_behind_the_one_that_stopped_a_block() -> None:
     case = Case(40, 40, 300, sh_degree=0, log_scale=-1.5, logit=3.0)
-    output = CpuRasterizer(threads=1).render(case.gaussians().map(torch.Tensor.float), case.camera(), 0, BLACK)
+    output = CpuRasterizer(threads=1).render(
+        case.gaussians().map(torch.Tensor.float), case.camera(), 0, BLACK
+    )
     frame = output.footprint.args[0].frame  # type: ignore[union-attr]
     skipped = 0
     for tile in range(9):
@@ -182,12 +221,16 @@ def test_the_backward_pass_skips_entries_behind_the_one_that_stopped_a_block() -
 
 
 def test_needles_keep_their_gradients() -> None:
-    """Long thin Gaussians: the determinant of their 2D covariance loses its digits in float32 as ac - b^2."""
+    """Long thin Gaussians: the determinant of their 2D covariance loses its digits in float32 as ac
+    - b^2."""
     gaussians = Case(90, 70, 40, sh_degree=0).gaussians()
     gaussians.log_scales[:, 0] = 0.5
     gaussians.log_scales[:, 1:] = -9.0
     errors = []
-    for rasterizer, dtype in ((CpuRasterizer(threads=1), torch.float32), (ReferenceRasterizer(), torch.float64)):
+    for rasterizer, dtype in (
+        (CpuRasterizer(threads=1), torch.float32),
+        (ReferenceRasterizer(), torch.float64),
+    ):
         leaves = gaussians.map(lambda tensor, dtype=dtype: tensor.to(dtype).requires_grad_())
         rasterizer.render(leaves, CASE.camera(), 0, BLACK.to(dtype)).image.square().sum().backward()
         errors.append(leaves.log_scales.grad.double())
@@ -196,35 +239,53 @@ def test_needles_keep_their_gradients() -> None:
 
 
 def test_turning_a_ball_has_no_gradient() -> None:
-    """Not even a rounding error: Adam would turn 1e-13 into a full step. What is nearly a ball has a true one."""
+    """Not even a rounding error: Adam would turn 1e-13 into a full step. What is nearly a ball has
+    a true one."""
     for stretch in (0.0, 0.01):
         gaussians = MANY.gaussians()
         gaussians.log_scales[:] = gaussians.log_scales[:, :1]
         gaussians.log_scales[:, 1] += stretch
         found = []
-        for rasterizer, dtype in ((CpuRasterizer(threads=1), torch.float32), (ReferenceRasterizer(), torch.float64)):
+        for rasterizer, dtype in (
+            (CpuRasterizer(threads=1), torch.float32),
+            (ReferenceRasterizer(), torch.float64),
+        ):
             leaves = gaussians.map(lambda tensor, dtype=dtype: tensor.to(dtype).requires_grad_())
-            rasterizer.render(leaves, MANY.camera(), 3, BLACK.to(dtype)).image.square().sum().backward()
+            rasterizer.render(
+                leaves, MANY.camera(), 3, BLACK.to(dtype)
+            ).image.square().sum().backward()
             found.append(leaves.quaternions.grad.double())
         assert bool(found[0].any()) == (stretch > 0)
         assert (found[0] - found[1]).abs().max() < 1e-3 * found[1].abs().max() + 1e-12
 
 
 def test_renders_may_be_differentiated_late_and_twice() -> None:
-    """Two graphs at once, in the opposite order, and one of them twice: none may use the memory of another."""
+    """Two graphs at once, in the opposite order, and one of them twice: none may use the memory of
+    another."""
     rasterizer = CpuRasterizer(threads=1)
     cases = (CASE, MANY)
     alone = [render_with_gradients(rasterizer, case, torch.float32)[1]["means"] for case in cases]
-    leaves = [case.gaussians().map(lambda tensor: tensor.float().requires_grad_()) for case in cases]
+    leaves = [
+        case.gaussians().map(lambda tensor: tensor.float().requires_grad_()) for case in cases
+    ]
     background = torch.tensor([0.2, 0.5, 0.9])
-    outputs = [rasterizer.render(g, case.camera(), 3, background) for g, case in zip(leaves, cases, strict=True)]
+    outputs = [
+        rasterizer.render(g, case.camera(), 3, background)
+        for g, case in zip(leaves, cases, strict=True)
+    ]
     for k in (1, 0, 0):
         case = cases[k]
         weights = torch.randn(
-            case.height, case.width, 4, generator=torch.Generator().manual_seed(7), dtype=torch.float64
+            case.height,
+            case.width,
+            4,
+            generator=torch.Generator().manual_seed(7),
+            dtype=torch.float64,
         ).float()
         leaves[k].means.grad = None
-        loss = (outputs[k].image * weights[..., :3]).sum() + (outputs[k].alpha * weights[..., 3]).sum()
+        loss = (outputs[k].image * weights[..., :3]).sum() + (
+            outputs[k].alpha * weights[..., 3]
+        ).sum()
         loss.backward(retain_graph=True)
         assert torch.equal(leaves[k].means.grad.double(), alone[k])
 
@@ -237,7 +298,9 @@ def test_results_that_are_kept_are_not_overwritten() -> None:
     del output
     for _ in range(3):
         render_with_gradients(rasterizer, CASE, torch.float32)
-        rasterizer.render(Case(60, 60, 90, 0).gaussians().map(torch.Tensor.float), CASE.camera(), 0, BLACK)
+        rasterizer.render(
+            Case(60, 60, 90, 0).gaussians().map(torch.Tensor.float), CASE.camera(), 0, BLACK
+        )
     assert torch.equal(image, kept)
     assert gradients["means"].isfinite().all()
 
@@ -274,7 +337,9 @@ def test_strided_parameters_and_the_gradient_of_the_background() -> None:
     rasterizer = CpuRasterizer(threads=1)
     background = torch.tensor([0.1, 0.5, 0.7], requires_grad=True)
     output = rasterizer.render(strided, CASE.camera(), 3, background)
-    assert torch.equal(output.image, rasterizer.render(gaussians, CASE.camera(), 3, background).image)
+    assert torch.equal(
+        output.image, rasterizer.render(gaussians, CASE.camera(), 3, background).image
+    )
     output.image.sum().backward()
     assert background.grad[0].item() == pytest.approx((1 - output.alpha).sum().item(), rel=1e-5)
 
@@ -309,7 +374,9 @@ print(float((output.image.double() - expected.image).abs().max()), worst)
     }
     root = Path(__file__).resolve().parents[2]
     command = [sys.executable, "-c", script]
-    run = subprocess.run(command, env=environment, cwd=root, capture_output=True, text=True, timeout=300, check=False)
+    run = subprocess.run(
+        command, env=environment, cwd=root, capture_output=True, text=True, timeout=300, check=False
+    )
     assert run.returncode == 0, run.stderr
     value_error, gradient_error = map(float, run.stdout.split())
     assert value_error < 1e-4
@@ -343,7 +410,9 @@ def test_vector_functions() -> None:
     np.testing.assert_allclose(out[:16], a * b + 2 - a / b, rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(out[16:32], np.exp2(8 * a.astype(np.float64)), rtol=1e-6)
     np.testing.assert_array_equal(out[32:48], np.where(mask, a, np.float32(7)))
-    np.testing.assert_allclose(out[48:64], np.minimum(a, b) + np.maximum(a, 0) * np.abs(b), rtol=1e-6)
+    np.testing.assert_allclose(
+        out[48:64], np.minimum(a, b) + np.maximum(a, 0) * np.abs(b), rtol=1e-6
+    )
     for k, values in enumerate((a, b, a * b, a - b, -a)):
         assert out[64 + simd.SUM_LANES[k]] == pytest.approx(values.sum(), abs=1e-5)
     assert np.count_nonzero(out[64:80]) == 5
@@ -358,7 +427,9 @@ def _logarithms(x, out):  # type: ignore[no-untyped-def]
         simd.store(out[1], i, simd.square_root(value) + simd.floor(value) - simd.ceil(value))
 
 
-@pytest.mark.parametrize("kind", [types.Array(types.float64, 1, "C"), types.Array(types.float32, 1, "A"), types.intp])
+@pytest.mark.parametrize(
+    "kind", [types.Array(types.float64, 1, "C"), types.Array(types.float32, 1, "A"), types.intp]
+)
 @pytest.mark.parametrize("name", ["load", "load_numbers", "store", "gather", "scatter"])
 def test_only_contiguous_float32_has_vectors(name: str, kind: types.Type) -> None:
     define = getattr(simd, name)._defn
@@ -387,7 +458,10 @@ def _gather_and_scatter(array, indices, out):  # type: ignore[no-untyped-def]
 def test_gather_and_scatter() -> None:
     array = np.arange(60, dtype=np.float32).reshape(20, 3)
     before = array.copy()
-    indices, out = np.array([5, 0, 19, 7, 2, 1, 3, 4, 6, 8, 9, 10, 11, 12, 7, 7]), np.empty(16, np.float32)
+    indices, out = (
+        np.array([5, 0, 19, 7, 2, 1, 3, 4, 6, 8, 9, 10, 11, 12, 7, 7]),
+        np.empty(16, np.float32),
+    )
     _gather_and_scatter(array, indices, out)
     np.testing.assert_array_equal(out, before[indices, 1])
     before[indices, 2] = before[indices, 1]
@@ -468,7 +542,9 @@ def test_memory_that_is_not_used_is_let_go(monkeypatch: pytest.MonkeyPatch) -> N
 
     arena, allocate = Arena(), workspace.aligned_bytes
     arena.take("a", (10,), np.float32)
-    monkeypatch.setattr(workspace, "aligned_bytes", lambda size: allocate(size) if not arena._blocks else None)
+    monkeypatch.setattr(
+        workspace, "aligned_bytes", lambda size: allocate(size) if not arena._blocks else None
+    )
     assert arena.take("a", (100,), np.float32).shape == (100,)  # the old block was dropped before
     assert allocate(10).size == 10
 

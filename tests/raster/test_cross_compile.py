@@ -1,4 +1,5 @@
-"""The CPU kernels as machine code for processors that are not here: every one compiles, with vector instructions."""
+"""The CPU kernels as machine code for processors that are not here: every one compiles, with vector
+instructions."""
 
 from __future__ import annotations
 
@@ -25,12 +26,14 @@ TARGETS = {  # triple, processor
     "sve": ("aarch64-unknown-linux-gnu", "neoverse-v1"),
     "apple": ("arm64-apple-macosx", "apple-m1"),
 }
-FREE_OF_VECTORS = {"sort_by_depth", "start_tiles", "fill_shards", "balance_tiles", "pair_shards"}  # counting and moving
+# counting and moving
+FREE_OF_VECTORS = {"sort_by_depth", "start_tiles", "fill_shards", "balance_tiles", "pair_shards"}
 
 
 @cache
 def kernels() -> dict[str, Any]:
-    """The kernels of a training step and of a footprint, by name, as one such step has called them."""
+    """The kernels of a training step and of a footprint, by name, as one such step has called
+    them."""
     case = Case(33, 49, 50, sh_degree=3)
     trainable = TrainableGaussians(case.gaussians().map(torch.Tensor.float), LearningRates(), 1.0)
     output = CpuRasterizer(threads=1).render(trainable.values, case.camera(), 3, torch.zeros(3))
@@ -70,7 +73,9 @@ def check(target: str, name: str) -> None:
     if name not in FREE_OF_VECTORS:
         assert re.search(r"\bfm(la|ul)(\.4s)?\s+v\d+", assembly), f"{name}: no vector instruction"
         called = set(re.findall(r"\bbl\s+_?(\w+)", assembly))
-        assert not called & {"fmaf", "sqrtf", "floorf", "ceilf", "fma", "exp2f"}, f"{name} calls {called}"
+        assert not called & {"fmaf", "sqrtf", "floorf", "ceilf", "fma", "exp2f"}, (
+            f"{name} calls {called}"
+        )
 
 
 @pytest.mark.parametrize("target", TARGETS)

@@ -1,4 +1,5 @@
-"""The table of executors: what `raster=` accepts, what `auto` takes, and that nothing else lists them."""
+"""The table of executors: what `raster=` accepts, what `auto` takes, and that nothing else lists
+them."""
 
 from __future__ import annotations
 
@@ -27,7 +28,9 @@ CPU = torch.device("cpu")
 
 def installed(monkeypatch: pytest.MonkeyPatch, *packages: str) -> None:
     """Make as if of the executors' packages these were installed, and no others."""
-    monkeypatch.setattr(executors.importlib.util, "find_spec", lambda name: object() if name in packages else None)
+    monkeypatch.setattr(
+        executors.importlib.util, "find_spec", lambda name: object() if name in packages else None
+    )
 
 
 @pytest.mark.parametrize("executor", EXECUTORS, ids=lambda executor: executor.name)
@@ -52,7 +55,10 @@ def test_names_are_the_same_everywhere() -> None:
 
 
 def test_the_table_loads_no_torch() -> None:
-    code = "import sys, gsbench.raster.executors, gsbench.raster.base; sys.exit('torch' in sys.modules)"
+    code = (
+        "import sys, gsbench.raster.executors, gsbench.raster.base; sys.exit('torch' in "
+        "sys.modules)"
+    )
     assert subprocess.run([sys.executable, "-c", code], check=False, timeout=300).returncode == 0
 
 
@@ -71,14 +77,23 @@ def test_auto(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture)
 def test_what_cannot_run_is_said_with_what_can(monkeypatch: pytest.MonkeyPatch) -> None:
     assert resolve("reference", "cpu").name == "reference"
     assert isinstance(create_rasterizer("reference", CPU, threads=1), ReferenceRasterizer)
-    with pytest.raises(InputError, match=r"opengl is not known; choose auto, reference, cpu, .*_target_"):
+    with pytest.raises(
+        InputError, match=r"opengl is not known; choose auto, reference, cpu, .*_target_"
+    ):
         resolve("opengl", "cpu")
-    with pytest.raises(InputError, match="raster=gsplat runs on device=cuda, not on cpu; choose from reference, cpu"):
+    with pytest.raises(
+        InputError,
+        match="raster=gsplat runs on device=cuda, not on cpu; choose from reference, cpu",
+    ):
         resolve("gsplat", "cpu")
-    with pytest.raises(InputError, match=r"raster=cpu runs on device=cpu, not on cuda; choose from reference, "):
+    with pytest.raises(
+        InputError, match=r"raster=cpu runs on device=cpu, not on cuda; choose from reference, "
+    ):
         resolve("cpu", "cuda")
     installed(monkeypatch)
-    with pytest.raises(InputError, match=f"raster=gsplat needs gsplat: {re.escape(install_command('gsplat'))}"):
+    with pytest.raises(
+        InputError, match=f"raster=gsplat needs gsplat: {re.escape(install_command('gsplat'))}"
+    ):
         resolve("gsplat", "cuda")
     assert find_executor("gsplat").obstacle("cuda") is not None
 
@@ -114,11 +129,19 @@ def test_python_headers_are_looked_for_where_the_usual_scheme_has_them(
 ) -> None:
     """Debian's own scheme for packages, ``posix_local``, names a folder that has no headers."""
     asked = []
-    monkeypatch.setattr(executors.sysconfig, "get_paths", lambda scheme: asked.append(scheme) or {"include": tmp_path})
+    monkeypatch.setattr(
+        executors.sysconfig,
+        "get_paths",
+        lambda scheme: asked.append(scheme) or {"include": tmp_path},
+    )
     monkeypatch.setenv("CC", sys.executable)
     for default in ("posix_local", "posix_prefix", "nt"):
-        monkeypatch.setattr(executors.sysconfig, "get_default_scheme", lambda default=default: default)
-        assert [line.partition(":")[0] for line in executors.missing_tools()] == [str(tmp_path / "Python.h")]
+        monkeypatch.setattr(
+            executors.sysconfig, "get_default_scheme", lambda default=default: default
+        )
+        assert [line.partition(":")[0] for line in executors.missing_tools()] == [
+            str(tmp_path / "Python.h")
+        ]
     assert asked == ["posix_prefix", "posix_prefix", "nt"]
     (tmp_path / "Python.h").touch()
     assert executors.missing_tools() == []
@@ -141,7 +164,9 @@ def test_a_gpu_that_cannot_be_used_is_explained(monkeypatch: pytest.MonkeyPatch)
 
 def test_settings_are_checked() -> None:
     assert RasterConfig(name="cpu").name == "cpu"
-    with pytest.raises(InputError, match=r"raster must be one of auto, reference, .*, got 'cpuu'.*cpu"):
+    with pytest.raises(
+        InputError, match=r"raster must be one of auto, reference, .*, got 'cpuu'.*cpu"
+    ):
         RasterConfig(name="cpuu")
     assert RasterConfig(name="mine", _target_="mine.Mine")._target_ == "mine.Mine"
 
@@ -163,7 +188,10 @@ def footprint_of(out: RenderOutput, **changes: float) -> Callable[..., Footprint
 @pytest.mark.parametrize(
     ("change", "told"),
     [
-        (lambda out: {"image": out.image[None]}, "image has shape (1, 5, 7, 3), expected (5, 7, 3)"),
+        (
+            lambda out: {"image": out.image[None]},
+            "image has shape (1, 5, 7, 3), expected (5, 7, 3)",
+        ),
         (lambda out: {"image": out.image + 0.5}, "image is off by up to 5.00e-01"),
         (lambda out: {"alpha": out.alpha - 0.25}, "alpha is off by up to 2.50e-01"),
         (lambda out: {"image": out.image + torch.nan}, "image is off by up to nan"),
@@ -183,7 +211,9 @@ def footprint_of(out: RenderOutput, **changes: float) -> Callable[..., Footprint
         ),
     ],
 )
-def test_each_departure_is_told(change: Callable[[RenderOutput], dict[str, object]], told: str) -> None:
+def test_each_departure_is_told(
+    change: Callable[[RenderOutput], dict[str, object]], told: str
+) -> None:
     class Wrong(ReferenceRasterizer):
         def render(self, gaussians, *arguments, **options):  # type: ignore[no-untyped-def]
             out = super().render(gaussians, *arguments, **options)
@@ -200,14 +230,18 @@ def test_without_gaussians_there_is_the_background(name: str) -> None:
             out = super().render(gaussians, *arguments, **options)
             return dataclasses.replace(out, **{name: getattr(out, name) + (len(gaussians) == 0)})
 
-    assert departures(Wrong(), cases=(TINY,)) == ["without Gaussians: the image is not the background"]
+    assert departures(Wrong(), cases=(TINY,)) == [
+        "without Gaussians: the image is not the background"
+    ]
 
 
 def test_without_gaussians_there_is_a_backward_pass() -> None:
     class Wrong(ReferenceRasterizer):
         def render(self, gaussians, *arguments, **options):  # type: ignore[no-untyped-def]
             out = super().render(gaussians, *arguments, **options)
-            return dataclasses.replace(out, image=out.image.detach()) if len(gaussians) == 0 else out
+            return (
+                dataclasses.replace(out, image=out.image.detach()) if len(gaussians) == 0 else out
+            )
 
     (told,) = departures(Wrong(), cases=(TINY,))
     assert told.startswith("without Gaussians: RuntimeError: ")
@@ -226,7 +260,9 @@ def test_the_scenes_are_the_same_in_every_version() -> None:
     ]
     camera = CASES[1].camera()
     assert (camera.width, camera.height) == (97, 65)
-    assert [camera.fx, camera.fy, camera.cx, camera.cy] == pytest.approx([106.7, 101.85, 55.8, 27.4])
+    assert [camera.fx, camera.fy, camera.cx, camera.cy] == pytest.approx(
+        [106.7, 101.85, 55.8, 27.4]
+    )
     assert camera.rotation[0].tolist() == pytest.approx([0.9800666, 0, 0.1986693])
     assert camera.rotation[2].tolist() == pytest.approx([-0.1986693, 0, 0.9800666])
     assert camera.translation.tolist() == [0.1, -0.2, 0.3]

@@ -1,4 +1,5 @@
-"""The adapter on gsplat, without a GPU: on a stand-in with gsplat's signatures, against the float64 reference."""
+"""The adapter on gsplat, without a GPU: on a stand-in with gsplat's signatures, against the float64
+reference."""
 
 from __future__ import annotations
 
@@ -16,7 +17,8 @@ from gsbench.raster.gsplat import GsplatRasterizer, _DeviceCamera, _reaches_imag
 from gsbench.raster.reference import ReferenceRasterizer, project, tile_rectangles
 from tests.gaussians.helpers import front_camera, random_gaussians
 
-FAINT = Case(50, 37, 60, sh_degree=3, log_scale=-2.0, logit=-3.0, principal=(3.0, -2.0))  # no alpha reaches a clamp
+# no alpha reaches a clamp
+FAINT = Case(50, 37, 60, sh_degree=3, log_scale=-2.0, logit=-3.0, principal=(3.0, -2.0))
 
 
 @pytest.fixture
@@ -31,10 +33,13 @@ def library() -> ModuleType:
 
 def test_values_and_gradients_match_the_reference(library: ModuleType) -> None:
     expected, references = render_with_gradients(ReferenceRasterizer(), FAINT, torch.float64)
-    output, gradients = render_with_gradients(GsplatRasterizer(library=library), FAINT, torch.float32)
+    output, gradients = render_with_gradients(
+        GsplatRasterizer(library=library), FAINT, torch.float32
+    )
     assert (output.image.double() - expected.image).abs().max() < 1e-4
     assert (output.alpha.double() - expected.alpha).abs().max() < 1e-4
-    assert references.keys() - gradients.keys() == {"splitting_probe"}  # gsplat gives no splitting matrices
+    # gsplat gives no splitting matrices
+    assert references.keys() - gradients.keys() == {"splitting_probe"}
     for name, gradient in gradients.items():
         reference = references[name]
         assert (gradient - reference).abs().max() < 1e-3 * reference.abs().max(), name
@@ -49,7 +54,11 @@ def test_the_two_versions_of_gsplat_give_the_same(library: ModuleType) -> None:
         render_with_gradients(GsplatRasterizer(library=version), FAINT, torch.float32)
         for version in (library.head(), library)
     )
-    assert library.calls.count("spherical_harmonics of 1.6") == library.calls.count("spherical_harmonics") == 1
+    assert (
+        library.calls.count("spherical_harmonics of 1.6")
+        == library.calls.count("spherical_harmonics")
+        == 1
+    )
     assert (image.image - expected.image).abs().max() < 1e-6
     for name, reference in references.items():
         assert (gradients[name] - reference).abs().max() <= 1e-5 * reference.abs().max(), name
@@ -75,14 +84,19 @@ def test_late_and_repeated_backward_without_the_absolute_gradient(library: Modul
 def test_screen_points_have_a_gradient_though_nothing_else_wants_one(library: ModuleType) -> None:
     _, expected = render_with_gradients(GsplatRasterizer(library=library), FAINT, torch.float32)
     gaussians = FAINT.gaussians().map(torch.Tensor.float)
-    output = GsplatRasterizer(library=library).render(gaussians, FAINT.camera(), 3, torch.tensor([0.2, 0.5, 0.9]))
-    weights = torch.randn(37, 50, 4, generator=torch.Generator().manual_seed(7), dtype=torch.float64).float()
+    output = GsplatRasterizer(library=library).render(
+        gaussians, FAINT.camera(), 3, torch.tensor([0.2, 0.5, 0.9])
+    )
+    weights = torch.randn(
+        37, 50, 4, generator=torch.Generator().manual_seed(7), dtype=torch.float64
+    ).float()
     ((output.image * weights[..., :3]).sum() + (output.alpha * weights[..., 3]).sum()).backward()
     assert torch.equal(output.screen_points.grad.double(), expected["screen_points"])
 
 
 def test_nothing_stays_alive_after_a_step(library: ModuleType) -> None:
-    """Without the garbage collector: a cycle through the graph would keep 60 MB a step at a million Gaussians."""
+    """Without the garbage collector: a cycle through the graph would keep 60 MB a step at a million
+    Gaussians."""
     rasterizer = GsplatRasterizer(library=library)
     camera, black = FAINT.camera(), torch.zeros(3)
     leaves = FAINT.gaussians().map(lambda tensor: tensor.float().requires_grad_())
@@ -96,7 +110,10 @@ def test_nothing_stays_alive_after_a_step(library: ModuleType) -> None:
                 loss = output.image.sum()
                 if backward:
                     loss.backward()
-                alive += [weakref.ref(tensor) for tensor in (output.image, output.alpha, output.screen_points)]
+                alive += [
+                    weakref.ref(tensor)
+                    for tensor in (output.image, output.alpha, output.screen_points)
+                ]
                 del output, loss
         assert len(alive) == 16
         assert [ref() for ref in alive] == [None] * 16
@@ -105,10 +122,17 @@ def test_nothing_stays_alive_after_a_step(library: ModuleType) -> None:
 
 
 def test_no_gaussians_never_reach_gsplat(library: ModuleType) -> None:
-    none = Case(20, 17, 1, 3).gaussians().map(torch.Tensor.float).select(torch.zeros(0, dtype=torch.long))
+    none = (
+        Case(20, 17, 1, 3)
+        .gaussians()
+        .map(torch.Tensor.float)
+        .select(torch.zeros(0, dtype=torch.long))
+    )
     leaves = none.map(lambda tensor: tensor.requires_grad_())
     background = torch.tensor([0.1, 0.2, 0.3])
-    output = GsplatRasterizer(library=library).render(leaves, Case(20, 17, 1, 3).camera(), 3, background, True)
+    output = GsplatRasterizer(library=library).render(
+        leaves, Case(20, 17, 1, 3).camera(), 3, background, True
+    )
     assert library.calls == []
     assert torch.equal(output.image, background.expand(17, 20, 3))
     assert output.alpha.shape == (17, 20)
@@ -150,7 +174,8 @@ def test_square_radii_are_those_of_the_reference() -> None:
     projected = project(random_gaussians(300, seed=4, log_scale=(-4, 0.5)), front_camera(64, 48))
     seen = torch.ones(1, len(projected.index), dtype=torch.bool)
     radii = _square_radii(projected.conics.unsqueeze(0), seen)[0]
-    assert (radii - projected.radii).abs().max() <= 1  # ceil may fall either way on an exact integer
+    # ceil may fall either way on an exact integer
+    assert (radii - projected.radii).abs().max() <= 1
     assert (radii == projected.radii).double().mean() > 0.99
 
 
@@ -164,7 +189,9 @@ def test_reach_agrees_with_the_tiles_of_the_reference() -> None:
 
 
 def test_a_square_that_only_touches_the_image_does_not_reach_it() -> None:
-    means = torch.tensor([[-3.0, 5], [-2.9, 5], [67, 5], [66.9, 5], [5, -3], [5, -2.9], [5, 51], [5, 50.9], [5, 5]])
+    means = torch.tensor(
+        [[-3.0, 5], [-2.9, 5], [67, 5], [66.9, 5], [5, -3], [5, -2.9], [5, 51], [5, 50.9], [5, 5]]
+    )
     radii = torch.tensor([3, 3, 3, 3, 3, 3, 3, 3, 0])
     expected = [False, True, False, True, False, True, False, True, False]
     assert _reaches_image(means, radii, 64, 48).tolist() == expected
@@ -176,6 +203,8 @@ def test_the_camera_takes_the_world_to_pixels() -> None:
     on_device = _DeviceCamera.of(camera, point)
     pixel = on_device.intrinsics[0] @ (on_device.view[0] @ torch.cat([point, torch.ones(1)]))[:3]
     expected = camera.rotation @ point.numpy() + camera.translation
-    assert float(pixel[0] / pixel[2]) == pytest.approx(camera.fx * expected[0] / expected[2] + camera.cx)
+    assert float(pixel[0] / pixel[2]) == pytest.approx(
+        camera.fx * expected[0] / expected[2] + camera.cx
+    )
     assert on_device.center.tolist() == pytest.approx(camera.center.tolist())
     assert on_device.half_size.tolist() == [32, 24]

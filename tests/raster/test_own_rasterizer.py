@@ -1,4 +1,5 @@
-"""A rasterizer from a file outside gsbench: that of docs/rasterizer.md, in the real program and by the contract."""
+"""A rasterizer from a file outside gsbench: that of docs/rasterizer.md, in the real program and by
+the contract."""
 
 from __future__ import annotations
 
@@ -21,8 +22,22 @@ from tests.config.test_schema import composed
 from tests.conftest import ROOT
 
 CPU = torch.device("cpu")
-TINY = ["scene.views=10", "scene.width=48", "scene.height=36", "init=random", "init.count=150", "init.size=1.2"]
-TINY += ["scene=courtyard", "train.iterations=12", "eval.lpips=[]", "eval.flip=false", "tracking=none", "device=cpu"]
+TINY = [
+    "scene.views=10",
+    "scene.width=48",
+    "scene.height=36",
+    "init=random",
+    "init.count=150",
+    "init.size=1.2",
+]
+TINY += [
+    "scene=courtyard",
+    "train.iterations=12",
+    "eval.lpips=[]",
+    "eval.flip=false",
+    "tracking=none",
+    "device=cpu",
+]
 OWN = ["raster._target_=untiled.Untiled", "allow_targets=[untiled]"]
 
 
@@ -30,7 +45,9 @@ OWN = ["raster._target_=untiled.Untiled", "allow_targets=[untiled]"]
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder with the document's ``untiled.py``, from which modules can be imported."""
     blocks = re.findall(
-        r"^```python\n(# untiled\.py\n.*?)^```$", (ROOT / "docs/rasterizer.md").read_text(), re.S | re.M
+        r"^```python\n(# untiled\.py\n.*?)^```$",
+        (ROOT / "docs/rasterizer.md").read_text(),
+        re.S | re.M,
     )
     (tmp_path / "untiled.py").write_text(blocks[0])
     monkeypatch.syspath_prepend(str(tmp_path))
@@ -59,7 +76,11 @@ def test_the_real_program_trains_with_it_and_knows_its_source(folder: Path) -> N
     assert json.loads(path.read_text())["raster"] == "untiled"
     (manifest,) = (folder / "runs" / "store" / "train").glob("*/manifest.json")
     recorded = json.loads(manifest.read_text())["inputs"]["raster"]
-    assert (recorded["class"], recorded["name"], recorded["rows"]) == ("untiled.Untiled", "untiled", 36)
+    assert (recorded["class"], recorded["name"], recorded["rows"]) == (
+        "untiled.Untiled",
+        "untiled",
+        36,
+    )
     assert len(recorded["source"]["untiled"]) == 64
 
     assert "was done" in gsbench(folder, *TINY, *OWN, "+raster.rows=36", "name=own").stderr
@@ -92,7 +113,8 @@ def test_without_a_footprint_it_is_refused_where_one_is_asked_for(folder: Path) 
     Parts(composed(*OWN)).check(on_this_machine=False)
     parts = Parts(composed(*OWN, "densify=pixelgs"))
     with pytest.raises(
-        InputError, match=r"densify=pixelgs needs .* raster=untiled does not give them; take raster=reference"
+        InputError,
+        match=r"densify=pixelgs needs .* raster=untiled does not give them; take raster=reference",
     ):
         parts.check(on_this_machine=False)
     parts.own_rasterizer.has_footprint = True  # type: ignore[union-attr]
@@ -116,7 +138,9 @@ def test_only_rasterizers_with_a_name_of_their_own(folder: Path) -> None:
         ("Absent", {}, "cannot be imported"),
     ):
         with pytest.raises(InputError, match=message):
-            build_own_rasterizer({"name": "auto", "_target_": f"untiled.{target}", **options}, ["untiled"])
+            build_own_rasterizer(
+                {"name": "auto", "_target_": f"untiled.{target}", **options}, ["untiled"]
+            )
 
 
 def test_its_source_is_part_of_the_hash(folder: Path) -> None:

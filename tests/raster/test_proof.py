@@ -1,4 +1,5 @@
-"""The proof of an executor: it passes sound kernels, catches planted faults, and is made once for each version."""
+"""The proof of an executor: it passes sound kernels, catches planted faults, and is made once for
+each version."""
 
 from __future__ import annotations
 
@@ -41,14 +42,25 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def passing(raster: str = "triton", failures: tuple[str, ...] = ()) -> RasterProof:
     return RasterProof(
-        raster=raster, device="a GPU", versions={"torch": "2"}, errors={}, failures=[*failures], seconds=1.0
+        raster=raster,
+        device="a GPU",
+        versions={"torch": "2"},
+        errors={},
+        failures=[*failures],
+        seconds=1.0,
     )
 
 
 def test_the_kernels_of_the_cpu_pass_with_room_to_spare() -> None:
     proof = prove(CpuRasterizer(), CPU)
     assert proof.failures == []
-    assert {"image", "gradient of means", "splitting matrix", "footprint (pixels)", "loss"} <= proof.errors.keys()
+    assert {
+        "image",
+        "gradient of means",
+        "splitting matrix",
+        "footprint (pixels)",
+        "loss",
+    } <= proof.errors.keys()
     assert proof.errors["bits of a second run"] == 0
     assert all(error < 1e-5 for error in proof.errors.values()), proof.errors
 
@@ -68,7 +80,12 @@ def test_a_departure_names_the_quantity_and_the_place() -> None:
 
 
 def test_a_fault_of_the_loss_is_seen_in_the_training_steps() -> None:
-    proof = prove(CpuRasterizer(), CPU, (TINY,), lambda image, target: torch_photometric_loss(image, target, 0.21))
+    proof = prove(
+        CpuRasterizer(),
+        CPU,
+        (TINY,),
+        lambda image, target: torch_photometric_loss(image, target, 0.21),
+    )
     assert "7x5-n20-sh3: loss is off by up to" in proof.failures[0]
 
 
@@ -79,7 +96,9 @@ def test_an_error_of_the_driver_is_a_failure_and_memory_that_is_full_is_not() ->
         def render(self, *arguments, **options):  # type: ignore[no-untyped-def]
             raise self.error
 
-    assert prove(Broken(), CPU, (TINY,)).failures == ["RuntimeError: CUDA error: an illegal memory access"]
+    assert prove(Broken(), CPU, (TINY,)).failures == [
+        "RuntimeError: CUDA error: an illegal memory access"
+    ]
     Broken.error = torch.OutOfMemoryError("full")
     with pytest.raises(torch.OutOfMemoryError):
         prove(Broken(), CPU, (TINY,))
@@ -102,9 +121,13 @@ def test_bits_that_differ_between_runs_are_caught_where_they_are_promised() -> N
 # ---- once for what it depends on
 
 
-def test_a_proof_is_kept_and_made_again_for_another_version(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_proof_is_kept_and_made_again_for_another_version(
+    cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     made: list[str] = []
-    monkeypatch.setattr(module, "prove_apart", lambda raster, device: made.append(raster) or passing(raster))
+    monkeypatch.setattr(
+        module, "prove_apart", lambda raster, device: made.append(raster) or passing(raster)
+    )
     assert known_proof("cpu", CPU) is None
     for _ in range(2):
         assert proof_of("cpu", CPU).passed
@@ -119,7 +142,9 @@ def test_a_proof_is_kept_and_made_again_for_another_version(cache: Path, monkeyp
     assert len(list(cache.glob("cpu-*.json"))) == 5
 
 
-@pytest.mark.parametrize("source", ["raster/triton/composite.py", "raster/staged.py", "train/loss_triton.py"])
+@pytest.mark.parametrize(
+    "source", ["raster/triton/composite.py", "raster/staged.py", "train/loss_triton.py"]
+)
 def test_a_change_of_the_kernels_calls_for_a_new_proof(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, source: str
 ) -> None:
@@ -146,7 +171,9 @@ def test_a_cache_that_cannot_be_written_proves_each_time_and_says_so(
     cache: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     made: list[str] = []
-    monkeypatch.setattr(module, "prove_apart", lambda raster, device: made.append(raster) or passing(raster))
+    monkeypatch.setattr(
+        module, "prove_apart", lambda raster, device: made.append(raster) or passing(raster)
+    )
     cache.parent.mkdir(parents=True)
     cache.write_text("a file where the folder should be")
     for _ in range(2):
@@ -165,13 +192,21 @@ def test_a_crash_of_the_process_is_a_failure(monkeypatch: pytest.MonkeyPatch) ->
 
 @pytest.mark.slow
 def test_two_processes_prove_once(tmp_path: Path) -> None:
-    code = "import torch; from gsbench.train.proof import proof_of; assert proof_of('cpu', torch.device('cpu')).passed"
+    code = (
+        "import torch; from gsbench.train.proof import proof_of; assert proof_of('cpu', "
+        "torch.device('cpu')).passed"
+    )
     environment = os.environ | {"XDG_CACHE_HOME": str(tmp_path / "cache")}
     script = f"import logging; logging.basicConfig(level=logging.INFO)\n{code}"
 
     def process(_: int) -> str:
         done = subprocess.run(
-            [sys.executable, "-c", script], env=environment, capture_output=True, text=True, timeout=600, check=True
+            [sys.executable, "-c", script],
+            env=environment,
+            capture_output=True,
+            text=True,
+            timeout=600,
+            check=True,
         )
         return done.stderr
 
@@ -185,35 +220,54 @@ def test_two_processes_prove_once(tmp_path: Path) -> None:
 
 @pytest.fixture
 def gpu(monkeypatch: pytest.MonkeyPatch) -> dict[str, list[str]]:
-    """A GPU on which all executors seem to be installed. The dictionary maps executors to their failures."""
+    """A GPU on which all executors seem to be installed. The dictionary maps executors to their
+    failures."""
     failures: dict[str, list[str]] = {}
     monkeypatch.setattr(type(EXECUTORS[0]), "is_installed", property(lambda self: True))
     monkeypatch.setattr(module, "create_rasterizer", lambda name, *_: name)
     monkeypatch.setattr(module, "_device_name", lambda device: "a GPU")
-    monkeypatch.setattr(module, "prove_apart", lambda raster, _: passing(raster, tuple(failures.get(raster, []))))
+    monkeypatch.setattr(
+        module, "prove_apart", lambda raster, _: passing(raster, tuple(failures.get(raster, [])))
+    )
     return failures
 
 
 @pytest.mark.parametrize(
     ("failing", "taken"),
-    [([], "triton"), (["triton"], "gsplat"), (["triton", "gsplat"], "reference"), (["gsplat"], "triton")],
+    [
+        ([], "triton"),
+        (["triton"], "gsplat"),
+        (["triton", "gsplat"], "reference"),
+        (["gsplat"], "triton"),
+    ],
 )
-def test_auto_takes_the_next_that_passes(gpu: dict[str, list[str]], failing: list[str], taken: str, caplog) -> None:
-    gpu |= {name: ["33x49-n50-sh3: image is off by up to 3.00e-01 at pixel (4, 2)", "alpha"] for name in failing}
+def test_auto_takes_the_next_that_passes(
+    gpu: dict[str, list[str]], failing: list[str], taken: str, caplog
+) -> None:
+    gpu |= {
+        name: ["33x49-n50-sh3: image is off by up to 3.00e-01 at pixel (4, 2)", "alpha"]
+        for name in failing
+    }
     chosen = create_proven("auto", torch.device("cuda"))
     assert chosen.rasterizer == taken
     assert chosen.proof.raster == taken
     over = failing[: len(chosen.passed_over)]
     assert [line.split()[0] for line in chosen.passed_over] == [f"raster={name}" for name in over]
     for line in chosen.passed_over:
-        assert "image is off by up to 3.00e-01 at pixel (4, 2) (and 1 more); torch 2; please report it with " in line
+        assert (
+            "image is off by up to 3.00e-01 at pixel (4, 2) (and 1 more); torch 2; please report "
+            "it with " in line
+        )
         assert json.loads(Path(line.split()[-1]).read_text())["failures"] == gpu["triton"]
         assert line in caplog.text
 
 
 def test_a_named_executor_that_fails_is_an_error(gpu: dict[str, list[str]]) -> None:
     gpu["triton"] = ["alpha is off"]
-    with pytest.raises(InputError, match=r"raster=triton is not used: it departs .* alpha is off.*device=cpu trains"):
+    with pytest.raises(
+        InputError,
+        match=r"raster=triton is not used: it departs .* alpha is off.*device=cpu trains",
+    ):
         create_proven("triton", torch.device("cuda"))
     gpu |= {name: ["alpha is off"] for name in ("gsplat", "reference")}
     with pytest.raises(InputError, match=r"raster=triton .*raster=gsplat .*raster=reference "):
@@ -236,31 +290,74 @@ def test_doctor_proves_on_request_and_shows_what_is_known(
     assert (told["raster"], told["passed"], told["seconds"]) == ("cpu", True, 1.0)
     made["cpu"] = passing("cpu", ("image is off",))
     assert run(["doctor", "--prove", "--raster", "cpu", "--device", "cpu"]) == 1
-    assert f"image is off\ntorch 2; please report it with {stamp_of('cpu', CPU)}" in capsys.readouterr().out
+    assert (
+        f"image is off\ntorch 2; please report it with {stamp_of('cpu', CPU)}"
+        in capsys.readouterr().out
+    )
     assert run(["doctor"]) == 1
-    assert "bad   proof        raster=cpu departs from the reference on a GPU" in capsys.readouterr().out
+    assert (
+        "bad   proof        raster=cpu departs from the reference on a GPU"
+        in capsys.readouterr().out
+    )
     assert run(["doctor", "--json"]) == 2
 
 
 # ---- faults in the kernels, each planted in a copy of gsbench that Triton's interpreter runs
 
-COMPOSITE, PROJECTION, GEOMETRY = (f"raster/triton/{name}.py" for name in ("composite", "projection", "geometry"))
+COMPOSITE, PROJECTION, GEOMETRY = (
+    f"raster/triton/{name}.py" for name in ("composite", "projection", "geometry")
+)
 FAULTS = {
     "none": ("raster/triton/layout.py", "SEGMENT = tl.constexpr(256)", "SEGMENT = tl.constexpr(8)"),
     "a sign": (COMPOSITE, "tl.fma(light, shine, -behind)", "tl.fma(light, shine, behind)"),
-    "a missing term of the light behind": (COMPOSITE, "behind = tl.fma(weight, shine, behind)", "pass"),
-    "no state at the border of a segment": (COMPOSITE, "light = tl.load(border + TRANSMITTANCE)", "pass"),
-    "a short segment": (COMPOSITE, "tl.minimum(begin + SEGMENT, end)", "tl.minimum(begin + SEGMENT - 1, end)"),
-    "swapped channels": (COMPOSITE, "tl.fma(weight, record[7], green)", "tl.fma(weight, record[8], green)"),
+    "a missing term of the light behind": (
+        COMPOSITE,
+        "behind = tl.fma(weight, shine, behind)",
+        "pass",
+    ),
+    "no state at the border of a segment": (
+        COMPOSITE,
+        "light = tl.load(border + TRANSMITTANCE)",
+        "pass",
+    ),
+    "a short segment": (
+        COMPOSITE,
+        "tl.minimum(begin + SEGMENT, end)",
+        "tl.minimum(begin + SEGMENT - 1, end)",
+    ),
+    "swapped channels": (
+        COMPOSITE,
+        "tl.fma(weight, record[7], green)",
+        "tl.fma(weight, record[8], green)",
+    ),
     "a footprint of one pixel too many": (
-        COMPOSITE, "blended = (power >= LOG2_ALPHA_MIN) & (position < seen)", "blended = power >= LOG2_ALPHA_MIN"),
-    "a missing term of the position's gradient": (PROJECTION, "view_z = -(through_focal * inverse_z + ", "view_z = -("),
-    "a sign of the quaternion's gradient": (PROJECTION, "qz * w_x - qx * w_z", "qz * w_x + qx * w_z"),
+        COMPOSITE,
+        "blended = (power >= LOG2_ALPHA_MIN) & (position < seen)",
+        "blended = power >= LOG2_ALPHA_MIN",
+    ),
+    "a missing term of the position's gradient": (
+        PROJECTION,
+        "view_z = -(through_focal * inverse_z + ",
+        "view_z = -(",
+    ),
+    "a sign of the quaternion's gradient": (
+        PROJECTION,
+        "qz * w_x - qx * w_z",
+        "qz * w_x + qx * w_z",
+    ),
     "a missing term of the splitting matrix": (PROJECTION, "q11 - e * h", "q11"),
     "a factor in harmonics of degree 3": (GEOMETRY, "8 * T2 * yz", "4 * T2 * yz"),
-    "a swapped axis": (GEOMETRY, "offset[0] * v.r10 + offset[1] * v.r11", "offset[0] * v.r11 + offset[1] * v.r10"),
-    "a weight of the loss": ("train/loss_triton.py", "(W0, W1, W2, W3, W4, W5)[k]", "(W0, W1, W2, W3, W5, W4)[k]"),
-}  # fmt: skip
+    "a swapped axis": (
+        GEOMETRY,
+        "offset[0] * v.r10 + offset[1] * v.r11",
+        "offset[0] * v.r11 + offset[1] * v.r10",
+    ),
+    "a weight of the loss": (
+        "train/loss_triton.py",
+        "(W0, W1, W2, W3, W4, W5)[k]",
+        "(W0, W1, W2, W3, W5, W4)[k]",
+    ),
+}
 # Small, for the interpreter: rows of blocks, lists of several segments, harmonics of all degrees.
 SCENE = "Case(18, 17, 40, sh_degree=3, log_scale=-1.0, logit=-1.0, spread=0.4)"
 PROVE = f"""
@@ -281,7 +378,9 @@ def test_a_planted_fault_is_caught(tmp_path: Path, fault: str) -> None:
     if reason := interpreter_fault(triton.__version__, np.__version__):
         pytest.skip(reason)
     package = tmp_path / "gsbench"
-    shutil.copytree(Path(gsbench.__file__).parent, package, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(
+        Path(gsbench.__file__).parent, package, ignore=shutil.ignore_patterns("__pycache__")
+    )
     for source, sound, faulty in {FAULTS["none"], FAULTS[fault]}:
         text = (package / source).read_text()
         assert text.count(sound) == 1
@@ -294,7 +393,13 @@ def test_a_planted_fault_is_caught(tmp_path: Path, fault: str) -> None:
     }
     words = [sys.executable, "-c", PROVE]
     done = subprocess.run(
-        words, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=900, check=False
+        words,
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=900,
+        check=False,
     )
     assert done.returncode == 0, done.stderr
     failures = json.loads(done.stdout.splitlines()[-1])

@@ -1,4 +1,5 @@
-"""The reference rasterizer against finite differences, a pixel-by-pixel restatement, and gsplat's own torch code."""
+"""The reference rasterizer against finite differences, a pixel-by-pixel restatement, and gsplat's
+own torch code."""
 
 from __future__ import annotations
 
@@ -19,8 +20,8 @@ def brute_force(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Every pixel by itself, in plain Python from the published formulas; colours of degree 0 only.
 
-    Image, opacity, and [N, 3] of each Gaussian over the pixels it is blended into: their number, the sum of
-    column + 100 row, and that of their distances to its mean.
+    Image, opacity, and [N, 3] of each Gaussian over the pixels it is blended into: their number,
+    the sum of column + 100 row, and that of their distances to its mean.
     """
     items = []
     for i in range(len(gaussians)):
@@ -49,14 +50,29 @@ def brute_force(
                 [0, camera.fy / view[2], -camera.fy * ty / view[2] ** 2],
             ]
         )
-        covariance = jacobian @ camera.rotation @ sigma @ camera.rotation.T @ jacobian.T + 0.3 * np.eye(2)
+        covariance = (
+            jacobian @ camera.rotation @ sigma @ camera.rotation.T @ jacobian.T + 0.3 * np.eye(2)
+        )
         largest = np.linalg.eigvalsh(covariance)[1]
         pixel = np.array(
-            [camera.fx * view[0] / view[2] + camera.cx - 0.5, camera.fy * view[1] / view[2] + camera.cy - 0.5]
+            [
+                camera.fx * view[0] / view[2] + camera.cx - 0.5,
+                camera.fy * view[1] / view[2] + camera.cy - 0.5,
+            ]
         )
         rgb = np.maximum(0, gaussians.sh_dc[i].numpy() * 0.28209479177387814 + 0.5)
         opacity = 1 / (1 + math.exp(-float(gaussians.opacity_logits[i])))
-        items.append((view[2], pixel, np.linalg.inv(covariance), math.ceil(3 * math.sqrt(largest)), opacity, rgb, i))
+        items.append(
+            (
+                view[2],
+                pixel,
+                np.linalg.inv(covariance),
+                math.ceil(3 * math.sqrt(largest)),
+                opacity,
+                rgb,
+                i,
+            )
+        )
     items.sort(key=lambda item: item[0])
     image = np.zeros((camera.height, camera.width, 3))
     alpha_image = np.zeros((camera.height, camera.width))
@@ -67,7 +83,9 @@ def brute_force(
             tile_x, tile_y = column // 16 * 16, row // 16 * 16
             for _, pixel, inverse, radius, opacity, rgb, i in items:
                 reaches = (
-                    math.floor((pixel[0] - radius) / 16) * 16 <= tile_x < math.floor((pixel[0] + radius + 15) / 16) * 16
+                    math.floor((pixel[0] - radius) / 16) * 16
+                    <= tile_x
+                    < math.floor((pixel[0] + radius + 15) / 16) * 16
                     and math.floor((pixel[1] - radius) / 16) * 16
                     <= tile_y
                     < math.floor((pixel[1] + radius + 15) / 16) * 16
@@ -91,8 +109,12 @@ def brute_force(
 @pytest.mark.parametrize("shift", [(0.0, 0.0), (5.0, -4.0)])
 def test_matches_brute_force(shift: tuple[float, float]) -> None:
     gaussians = random_gaussians(60, seed=3, log_scale=(-3.5, -0.5))
-    gaussians.opacity_logits[:8] = 6.0  # opaque ones reach both the clamp of alpha and the early stop
-    camera, background = front_camera(37, 21, shift), torch.tensor([0.2, 0.5, 0.9], dtype=torch.float64)
+    # opaque ones reach both the clamp of alpha and the early stop
+    gaussians.opacity_logits[:8] = 6.0
+    camera, background = (
+        front_camera(37, 21, shift),
+        torch.tensor([0.2, 0.5, 0.9], dtype=torch.float64),
+    )
     out = ReferenceRasterizer().render(gaussians, camera, 0, background)
     image, alpha, covered = brute_force(gaussians, camera, background.numpy())
     np.testing.assert_allclose(out.image.detach().numpy(), image, atol=1e-10)
@@ -110,10 +132,13 @@ def test_matches_brute_force(shift: tuple[float, float]) -> None:
 @pytest.mark.parametrize("degree", [0, 1, 3])
 def test_gradients_match_finite_differences(degree: int) -> None:
     gaussians = random_gaussians(6, seed=11, log_scale=(-2.2, -1.2))
-    gaussians.opacity_logits.clamp_(max=1.5)  # below the clamp of alpha, whose gradient is passed on purpose
+    # below the clamp of alpha, whose gradient is passed on purpose
+    gaussians.opacity_logits.clamp_(max=1.5)
     gaussians.sh_dc.clamp_(min=-0.5)  # above the clamp of colours
     camera, background = front_camera(20, 18), torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64)
-    weights = torch.randn(18, 20, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    weights = torch.randn(
+        18, 20, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64
+    )
 
     def loss(values: Gaussians) -> torch.Tensor:
         out = ReferenceRasterizer().render(values, camera, degree, background)
@@ -137,23 +162,29 @@ def test_gradients_match_finite_differences(degree: int) -> None:
             assert not numeric.any()
             continue
         assert numeric.abs().max() > 0
-        torch.testing.assert_close(tensor.grad, numeric, atol=2e-6, rtol=2e-4, msg=lambda m, n=name: f"{n}: {m}")
+        torch.testing.assert_close(
+            tensor.grad, numeric, atol=2e-6, rtol=2e-4, msg=lambda m, n=name: f"{n}: {m}"
+        )
 
 
 def test_screen_gradient_is_the_gradient_of_the_projected_mean_in_ndc() -> None:
-    """Moving the principal point moves every projected mean alike: the sum of the screen gradients says by how much."""
+    """Moving the principal point moves every projected mean alike: the sum of the screen gradients
+    says by how much."""
     gaussians = random_gaussians(30, seed=5)
     background = torch.zeros(3, dtype=torch.float64)
 
     def loss(shift: float) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         leaves = gaussians.map(lambda tensor: tensor.clone().requires_grad_(True))
-        out = ReferenceRasterizer().render(leaves, front_camera(32, 32, (shift, 0.0)), 0, background, True)
+        out = ReferenceRasterizer().render(
+            leaves, front_camera(32, 32, (shift, 0.0)), 0, background, True
+        )
         value = (out.image**2).sum()
         value.backward()
         return value.detach(), out.screen_points.grad, out.screen_gradient_abs
 
     _, gradient, absolute = loss(0.0)
-    epsilon = 1e-6  # px; the clamp of the Jacobian moves with the principal point too, but no mean is near it
+    # px; the clamp of the Jacobian moves with the principal point too, but no mean is near it
+    epsilon = 1e-6
     numeric = (loss(epsilon)[0] - loss(-epsilon)[0]) / (2 * epsilon)
     assert gradient[:, 0].sum() / (32 / 2) == pytest.approx(float(numeric), rel=1e-4)
     assert (absolute >= gradient.abs() - 1e-12).all()
@@ -161,24 +192,42 @@ def test_screen_gradient_is_the_gradient_of_the_projected_mean_in_ndc() -> None:
 
 
 def test_projection_matches_gsplat() -> None:
-    gsplat = pytest.importorskip("gsplat.cuda._torch_impl", reason="gsplat (group dev) is not installed")
+    gsplat = pytest.importorskip(
+        "gsplat.cuda._torch_impl", reason="gsplat (group dev) is not installed"
+    )
     gaussians, camera = random_gaussians(200, seed=7), front_camera(64, 48)
     matrix = torch.eye(4, dtype=torch.float64)
-    matrix[:3, :3], matrix[:3, 3] = torch.from_numpy(camera.rotation), torch.from_numpy(camera.translation)
-    intrinsics = torch.tensor([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]], dtype=torch.float64)
-    covariances, _ = gsplat._quat_scale_to_covar_preci(gaussians.quaternions, gaussians.scales, True, False)
+    matrix[:3, :3], matrix[:3, 3] = (
+        torch.from_numpy(camera.rotation),
+        torch.from_numpy(camera.translation),
+    )
+    intrinsics = torch.tensor(
+        [[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]], dtype=torch.float64
+    )
+    covariances, _ = gsplat._quat_scale_to_covar_preci(
+        gaussians.quaternions, gaussians.scales, True, False
+    )
     _, means, depths, conics, _ = gsplat._fully_fused_projection(
-        gaussians.means, covariances, matrix[None], intrinsics[None], camera.width, camera.height, eps2d=0.3
+        gaussians.means,
+        covariances,
+        matrix[None],
+        intrinsics[None],
+        camera.width,
+        camera.height,
+        eps2d=0.3,
     )
     projected = project(gaussians, camera)
-    torch.testing.assert_close(projected.means + 0.5, means[0, projected.index])  # gsplat's first pixel centre is 0.5
+    # gsplat's first pixel centre is 0.5
+    torch.testing.assert_close(projected.means + 0.5, means[0, projected.index])
     torch.testing.assert_close(projected.conics, conics[0, projected.index])
     torch.testing.assert_close(projected.depths, depths[0, projected.index])
     assert len(projected.index) > 150
 
 
 def test_spherical_harmonics_match_gsplat() -> None:
-    gsplat = pytest.importorskip("gsplat.cuda._torch_impl", reason="gsplat (group dev) is not installed")
+    gsplat = pytest.importorskip(
+        "gsplat.cuda._torch_impl", reason="gsplat (group dev) is not installed"
+    )
     from gsbench.gaussians.model import colors
 
     gaussians = random_gaussians(50, seed=9)
@@ -191,7 +240,8 @@ def test_spherical_harmonics_match_gsplat() -> None:
 
 
 def test_the_pixel_at_a_mean_has_the_whole_opacity() -> None:
-    camera = Camera(40, 30, 36.0, 36.0, 20.5, 15.5, np.eye(3), np.zeros(3))  # pixel centres lie at halves
+    # pixel centres lie at halves
+    camera = Camera(40, 30, 36.0, 36.0, 20.5, 15.5, np.eye(3), np.zeros(3))
     one = random_gaussians(1)
     one.means[0] = torch.tensor([0.0, 0.0, 4.0])
     out = ReferenceRasterizer().render(one, camera, 0, torch.zeros(3, dtype=torch.float64))

@@ -1,4 +1,5 @@
-"""Three runs of a step with raster=triton and its loss kernel give the same bits: on a GPU, or interpreted if tiny.
+"""Three runs of a step with raster=triton and its loss kernel give the same bits: on a GPU, or
+interpreted if tiny.
 
 The runs are on new memory, on used memory, and by new objects with new memory pools.
 """
@@ -14,7 +15,9 @@ from tests.raster.conftest import INTERPRETING
 
 ON_A_GPU = torch.cuda.is_available()
 
-pytestmark = pytest.mark.skipif(not (ON_A_GPU or INTERPRETING), reason="needs a GPU or Triton's interpreter")
+pytestmark = pytest.mark.skipif(
+    not (ON_A_GPU or INTERPRETING), reason="needs a GPU or Triton's interpreter"
+)
 
 
 @pytest.mark.gpu
@@ -22,7 +25,13 @@ pytestmark = pytest.mark.skipif(not (ON_A_GPU or INTERPRETING), reason="needs a 
     ("width", "height", "count"),
     [
         pytest.param(32, 16, 12, id="tiny"),
-        pytest.param(1600, 1060, 100_000, id="full", marks=pytest.mark.skipif(not ON_A_GPU, reason="needs a GPU")),
+        pytest.param(
+            1600,
+            1060,
+            100_000,
+            id="full",
+            marks=pytest.mark.skipif(not ON_A_GPU, reason="needs a GPU"),
+        ),
     ],
 )
 def test_three_runs_give_the_same_bits(width: int, height: int, count: int) -> None:
@@ -36,10 +45,17 @@ def test_three_runs_give_the_same_bits(width: int, height: int, count: int) -> N
 
     def run(rasterizer: TritonRasterizer, loss: TritonLoss) -> dict[str, Tensor]:
         leaves = gaussians.map(lambda tensor: tensor.to(device).requires_grad_())
-        output = rasterizer.render(leaves, scene.train[0].camera, 3, background, absolute_gradient=True)
+        output = rasterizer.render(
+            leaves, scene.train[0].camera, 3, background, absolute_gradient=True
+        )
         value = loss(output.image, target)[0]
         value.backward()
-        outputs = {"image": output.image, "alpha": output.alpha, "radii": output.radii, "loss": value}
+        outputs = {
+            "image": output.image,
+            "alpha": output.alpha,
+            "radii": output.radii,
+            "loss": value,
+        }
         outputs |= {"screen": output.screen_points.grad, "absolute": output.screen_gradient_abs}
         outputs |= {f"gradient of {name}": tensor.grad for name, tensor in leaves.tensors().items()}
         return {name: tensor.detach().cpu() for name, tensor in outputs.items()}
@@ -48,4 +64,6 @@ def test_three_runs_give_the_same_bits(width: int, height: int, count: int) -> N
     first = run(rasterizer, loss)
     assert first["gradient of means"].abs().max() > 0  # else equal bits would say nothing
     for other in (run(rasterizer, loss), run(TritonRasterizer(), TritonLoss(0.2))):
-        assert [name for name, tensor in first.items() if not torch.equal(tensor, other[name])] == []
+        assert [
+            name for name, tensor in first.items() if not torch.equal(tensor, other[name])
+        ] == []

@@ -1,4 +1,5 @@
-"""Splitting matrices against second derivatives that autograd takes of the definition, and against splits."""
+"""Splitting matrices against second derivatives that autograd takes of the definition, and against
+splits."""
 
 from __future__ import annotations
 
@@ -18,7 +19,8 @@ from gsbench.scene.types import Camera
 CASES = (
     Case(7, 5, 20, sh_degree=0),
     Case(33, 20, 40, sh_degree=0, log_scale=-1.5, principal=(4.0, -3.0)),
-    Case(12, 16, 60, sh_degree=0, log_scale=-1.0, logit=3.0),  # opaque: alphas are clamped, pixels stop early
+    # opaque: alphas are clamped, pixels stop early
+    Case(12, 16, 60, sh_degree=0, log_scale=-1.0, logit=3.0),
 )
 
 
@@ -32,41 +34,66 @@ def heights(pixels: Tensor, mean: Tensor, conic: Tensor, opacity: Tensor) -> Ten
     """Opacity times density of one Gaussian at pixels [P, 2]."""
     d = pixels - mean
     return opacity * torch.exp(
-        -0.5 * (conic[0] * d[:, 0] ** 2 + 2 * conic[1] * d[:, 0] * d[:, 1] + conic[2] * d[:, 1] ** 2)
+        -0.5
+        * (conic[0] * d[:, 0] ** 2 + 2 * conic[1] * d[:, 0] * d[:, 1] + conic[2] * d[:, 1] ** 2)
     )
 
 
 class Slow:
-    """A case composited pixel by pixel from the heights of its Gaussians, and its loss: a fixed weighting."""
+    """A case composited pixel by pixel from the heights of its Gaussians, and its loss: a fixed
+    weighting."""
 
     def __init__(self, case: Case) -> None:
         self.case, self.camera, self.gaussians = case, case.camera(), case.gaussians()
         self.projected: Projection = project(self.gaussians, self.camera)
-        rows, columns = torch.meshgrid(torch.arange(case.height), torch.arange(case.width), indexing="ij")
+        rows, columns = torch.meshgrid(
+            torch.arange(case.height), torch.arange(case.width), indexing="ij"
+        )
         self.pixels = torch.stack([columns, rows], -1).reshape(-1, 2).double()
-        self.colours = (self.gaussians.sh_dc[self.projected.index] * 0.28209479177387814 + 0.5).clamp_min(0)
+        self.colours = (
+            self.gaussians.sh_dc[self.projected.index] * 0.28209479177387814 + 0.5
+        ).clamp_min(0)
         self.order = torch.sort(self.projected.depths, stable=True).indices.tolist()
         generator = torch.Generator().manual_seed(3)
-        self.weights = torch.randn(case.height, case.width, 3, generator=generator, dtype=torch.float64)
+        self.weights = torch.randn(
+            case.height, case.width, 3, generator=generator, dtype=torch.float64
+        )
         self.background = torch.tensor([0.3, 0.1, 0.8], dtype=torch.float64)
 
         self.means = self.gaussians.means[self.projected.index]
-        self.linear = [jacobian(lambda point: image_of(self.camera, point), mean) for mean in self.means]  # each [2, 3]
+        # each [2, 3]
+        self.linear = [
+            jacobian(lambda point: image_of(self.camera, point), mean) for mean in self.means
+        ]
         first, past = tile_rectangles(self.projected, self.camera, CONSTANTS.tile)  # [M, 2]
         tiles = (self.pixels // CONSTANTS.tile).unsqueeze(0)  # [1, P, 2]
-        self.reached = ((tiles >= first.unsqueeze(1)) & (tiles < past.unsqueeze(1))).all(-1)  # [M, P] as far as it goes
+        self.reached = ((tiles >= first.unsqueeze(1)) & (tiles < past.unsqueeze(1))).all(
+            -1
+        )  # [M, P] as far as it goes
 
     def height(self, k: int, displacement: Tensor) -> Tensor:
-        """Of the k-th projected Gaussian, moved by ``displacement`` [3] in the world, linearly on the image."""
+        """Of the k-th projected Gaussian, moved by ``displacement`` [3] in the world, linearly on
+        the image."""
         moved = self.projected.means[k] + self.linear[k] @ displacement
-        return heights(self.pixels, moved, self.projected.conics[k], self.gaussians.opacities[self.projected.index[k]])
+        return heights(
+            self.pixels,
+            moved,
+            self.projected.conics[k],
+            self.gaussians.opacities[self.projected.index[k]],
+        )
 
     def all_heights(self) -> Tensor:
-        return torch.stack([self.height(k, torch.zeros(3).double()) for k in range(len(self.projected.index))])
+        return torch.stack(
+            [self.height(k, torch.zeros(3).double()) for k in range(len(self.projected.index))]
+        )
 
     def loss(self, s: Tensor) -> Tensor:
-        """Of heights [M, P]. The clamp to .99 passes the gradient; the heights decide what is skipped."""
-        colour, through = torch.zeros(len(self.pixels), 3).double(), torch.ones(len(self.pixels)).double()
+        """Of heights [M, P]. The clamp to .99 passes the gradient; the heights decide what is
+        skipped."""
+        colour, through = (
+            torch.zeros(len(self.pixels), 3).double(),
+            torch.ones(len(self.pixels)).double(),
+        )
         alive = torch.ones(len(self.pixels), dtype=torch.bool)
         for k in self.order:
             alpha = s[k] + (s[k].detach().clamp_max(CONSTANTS.alpha_max) - s[k].detach())
@@ -82,16 +109,21 @@ class Slow:
     def matrices(self, rasterizer: str) -> Tensor:
         """As the rasterizer gives them, [N, 3, 3] float64."""
         dtype = torch.float64 if rasterizer == "reference" else torch.float32
-        gaussians = self.gaussians.map(lambda tensor: tensor.detach().clone().to(dtype).requires_grad_())
+        gaussians = self.gaussians.map(
+            lambda tensor: tensor.detach().clone().to(dtype).requires_grad_()
+        )
         executor = create_rasterizer(rasterizer, torch.device("cpu"), threads=1)
-        output = executor.render(gaussians, self.camera, 0, self.background.to(dtype), splitting_matrix=True)  # type: ignore[call-arg]
+        output = executor.render(
+            gaussians, self.camera, 0, self.background.to(dtype), splitting_matrix=True
+        )  # type: ignore[call-arg]
         (output.image * self.weights.to(dtype)).sum().backward()
         return output.require_splitting_matrix().double()
 
 
 @pytest.mark.parametrize("case", CASES, ids=str)
 def test_the_matrix_is_the_gradient_by_heights_times_their_hessians(case: Case) -> None:
-    """The definition of the paper, one Gaussian at a time, with all derivatives taken by autograd."""
+    """The definition of the paper, one Gaussian at a time, with all derivatives taken by
+    autograd."""
     slow = Slow(case)
     s = slow.all_heights().detach().requires_grad_()
     (gradient,) = torch.autograd.grad(slow.loss(s), s)
@@ -108,7 +140,8 @@ def test_the_matrix_is_the_gradient_by_heights_times_their_hessians(case: Case) 
     torch.testing.assert_close(exact, expected, rtol=1e-9, atol=1e-9 * float(expected.abs().max()))
     compiled = slow.matrices("cpu")
     sizes = expected.abs().amax((1, 2), keepdim=True)
-    assert ((compiled - expected).abs() <= 1e-3 * sizes + 1e-6 * expected.abs().max()).all()  # of each Gaussian's own
+    # of each Gaussian's own
+    assert ((compiled - expected).abs() <= 1e-3 * sizes + 1e-6 * expected.abs().max()).all()
 
 
 def second_difference(of: Callable[[float], Tensor], step: float) -> float:
@@ -122,12 +155,17 @@ def test_it_foretells_what_two_halves_do_to_the_loss() -> None:
     generator = torch.Generator().manual_seed(5)
     compared = 0
     for k, index in enumerate(slow.projected.index.tolist()):
-        direction = torch.nn.functional.normalize(torch.randn(3, generator=generator, dtype=torch.float64), dim=0)
+        direction = torch.nn.functional.normalize(
+            torch.randn(3, generator=generator, dtype=torch.float64), dim=0
+        )
         foretold = float(direction @ matrices[index] @ direction)
 
         def split(distance: float, k: int = k, direction: Tensor = direction) -> Tensor:
-            halves = (slow.height(k, distance * direction) + slow.height(k, -distance * direction)) / 2
-            skipped = s[k] < CONSTANTS.alpha_min  # stays skipped: where a pixel begins to count is no derivative
+            halves = (
+                slow.height(k, distance * direction) + slow.height(k, -distance * direction)
+            ) / 2
+            # stays skipped: where a pixel begins to count is no derivative
+            skipped = s[k] < CONSTANTS.alpha_min
             kept = torch.where(skipped, s[k], halves.clamp_min(CONSTANTS.alpha_min))
             return slow.loss(torch.cat([s[:k], kept.unsqueeze(0), s[k + 1 :]]))
 
@@ -139,7 +177,9 @@ def test_it_foretells_what_two_halves_do_to_the_loss() -> None:
 
 def test_only_where_it_is_asked_for() -> None:
     case = CASES[0]
-    plain = ReferenceRasterizer().render(case.gaussians(), case.camera(), 0, torch.zeros(3).double())
+    plain = ReferenceRasterizer().render(
+        case.gaussians(), case.camera(), 0, torch.zeros(3).double()
+    )
     assert plain.splitting_probe is None
     with pytest.raises(RuntimeError, match="splitting_matrix=True"):
         plain.require_splitting_matrix()

@@ -1,4 +1,5 @@
-"""What executors share: checks of their inputs, reads from a device that do not wait, and the node of autograd."""
+"""What executors share: checks of their inputs, reads from a device that do not wait, and the node
+of autograd."""
 
 from __future__ import annotations
 
@@ -47,7 +48,9 @@ class Recording(StagedRasterizer[str]):
         if len(gaussians) == 1:
             raise ValueError("one is too few")
 
-    def forward(self, gaussians: Gaussians, request: RenderRequest) -> tuple[Tensor, Tensor, Tensor, str]:
+    def forward(
+        self, gaussians: Gaussians, request: RenderRequest
+    ) -> tuple[Tensor, Tensor, Tensor, str]:
         alpha = torch.full((request.camera.height, request.camera.width), 0.25, dtype=torch.float64)
         image = alpha.unsqueeze(-1).repeat(1, 1, 3)
         return image, alpha, torch.ones(len(gaussians), dtype=torch.int32), "frame"
@@ -55,9 +58,13 @@ class Recording(StagedRasterizer[str]):
     def backward(self, *arguments: Any) -> Gradients:
         self.calls.append(arguments)
         _, gaussians, *_, want_splitting = arguments
-        splitting = torch.full((len(gaussians), 3, 3), 8.0, dtype=torch.float64) if want_splitting else None
+        splitting = (
+            torch.full((len(gaussians), 3, 3), 8.0, dtype=torch.float64) if want_splitting else None
+        )
         sixes = [torch.full_like(tensor, 6.0) for tensor in gaussians.tensors().values()]
-        return Gradients(sixes, torch.full((len(gaussians), 2), 7.0, dtype=torch.float64), splitting)
+        return Gradients(
+            sixes, torch.full((len(gaussians), 2), 7.0, dtype=torch.float64), splitting
+        )
 
     def footprint(self, *arguments: Any) -> Footprint:
         self.calls.append(arguments)
@@ -65,7 +72,10 @@ class Recording(StagedRasterizer[str]):
 
 
 def test_gradients_reach_the_stage_and_come_back() -> None:
-    rasterizer, leaves = Recording(), random_gaussians(2).map(lambda tensor: tensor.requires_grad_())
+    rasterizer, leaves = (
+        Recording(),
+        random_gaussians(2).map(lambda tensor: tensor.requires_grad_()),
+    )
     background = BLACK.clone().requires_grad_()
     output = rasterizer.render(leaves, camera(), 1, background, True, splitting_matrix=True)
     assert not output.radii.requires_grad
@@ -84,7 +94,10 @@ def test_gradients_reach_the_stage_and_come_back() -> None:
 
 
 def test_the_opacity_alone_may_be_differentiated() -> None:
-    rasterizer, leaves = Recording(), random_gaussians(2).map(lambda tensor: tensor.requires_grad_())
+    rasterizer, leaves = (
+        Recording(),
+        random_gaussians(2).map(lambda tensor: tensor.requires_grad_()),
+    )
     rasterizer.render(leaves, camera(), 1, BLACK).alpha.sum().backward()
     ((_, _, request, g_image, g_alpha, want_splitting),) = rasterizer.calls
     assert g_image.shape == (3, 4, 3)
@@ -96,7 +109,11 @@ def test_the_opacity_alone_may_be_differentiated() -> None:
 
 
 def test_a_footprint_gets_the_frame_and_values() -> None:
-    rasterizer, leaves, view = Recording(), random_gaussians(2).map(lambda tensor: tensor.requires_grad_()), camera()
+    rasterizer, leaves, view = (
+        Recording(),
+        random_gaussians(2).map(lambda tensor: tensor.requires_grad_()),
+        camera(),
+    )
     output = rasterizer.render(leaves, view, 1, BLACK)
     values = torch.ones(3, 4)
     output.require_footprint(values)
@@ -144,13 +161,17 @@ def test_settings_that_do_not_fit_are_named() -> None:
         check_settings(gaussians, camera(), -1, BLACK)
     with pytest.raises(ValueError, match=r"dtype must be float32 or float64, got torch\.float16"):
         check_settings(gaussians.map(Tensor.half), camera(), 0, BLACK.half())
-    with pytest.raises(ValueError, match=r"background: is torch\.float64 on meta, but means is torch\.float64 on cpu"):
+    with pytest.raises(
+        ValueError,
+        match=r"background: is torch\.float64 on meta, but means is torch\.float64 on cpu",
+    ):
         check_settings(gaussians, camera(), 0, BLACK.to("meta"))
     with pytest.raises(ValueError, match=r"background: must be three numbers, got shape \(4,\)"):
         check_settings(gaussians, camera(), 0, torch.zeros(4, dtype=torch.float64))
     with pytest.raises(ValueError, match="background: must be three finite numbers"):
         check_settings(gaussians, camera(), 0, BLACK + math.inf)
-    check_settings(gaussians.map(lambda tensor: tensor.to("meta")), camera(), 0, BLACK.to("meta"))  # not looked at
+    # not looked at
+    check_settings(gaussians.map(lambda tensor: tensor.to("meta")), camera(), 0, BLACK.to("meta"))
 
 
 @pytest.mark.parametrize("name", ["means", "opacity_logits", "sh_rest"])
@@ -160,7 +181,10 @@ def test_the_first_bad_value_is_named(name: str) -> None:
     raise_for_values(gaussians, BLACK)
     getattr(gaussians, name)[[2, 4]] = math.nan
     assert bad_values(gaussians, BLACK)
-    for refuse in (lambda: raise_for_values(gaussians), lambda: check_inputs(gaussians, camera(), 0, BLACK)):
+    for refuse in (
+        lambda: raise_for_values(gaussians),
+        lambda: check_inputs(gaussians, camera(), 0, BLACK),
+    ):
         with pytest.raises(ValueError, match=rf"^{name}: not finite at Gaussian 2 \(2 in all\)"):
             refuse()
 
@@ -169,7 +193,9 @@ def test_a_rotation_without_length_and_a_bad_background_are_named() -> None:
     gaussians = random_gaussians(4)
     gaussians.quaternions[[1, 2]] = 1e-13
     assert bad_values(gaussians, BLACK)
-    with pytest.raises(ValueError, match=r"quaternions: no length, so no rotation, at Gaussian 1 \(2 in all\)"):
+    with pytest.raises(
+        ValueError, match=r"quaternions: no length, so no rotation, at Gaussian 1 \(2 in all\)"
+    ):
         raise_for_values(gaussians)
     assert bad_values(random_gaussians(4), BLACK + math.nan)
     with pytest.raises(ValueError, match="background"):
@@ -202,9 +228,13 @@ def test_a_readback_waits_only_for_what_has_not_arrived(monkeypatch: pytest.Monk
     device = SimpleNamespace(type="cuda", index=1)
     source = SimpleNamespace(device=device, shape=(2,), dtype=torch.float32)
     source.detach = lambda: source
-    monkeypatch.setattr(staged.torch, "empty", lambda *_, **options: host if options["pin_memory"] else None)
+    monkeypatch.setattr(
+        staged.torch, "empty", lambda *_, **options: host if options["pin_memory"] else None
+    )
     monkeypatch.setattr(staged.torch.cuda, "Event", Event)
-    monkeypatch.setattr(staged.torch.cuda, "current_stream", lambda of: f"stream of cuda:{of.index}")
+    monkeypatch.setattr(
+        staged.torch.cuda, "current_stream", lambda of: f"stream of cuda:{of.index}"
+    )
     monkeypatch.setattr(Readback, "waits", 0)
     early, late = Readback(source), Readback(source)  # type: ignore[arg-type]
     assert host.copied == [(source, True)] * 2

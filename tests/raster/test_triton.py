@@ -1,4 +1,5 @@
-"""The Triton rasterizer without a GPU: its tests in Triton's interpreter, each part in a process of its own."""
+"""The Triton rasterizer without a GPU: its tests in Triton's interpreter, each part in a process of
+its own."""
 
 from __future__ import annotations
 
@@ -28,7 +29,8 @@ PARTS = {
     "every scene": [CONTRACT, "-k", f"triton and {EVERY} and not {ONE_SCENE}"],
     "kernels and training": [INTERPRETED],
 }
-LIMIT = 1700  # s, for one that hangs: below the limit of a test in pyproject.toml; minutes on a quiet machine
+# s, for one that hangs: below the limit of a test in pyproject.toml; minutes on a quiet machine
+LIMIT = 1700
 
 
 @pytest.mark.parametrize("part", PARTS)
@@ -40,8 +42,20 @@ def test_in_the_interpreter(part: str) -> None:
         "OMP_NUM_THREADS": "1",
         "PYTHONPATH": os.pathsep.join(path for path in [str(ROOT), *sys.path] if path),
     }
-    words = [sys.executable, "-m", "pytest", "-q", "-x", "--no-header", "-p", "no:cacheprovider", *PARTS[part]]
-    done = subprocess.run(words, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=LIMIT, check=False)
+    words = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-q",
+        "-x",
+        "--no-header",
+        "-p",
+        "no:cacheprovider",
+        *PARTS[part],
+    ]
+    done = subprocess.run(
+        words, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=LIMIT, check=False
+    )
     assert done.returncode == 0, done.stdout
     assert " passed" in done.stdout
 
@@ -65,8 +79,19 @@ def test_no_test_is_in_two_parts_or_in_none() -> None:
     environment = os.environ | {"TRITON_INTERPRET": "1"}
 
     def collected(arguments: list[str]) -> list[str]:
-        words = [sys.executable, "-m", "pytest", "-q", "--collect-only", "-p", "no:cacheprovider", *arguments]
-        done = subprocess.run(words, cwd=ROOT, env=environment, capture_output=True, text=True, check=True)
+        words = [
+            sys.executable,
+            "-m",
+            "pytest",
+            "-q",
+            "--collect-only",
+            "-p",
+            "no:cacheprovider",
+            *arguments,
+        ]
+        done = subprocess.run(
+            words, cwd=ROOT, env=environment, capture_output=True, text=True, check=True
+        )
         return [line for line in done.stdout.splitlines() if "::" in line]
 
     everything = [name for name in collected([CONTRACT, INTERPRETED]) if "triton" in name]

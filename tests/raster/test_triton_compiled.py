@@ -1,4 +1,5 @@
-"""The Triton kernels compiled for GPUs that are not here, and what a step asks of the device beside them."""
+"""The Triton kernels compiled for GPUs that are not here, and what a step asks of the device beside
+them."""
 
 from __future__ import annotations
 
@@ -26,15 +27,25 @@ from tests.raster.ahead_of_time import TARGETS, Launch, compile_for, recorded, s
 pytestmark = pytest.mark.slow
 
 CASE = Case(33, 49, 50, sh_degree=3)
-# Bounds on the instructions of the loops that take most of the time, a third above what Triton 3.7 makes of them: a
-# slip by which values leave their registers, or are summed across lanes too early, costs more. An entry is 128 pixels.
+# Bounds on the instructions of the loops that take most of the time, a third above what Triton 3.7
+# makes of them: a slip by which values leave their registers, or are summed across lanes too early,
+# costs more. An entry is 128 pixels.
 FORWARD_ENTRY, BACKWARD_ENTRY = 125, 285
 # What makes the host wait for a device.
-WAITING = ("_local_scalar_dense", "nonzero", "masked_select", "unique", "is_nonzero", "equal", "repeat_interleave")
+WAITING = (
+    "_local_scalar_dense",
+    "nonzero",
+    "masked_select",
+    "unique",
+    "is_nonzero",
+    "equal",
+    "repeat_interleave",
+)
 
 
 class Answer:
-    """In place of `gsbench.raster.staged.Readback`: as if 2 rows of blocks and 7 pairs had been counted."""
+    """In place of `gsbench.raster.staged.Readback`: as if 2 rows of blocks and 7 pairs had been
+    counted."""
 
     asked = 0
 
@@ -75,10 +86,13 @@ def step(
     TARGETS,
     ids="sm_{}".format,
 )
-def test_kernels_compile_without_spills(launches: list[Launch], target: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_kernels_compile_without_spills(
+    launches: list[Launch], target: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     step(CASE)
     step(CASE, absolute=True, footprint=True)
-    if target == 90:  # the other variants: the lower degrees, and blocks that are numbered in 32 bits
+    # the other variants: the lower degrees, and blocks that are numbered in 32 bits
+    if target == 90:
         monkeypatch.setattr(lists, "MAX_INT16", 0)
         for degree in (0, 1, 2):
             step(replace(CASE, sh_degree=degree))
@@ -87,9 +101,13 @@ def test_kernels_compile_without_spills(launches: list[Launch], target: int, mon
         variant = launch.name, str(specialization(launch, target))
         if variant in compiled:
             continue
-        assert launch.named["enable_fp_fusion"] is True, variant  # no longer the default from Triton 3.10 on
+        # no longer the default from Triton 3.10 on
+        assert launch.named["enable_fp_fusion"] is True, variant
         compiled[variant] = made = compile_for(launch, target)
-        print(f"sm_{target} {launch.name:20} {made.registers:4} registers, innermost loops {[*made.loops.values()]}")
+        print(
+            f"sm_{target} {launch.name:20} {made.registers:4} registers, innermost loops "
+            f"{[*made.loops.values()]}"
+        )
         assert made.spilled == 0, variant
         if launch.name == "composite":
             assert made.inner_loop / composite.UNROLL.value < FORWARD_ENTRY
@@ -100,7 +118,8 @@ def test_kernels_compile_without_spills(launches: list[Launch], target: int, mon
 
 
 def test_growing_compiles_nothing_anew(launches: list[Launch]) -> None:
-    """Numbers of Gaussians, units and pixels change all the time; no kernel may be special to one of them."""
+    """Numbers of Gaussians, units and pixels change all the time; no kernel may be special to one
+    of them."""
     cases = (Case(33, 49, 50, 3), Case(32, 48, 64, 3), Case(1, 16, 1, 3))
     for case in cases:
         step(case)
@@ -112,9 +131,12 @@ def test_growing_compiles_nothing_anew(launches: list[Launch]) -> None:
         assert kinds[k] == kinds[k + each] == kinds[k + 2 * each], name
 
 
-@pytest.mark.parametrize("size", [(1600, 1060), (500, 375), (800, 530), (256, 192), (140, 105), (4000, 3000)], ids=str)
+@pytest.mark.parametrize(
+    "size", [(1600, 1060), (500, 375), (800, 530), (256, 192), (140, 105), (4000, 3000)], ids=str
+)
 def test_a_loss_has_work_for_all_multiprocessors(size: tuple[int, int]) -> None:
-    """The fullest filters fewer rows than with programs of 32 rows, and few are idle that a smaller one would fill."""
+    """The fullest filters fewer rows than with programs of 32 rows, and few are idle that a smaller
+    one would fill."""
     strips = -(-3 * size[0] // STRIP)
 
     def counted(rows: int) -> tuple[int, int]:
@@ -123,7 +145,10 @@ def test_a_loss_has_work_for_all_multiprocessors(size: tuple[int, int]) -> None:
 
     rows = rows_of_program(size[1], 3 * size[0])
     (programs, filtered), (_, before) = counted(rows), counted(32)
-    print(f"{size}: {rows} rows, {programs} programs; the fullest multiprocessor filters {filtered}, was {before}")
+    print(
+        f"{size}: {rows} rows, {programs} programs; the fullest multiprocessor filters "
+        f"{filtered}, was {before}"
+    )
     assert filtered < before
     assert programs >= MULTIPROCESSORS or rows == 8
 
@@ -136,9 +161,15 @@ class Watch(TorchDispatchMode):
         self.waits: list[str] = []
         self.operations = 0
 
-    def __torch_dispatch__(self, operation: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+    def __torch_dispatch__(
+        self, operation: Any, types: Any, args: Any = (), kwargs: Any = None
+    ) -> Any:
         result = operation(*args, **(kwargs or {}))
-        devices = {leaf.device.type for leaf in tree_leaves((args, kwargs, result)) if isinstance(leaf, Tensor)}
+        devices = {
+            leaf.device.type
+            for leaf in tree_leaves((args, kwargs, result))
+            if isinstance(leaf, Tensor)
+        }
         self.operations += 1
         if len(devices) > 1 or any(name in str(operation) for name in WAITING):
             self.waits.append(str(operation))
@@ -146,7 +177,8 @@ class Watch(TorchDispatchMode):
 
 
 def test_a_step_waits_once(launches: list[Launch]) -> None:
-    """On torch's device "meta", whose tensors have no values: reading one raises, copying one is seen."""
+    """On torch's device "meta", whose tensors have no values: reading one raises, copying one is
+    seen."""
     gaussians = CASE.gaussians().map(lambda tensor: tensor.float().to("meta").requires_grad_())
     background = torch.zeros(3, device="meta")
     target = torch.zeros(CASE.height, CASE.width, 3, dtype=torch.uint8, device="meta")

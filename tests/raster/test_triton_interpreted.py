@@ -1,4 +1,5 @@
-"""What the Triton rasterizer promises beyond the contract, in Triton's interpreter; run by ``test_triton.py``."""
+"""What the Triton rasterizer promises beyond the contract, in Triton's interpreter; run by
+``test_triton.py``."""
 
 from __future__ import annotations
 
@@ -56,12 +57,16 @@ def shorten_segments(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_same_bits_on_every_run() -> None:
     rasterizer = TritonRasterizer()
     expected = bits(*render_with_gradients(rasterizer, SMALL, torch.float32))
-    assert bits(*render_with_gradients(rasterizer, SMALL, torch.float32)) == expected  # memory that was used before
+    # memory that was used before
+    assert bits(*render_with_gradients(rasterizer, SMALL, torch.float32)) == expected
     assert bits(*render_with_gradients(TritonRasterizer(), SMALL, torch.float32)) == expected
 
 
-def test_neither_old_memory_nor_the_order_of_programs_changes_a_bit(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Programs in any order, memory full of NaN and of places far outside: nothing is read before it is written.
+def test_neither_old_memory_nor_the_order_of_programs_changes_a_bit(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Programs in any order, memory full of NaN and of places far outside: nothing is read before
+    it is written.
 
     Of the long lists of opaque Gaussians many entries are such that no pixel comes to them.
     """
@@ -74,7 +79,9 @@ def test_neither_old_memory_nor_the_order_of_programs_changes_a_bit(monkeypatch:
         footprint = output.footprint(values)
         frame = output.footprint.args[0]
         skipped.append(int((frame.lists.starts[1:] - frame.past).sum()))
-        return bits(output, gradients) + [tensor.numpy().tobytes() for tensor in vars(footprint).values()]
+        return bits(output, gradients) + [
+            tensor.numpy().tobytes() for tensor in vars(footprint).values()
+        ]
 
     skipped: list[int] = []
     expected = run()
@@ -98,22 +105,37 @@ def test_neither_old_memory_nor_the_order_of_programs_changes_a_bit(monkeypatch:
 def misses(case: Case, gaussians: Gaussians) -> tuple[dict[str, float], RenderOutput]:
     """The largest errors against the reference, each as a share of the largest value."""
     results = []
-    for rasterizer, dtype in ((TritonRasterizer(), torch.float32), (ReferenceRasterizer(), torch.float64)):
-        copy = gaussians.map(lambda tensor, dtype=dtype: tensor.detach().clone().to(dtype).requires_grad_())
+    for rasterizer, dtype in (
+        (TritonRasterizer(), torch.float32),
+        (ReferenceRasterizer(), torch.float64),
+    ):
+        copy = gaussians.map(
+            lambda tensor, dtype=dtype: tensor.detach().clone().to(dtype).requires_grad_()
+        )
         background = torch.tensor([0.2, 0.5, 0.9], dtype=dtype)
-        output = rasterizer.render(copy, case.camera(), case.sh_degree, background, absolute_gradient=True)
+        output = rasterizer.render(
+            copy, case.camera(), case.sh_degree, background, absolute_gradient=True
+        )
         loss = output.image.square().sum() + 0.3 * output.alpha.square().sum()
         loss.backward()
         found = {name: tensor.grad for name, tensor in copy.tensors().items()}
-        found |= {"image": output.image, "screen": output.screen_points.grad, "absolute": output.screen_gradient_abs}
+        found |= {
+            "image": output.image,
+            "screen": output.screen_points.grad,
+            "absolute": output.screen_gradient_abs,
+        }
         results.append((output, {name: tensor.detach().double() for name, tensor in found.items()}))
     (output, found), (_, expected) = results
-    errors = {name: (found[name] - wanted).abs().max() / wanted.abs().max() for name, wanted in expected.items()}
+    errors = {
+        name: (found[name] - wanted).abs().max() / wanted.abs().max()
+        for name, wanted in expected.items()
+    }
     return {name: float(error) for name, error in errors.items()}, output
 
 
 def test_a_long_list_is_walked_backward_in_segments() -> None:
-    """Some 600 faint Gaussians before one block, three segments; opaque ones between stop some of the pixels."""
+    """Some 600 faint Gaussians before one block, three segments; opaque ones between stop some of
+    the pixels."""
     case = Case(16, 8, 620, sh_degree=1)
     gaussians = case.gaussians()
     gaussians.means[:, :2] *= 0.3
@@ -129,8 +151,11 @@ def test_a_long_list_is_walked_backward_in_segments() -> None:
 
 
 @pytest.mark.parametrize("logit", [0.0, 4.0])
-def test_segments_change_nothing_but_the_last_digits(monkeypatch: pytest.MonkeyPatch, logit: float) -> None:
-    """Six blocks of some 60 entries, eight a segment, some of them behind where all pixels of a block have stopped."""
+def test_segments_change_nothing_but_the_last_digits(
+    monkeypatch: pytest.MonkeyPatch, logit: float
+) -> None:
+    """Six blocks of some 60 entries, eight a segment, some of them behind where all pixels of a
+    block have stopped."""
     case = Case(20, 17, 80, sh_degree=1, log_scale=-0.5, logit=logit)
     shorten_segments(monkeypatch)
     errors, output = misses(case, case.gaussians())
@@ -152,7 +177,9 @@ def test_equal_depths_are_blended_in_the_order_of_the_index() -> None:
     )
     camera = SMALL.camera()
     image = TritonRasterizer().render(gaussians, camera, 0, BLACK).image
-    reference = ReferenceRasterizer().render(gaussians.map(Tensor.double), camera, 0, BLACK.double()).image
+    reference = (
+        ReferenceRasterizer().render(gaussians.map(Tensor.double), camera, 0, BLACK.double()).image
+    )
     assert (image - reference).abs().max() < 1e-5
     assert reference.max() > 0.5
 
@@ -163,9 +190,14 @@ def test_needles_keep_their_gradients() -> None:
     gaussians.log_scales[:, 0] = 0.5
     gaussians.log_scales[:, 1:] = -9.0
     results = []
-    for rasterizer, dtype in ((TritonRasterizer(), torch.float32), (ReferenceRasterizer(), torch.float64)):
+    for rasterizer, dtype in (
+        (TritonRasterizer(), torch.float32),
+        (ReferenceRasterizer(), torch.float64),
+    ):
         copy = gaussians.map(lambda tensor, dtype=dtype: tensor.to(dtype).requires_grad_())
-        rasterizer.render(copy, Case(50, 40, 20, 0).camera(), 0, BLACK.to(dtype)).image.square().sum().backward()
+        rasterizer.render(
+            copy, Case(50, 40, 20, 0).camera(), 0, BLACK.to(dtype)
+        ).image.square().sum().backward()
         results.append(copy.log_scales.grad.double())
     assert results[1].abs().max() > 0
     assert (results[0] - results[1]).abs().max() < 1e-4 * results[1].abs().max()
@@ -173,12 +205,16 @@ def test_needles_keep_their_gradients() -> None:
 
 @pytest.mark.parametrize("stretch", [0.0, 0.01])
 def test_turning_a_ball_has_no_gradient(stretch: float) -> None:
-    """Not even a rounding error: Adam would turn 1e-13 into a full step. What is nearly a ball has a true one."""
+    """Not even a rounding error: Adam would turn 1e-13 into a full step. What is nearly a ball has
+    a true one."""
     gaussians = SMALL.gaussians()
     gaussians.log_scales[:] = gaussians.log_scales[:, :1]
     gaussians.log_scales[:, 1] += stretch
     found = []
-    for rasterizer, dtype in ((TritonRasterizer(), torch.float32), (ReferenceRasterizer(), torch.float64)):
+    for rasterizer, dtype in (
+        (TritonRasterizer(), torch.float32),
+        (ReferenceRasterizer(), torch.float64),
+    ):
         copy = gaussians.map(lambda tensor, dtype=dtype: tensor.to(dtype).requires_grad_())
         rasterizer.render(copy, SMALL.camera(), 3, BLACK.to(dtype)).image.square().sum().backward()
         found.append(copy.quaternions.grad.double())
@@ -212,20 +248,30 @@ def test_far_from_the_origin_nothing_is_lost() -> None:
 
 
 def test_renders_may_be_differentiated_late_and_twice() -> None:
-    """Two graphs at once, in the opposite order, and one of them twice: none may use the memory of another."""
+    """Two graphs at once, in the opposite order, and one of them twice: none may use the memory of
+    another."""
     rasterizer = TritonRasterizer()
     cases = (TINY, SMALL)
     alone = [render_with_gradients(rasterizer, case, torch.float32)[1]["means"] for case in cases]
     parameters = [leaves(case) for case in cases]
     background = torch.tensor([0.2, 0.5, 0.9])
-    outputs = [rasterizer.render(g, case.camera(), 3, background) for g, case in zip(parameters, cases, strict=True)]
+    outputs = [
+        rasterizer.render(g, case.camera(), 3, background)
+        for g, case in zip(parameters, cases, strict=True)
+    ]
     for k in (1, 0, 0):
         case = cases[k]
         weights = torch.randn(
-            case.height, case.width, 4, generator=torch.Generator().manual_seed(7), dtype=torch.float64
+            case.height,
+            case.width,
+            4,
+            generator=torch.Generator().manual_seed(7),
+            dtype=torch.float64,
         ).float()
         parameters[k].means.grad = None
-        loss = (outputs[k].image * weights[..., :3]).sum() + (outputs[k].alpha * weights[..., 3]).sum()
+        loss = (outputs[k].image * weights[..., :3]).sum() + (
+            outputs[k].alpha * weights[..., 3]
+        ).sum()
         loss.backward(retain_graph=True)
         assert torch.equal(parameters[k].means.grad.double(), alone[k])
 
@@ -260,13 +306,16 @@ def test_strided_parameters_and_the_gradient_of_the_background() -> None:
     rasterizer = TritonRasterizer()
     background = torch.tensor([0.1, 0.5, 0.7], requires_grad=True)
     output = rasterizer.render(strided, TINY.camera(), 3, background)
-    assert torch.equal(output.image, rasterizer.render(gaussians, TINY.camera(), 3, background).image)
+    assert torch.equal(
+        output.image, rasterizer.render(gaussians, TINY.camera(), 3, background).image
+    )
     output.image.sum().backward()
     assert background.grad[0].item() == pytest.approx((1 - output.alpha).sum().item(), rel=1e-5)
 
 
 def test_a_step_leaves_nothing_alive() -> None:
-    """Without Python's collector of cycles: what a step made is freed as soon as its names are gone."""
+    """Without Python's collector of cycles: what a step made is freed as soon as its names are
+    gone."""
     rasterizer, loss = TritonRasterizer(), TritonLoss(0.2)
     parameters = leaves(TINY)
     target = torch.zeros(TINY.height, TINY.width, 3, dtype=torch.uint8)
@@ -279,24 +328,38 @@ def test_a_step_leaves_nothing_alive() -> None:
             output = rasterizer.render(parameters, TINY.camera(), 3, BLACK, absolute_gradient=True)
             value = loss(output.image, target)[0]
             value.backward()
-            kept = [output.image, output.alpha, output.radii, output.screen_points, output.screen_gradient_abs, value]
-            alive += [weakref.ref(tensor) for tensor in [*kept, output.image.grad_fn, value.grad_fn]]
+            kept = [
+                output.image,
+                output.alpha,
+                output.radii,
+                output.screen_points,
+                output.screen_gradient_abs,
+                value,
+            ]
+            alive += [
+                weakref.ref(tensor) for tensor in [*kept, output.image.grad_fn, value.grad_fn]
+            ]
             del output, value, kept
         assert [reference() for reference in alive if reference() is not None] == []
-        assert [len(free) for pool in (rasterizer._frames, loss.pool) for free in pool._free.values()] == [1, 1]
+        assert [
+            len(free) for pool in (rasterizer._frames, loss.pool) for free in pool._free.values()
+        ] == [1, 1]
     finally:
         if collecting:
             gc.enable()
 
 
 def test_more_rows_than_were_expected() -> None:
-    """Gaussians as large as the image: the memory for their rows grows, and the result is that of a second render."""
+    """Gaussians as large as the image: the memory for their rows grows, and the result is that of a
+    second render."""
     gaussians = random_gaussians(6, seed=1, log_scale=(0.5, 1.0)).map(Tensor.float)
     camera = Camera(90, 120, 90, 90, 45, 60, np.eye(3), np.zeros(3))
     rasterizer = TritonRasterizer()
     first = rasterizer.render(gaussians, camera, 0, BLACK)
     second = rasterizer.render(gaussians, camera, 0, BLACK)
-    reference = ReferenceRasterizer().render(gaussians.map(Tensor.double), camera, 0, BLACK.double())
+    reference = ReferenceRasterizer().render(
+        gaussians.map(Tensor.double), camera, 0, BLACK.double()
+    )
     assert (reference.radii > 60).any()
     assert torch.equal(first.image, second.image)
     assert (first.image - reference.image).abs().max() < 1e-5
@@ -308,7 +371,9 @@ def test_many_blocks_are_numbered_in_more_bits(monkeypatch: pytest.MonkeyPatch) 
     assert bits(*render_with_gradients(TritonRasterizer(), TINY, torch.float32)) == expected
 
 
-@pytest.mark.parametrize("case", [TINY, SMALL, Case(20, 17, 80, sh_degree=1, log_scale=-0.5)], ids=str)
+@pytest.mark.parametrize(
+    "case", [TINY, SMALL, Case(20, 17, 80, sh_degree=1, log_scale=-0.5)], ids=str
+)
 def test_the_memory_that_is_kept_is_counted_from_its_shapes(case: Case) -> None:
     rasterizer = TritonRasterizer()
     output = rasterizer.render(leaves(case), case.camera(), case.sh_degree, BLACK)
@@ -316,16 +381,23 @@ def test_the_memory_that_is_kept_is_counted_from_its_shapes(case: Case) -> None:
     output.image.sum().backward()
     count, pairs, blocks = case.count, frame.units.pairs, frame.blocks
     del output, frame
-    free = [workspace for pool in (rasterizer._frames, rasterizer._scratch) for workspace in pool._free.values()]
+    free = [
+        workspace
+        for pool in (rasterizer._frames, rasterizer._scratch)
+        for workspace in pool._free.values()
+    ]
     buffers = [tensor for (workspace,) in free for tensor in workspace._buffers.values()]
     room = next(
-        len(tensor) for (workspace,) in free for name, tensor in workspace._buffers.items() if name == "pair_ends"
+        len(tensor)
+        for (workspace,) in free
+        for name, tensor in workspace._buffers.items()
+        if name == "pair_ends"
     )
     assert room >= 2 * count
     assert pairs > count / 2
     borders = (pairs - 1) // layout.SEGMENT.value * layout.BORDER.value * 4
-    # A Gaussian, a row of its blocks, a pair, a block: as docs/gpu.md says; and of a render: the record that cannot be
-    # seen, the end of the lists, flags, status.
+    # A Gaussian, a row of its blocks, a pair, a block: as docs/gpu.md says; and of a render: the
+    # record that cannot be seen, the end of the lists, flags, status.
     stated = 136 * count + 20 * room + 84 * pairs + 1052 * blocks + borders + (64 + 4 + 4 + 3 * 8)
     assert sum(tensor.nbytes for tensor in buffers) == stated
 
@@ -345,7 +417,9 @@ def test_a_background_that_is_not_finite_is_named(monkeypatch: pytest.MonkeyPatc
     """On a device it is not looked at before the kernels do."""
     monkeypatch.setattr(staged, "check_settings", lambda *_: None)
     with pytest.raises(ValueError, match="background"):
-        TritonRasterizer().render(leaves(TINY), TINY.camera(), 0, torch.tensor([0.0, torch.nan, 0.0]))
+        TritonRasterizer().render(
+            leaves(TINY), TINY.camera(), 0, torch.tensor([0.0, torch.nan, 0.0])
+        )
 
 
 def orbit_camera(angle: float) -> Camera:
@@ -361,21 +435,28 @@ def tiny_scene(truth: Gaussians) -> Scene:
     for i, angle in enumerate((-0.4, 0.0, 0.4)):
         camera = orbit_camera(angle)
         image = ReferenceRasterizer().render(truth, camera, 0, BLACK).image
-        views.append(View(f"{i}.png", camera, (image.clamp(0, 1) * 255).round().to(torch.uint8).numpy()))
+        views.append(
+            View(f"{i}.png", camera, (image.clamp(0, 1) * 255).round().to(torch.uint8).numpy())
+        )
     return Scene("tiny", tuple(views), tuple(views[:1]))
 
 
 def test_a_training_equals_the_references(tmp_path: Path) -> None:
     """Thirty iterations, of which the twentieth refines.
 
-    The initial Gaussians are round: the gradients of their rotations are rounding errors, which Adam takes for a
-    direction. That shows once a split places the halves along rotated axes.
+    The initial Gaussians are round: the gradients of their rotations are rounding errors, which
+    Adam takes for a direction. That shows once a split places the halves along rotated axes.
     """
     truth = random_gaussians(10, seed=2, log_scale=(-2.0, -1.0)).map(Tensor.float)
     truth.opacity_logits += 2
     scene = tiny_scene(truth)
     options = TrainConfig(
-        name="test", iterations=30, sh_interval=10, position_steps=30, checkpoint_every=100, log_every=1
+        name="test",
+        iterations=30,
+        sh_interval=10,
+        position_steps=30,
+        checkpoint_every=100,
+        log_every=1,
     )  # type: ignore[call-arg]
     colors = torch.full((len(truth), 3), 127, dtype=torch.uint8)
 
@@ -385,7 +466,9 @@ def test_a_training_equals_the_references(tmp_path: Path) -> None:
         cloud = gaussians_from_cloud(truth.means.double().numpy(), colors.numpy())
         densifier = ADC(start=15, stop=29, interval=20, opacity_reset_interval=1000)
         gaussians = Trainer(scene, cloud, densifier, rasterizer, options, 0).run(folder)
-        return gaussians, [json.loads(line)["loss"] for line in (folder / "metrics.jsonl").read_text().splitlines()]
+        return gaussians, [
+            json.loads(line)["loss"] for line in (folder / "metrics.jsonl").read_text().splitlines()
+        ]
 
     gaussians, losses = train(TritonRasterizer())
     expected, expected_losses = train(ReferenceRasterizer())

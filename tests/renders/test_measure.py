@@ -9,14 +9,22 @@ import pytest
 from gsbench.errors import InputError
 from gsbench.renders.measure import Destination, ReferenceImages, find_destination
 
-COURTYARD = ReferenceImages({}, "the test views of a trial", "0" * 64, (96, 72), {}, "courtyard", "sfm")
+COURTYARD = ReferenceImages(
+    {}, "the test views of a trial", "0" * 64, (96, 72), {}, "courtyard", "sfm"
+)
 FOLDER = ReferenceImages({}, "the pictures in a folder", "0" * 64, (96, 72), {})
 
 
 @pytest.mark.parametrize(
     ("word", "scene", "seed", "truth", "said"),
     [
-        ("table1:mine", "garden", 0, COURTYARD, r"--scene garden: the photographs are .* of the scene courtyard"),
+        (
+            "table1:mine",
+            "garden",
+            0,
+            COURTYARD,
+            r"--scene garden: the photographs are .* of the scene courtyard",
+        ),
         ("table1:mine", None, -1, COURTYARD, "--seed -1: must be 0 or more"),
         ("table1:mine", "../x", 0, FOLDER, r"--scene \.\./x: must be a plain folder name"),
         ("table1:mine", None, 0, FOLDER, "give it with --scene"),

@@ -1,4 +1,5 @@
-"""Predictions of nerfbaselines, as its version 1.2.12 writes them: folder, .tar.gz, and published zip."""
+"""Predictions of nerfbaselines, as its version 1.2.12 writes them: folder, .tar.gz, and published
+zip."""
 
 from __future__ import annotations
 
@@ -34,7 +35,10 @@ def members() -> dict[str, bytes]:
     files = {"info.json": b"{}"}
     for view in VIEWS:
         photograph = rng.integers(20, 255, (*SIZE, 3)).astype(np.uint8)
-        files |= {f"gt-color/{view}.png": png(photograph), f"color/{view}.png": png(photograph - 10)}
+        files |= {
+            f"gt-color/{view}.png": png(photograph),
+            f"color/{view}.png": png(photograph - 10),
+        }
         files |= {f"cameras/{view}.npz": b"x", f"depth-rgb/{view}.png": png(photograph)}
     return files
 
@@ -80,10 +84,24 @@ def test_predictions_are_measured_as_they_are(
     measured = json.loads(capsys.readouterr().out)
     assert set(measured["views"]) == {f"{view}.png" for view in VIEWS}
     assert measured["metrics"]["psnr"] == pytest.approx(20 * np.log10(255 / 10))
-    photographs = as_folder({f"{view}.JPG.png": members[f"gt-color/{view}.png"] for view in VIEWS}, tmp_path / "photos")
+    photographs = as_folder(
+        {f"{view}.JPG.png": members[f"gt-color/{view}.png"] for view in VIEWS}, tmp_path / "photos"
+    )
     for file in list(photographs.rglob("*.png")):
         file.rename(file.with_suffix(""))
-    assert run(["evaluate", str(place), "--truth", str(photographs), "eval.lpips=[]", "eval.flip=false"]) == 0
+    assert (
+        run(
+            [
+                "evaluate",
+                str(place),
+                "--truth",
+                str(photographs),
+                "eval.lpips=[]",
+                "eval.flip=false",
+            ]
+        )
+        == 0
+    )
     assert "names matched" in capsys.readouterr().out
 
 
@@ -96,7 +114,11 @@ def test_predictions_are_measured_as_they_are(
     ],
 )
 def test_strange_archives_are_refused(
-    pack: Callable[..., Path], change: dict[str, bytes], message: str, members: dict[str, bytes], tmp_path: Path
+    pack: Callable[..., Path],
+    change: dict[str, bytes],
+    message: str,
+    members: dict[str, bytes],
+    tmp_path: Path,
 ) -> None:
     archive = pack(members | change, tmp_path / "predictions")
     with pytest.raises(InputError, match=message), opened_renders(archive):
@@ -105,7 +127,10 @@ def test_strange_archives_are_refused(
 
 
 def test_what_is_no_archive_of_predictions_is_refused(
-    members: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    members: dict[str, bytes],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     (tmp_path / "text.zip").write_text("no archive")
     whole = as_tar(members, tmp_path / "whole").read_bytes()
@@ -121,5 +146,8 @@ def test_what_is_no_archive_of_predictions_is_refused(
         assert run(["evaluate", str(place)]) == 2
         assert message in capsys.readouterr().err
     monkeypatch.setattr("gsbench.renders.predictions.MAX_TOTAL_BYTES", 1000)
-    with pytest.raises(InputError, match="and 1 kB are the most"), opened_renders(as_zip(members, tmp_path / "big")):
+    with (
+        pytest.raises(InputError, match="and 1 kB are the most"),
+        opened_renders(as_zip(members, tmp_path / "big")),
+    ):
         pass

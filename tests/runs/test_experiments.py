@@ -1,4 +1,5 @@
-"""The records of an experiment: which experiments there are, the search for an arm's settings, declared questions."""
+"""The records of an experiment: which experiments there are, the search for an arm's settings,
+declared questions."""
 
 from __future__ import annotations
 
@@ -28,9 +29,17 @@ from gsbench.runs.trial_record import Declared
 
 POINTS = [{"settings": {"x": 0.5}, "value": 2.0}, {"settings": {"x": 1}, "value": 4.0}]
 TUNING = {
-    "sweep": "s", "arm": "sfm-adc", "metric": "psnr", "direction": 1, "wanted": 3, "seeds": [0], "scenes": ["garden"],
-    "ranges": {"x": "0,1"}, "log": ["x"], "points": [*POINTS, {"settings": {}, "value": None}],
-}  # fmt: skip
+    "sweep": "s",
+    "arm": "sfm-adc",
+    "metric": "psnr",
+    "direction": 1,
+    "wanted": 3,
+    "seeds": [0],
+    "scenes": ["garden"],
+    "ranges": {"x": "0,1"},
+    "log": ["x"],
+    "points": [*POINTS, {"settings": {}, "value": None}],
+}
 
 
 def test_experiments_are_folders_that_are_not_hidden(tmp_path: Path) -> None:
@@ -63,7 +72,12 @@ def tuning(tmp_path: Path, **changes: Any) -> Any:
 def test_the_best_point_is_the_one_with_the_best_value(tmp_path: Path) -> None:
     assert tuning(tmp_path).best.value == 4.0
     assert tuning(tmp_path, direction=-1).best.value == 2.0
-    assert tuning(tmp_path, direction=-1, points=[*POINTS, {"settings": {"x": 2.0}, "value": 0.0}]).best.value == 0.0
+    assert (
+        tuning(
+            tmp_path, direction=-1, points=[*POINTS, {"settings": {"x": 2.0}, "value": 0.0}]
+        ).best.value
+        == 0.0
+    )
     assert tuning(tmp_path, points=[{"settings": {}, "value": None}]).best is None
 
 
@@ -93,7 +107,10 @@ def test_a_declaration_knows_its_time_and_its_metric() -> None:
     assert one.when == "1970-01-01 02:00 UTC"
     assert one.primary == "psnr@extrapolation"
     assert one.summary() == Declared(metric="psnr@extrapolation", time=one.time)
-    assert [(question.metric, question.sign) for question in one.questions] == [("psnr", 0), ("ssim", 0)]
+    assert [(question.metric, question.sign) for question in one.questions] == [
+        ("psnr", 0),
+        ("ssim", 0),
+    ]
     assert Question(metric="psnr").sign == 1
     with pytest.raises(ValueError, match="time is not a time"):
         Declaration(time="yesterday")
@@ -101,19 +118,31 @@ def test_a_declaration_knows_its_time_and_its_metric() -> None:
 
 def test_planned_trials_are_those_of_the_declaration_and_of_its_questions() -> None:
     asked = Question(metric="psnr", scenes={"garden": ("garden/a/1", "garden/b/2")}, seeds=(1, 0))
-    both = Declaration(time=declared(1).time, questions=(asked,), trials={"garden/a/1": (2,), "room/a/1": (0,)})
+    both = Declaration(
+        time=declared(1).time, questions=(asked,), trials={"garden/a/1": (2,), "room/a/1": (0,)}
+    )
     assert both.planned == {"garden/a/1": (0, 1, 2), "garden/b/2": (0, 1), "room/a/1": (0,)}
     assert merge_planned({}, both.planned) == both.planned
-    named = [declared(1), declared(1, trials={}), declared(1, "psnr"), Declaration(time=both.time, questions=(asked,))]
+    named = [
+        declared(1),
+        declared(1, trials={}),
+        declared(1, "psnr"),
+        Declaration(time=both.time, questions=(asked,)),
+    ]
     assert [one.names_trials for one in named] == [False, True, False, True]
 
 
 def test_a_declaration_is_in_force_since_its_first_equal(tmp_path: Path) -> None:
-    first, second, third = declared(1, "psnr"), declared(2, "psnr"), declared(3, "psnr", missing={"a": ["b"]})
+    first, second, third = (
+        declared(1, "psnr"),
+        declared(2, "psnr"),
+        declared(3, "psnr", missing={"a": ["b"]}),
+    )
     other, last = declared(2, "ssim"), declared(4, "ssim")
     assert latest_declaration([first]) is first
     assert latest_declaration([first, second]) is first
-    assert latest_declaration([first, second, third]) is first  # what could not be tested asks nothing else
+    # what could not be tested asks nothing else
+    assert latest_declaration([first, second, third]) is first
     assert latest_declaration([first, other, third]) is third
     assert latest_declaration([first, second, last]) is last
     assert latest_declaration([other, first, second, third]) is first
@@ -124,7 +153,8 @@ def test_declarations_are_kept_in_the_order_of_time(tmp_path: Path) -> None:
     assert read_declarations(tmp_path) == []
     text = record_text([second, first])
     assert text.endswith("}\n")
-    (tmp_path / "declared.jsonl").write_text(text + '{"time": "1970-01-01T03:00:00Z"}\n')  # one that asks nothing
+    # one that asks nothing
+    (tmp_path / "declared.jsonl").write_text(text + '{"time": "1970-01-01T03:00:00Z"}\n')
     assert read_declarations(tmp_path) == [first, second]
     repeated = [first.summary(), None, Declared(metric="lpips_vgg", time="1970-01-01T00:00:00Z")]
     assert read_declarations(tmp_path, [*repeated, Declared(metric="psnr", time="?")]) == [

@@ -41,16 +41,24 @@ from gsbench.system.own_modules import allow_modules, allowed_modules
 from tests.conftest import script
 from tests.test_architecture import modules, reached
 
-SOURCE = '"""A module."""\nX = 0.8  # weight\n\n\ndef loss(a):\n    """The loss."""\n    return X * a\n'
-# Rooms that make no number: what is said, how processes run, where files lie. What `config` and `settings` make of the
-# user's words is in the keys as it is.
+SOURCE = (
+    '"""A module."""\nX = 0.8  # weight\n\n\ndef loss(a):\n    """The loss."""\n    return X * a\n'
+)
+# Rooms that make no number: what is said, how processes run, where files lie. What `config` and
+# `settings` make of the user's words is in the keys as it is.
 WITHOUT_NUMBERS = frozenset(
     """
     analysis app bench cli claims config datasets downloads errors files launch logs parsing renders runs
     settings system tracking verbs view words
     """.split()  # noqa: SIM905 - words are easier to read than a list of quoted ones
 )
-STEPS = {"scene": "scene", "init": "scene", "train": "train", "ground_truth": "scene", "evaluate": "evaluate"}
+STEPS = {
+    "scene": "scene",
+    "init": "scene",
+    "train": "train",
+    "ground_truth": "scene",
+    "evaluate": "evaluate",
+}
 # Of what a step's module imports, what another stage's key stands for, or what makes objects alone.
 BESIDE: dict[str, tuple[str, ...]] = {
     "scene": ("gaussians",),
@@ -63,8 +71,11 @@ BESIDE: dict[str, tuple[str, ...]] = {
 
 @pytest.fixture
 def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """A copy of gsbench that is not the one that runs, without files of a release, read as by a new process."""
-    copy = shutil.copytree(PACKAGE, tmp_path / "gsbench", ignore=shutil.ignore_patterns("__pycache__", "*.json"))
+    """A copy of gsbench that is not the one that runs, without files of a release, read as by a new
+    process."""
+    copy = shutil.copytree(
+        PACKAGE, tmp_path / "gsbench", ignore=shutil.ignore_patterns("__pycache__", "*.json")
+    )
     monkeypatch.setattr(keys, "PACKAGE", copy)
     again()
     yield copy
@@ -112,7 +123,13 @@ def test_whatever_can_change_a_number_counts(edit: Callable[[str], str]) -> None
 
 @pytest.mark.parametrize("stage", ROOMS)
 def test_the_table_has_all_rooms_that_a_stage_imports(stage: str) -> None:
-    known = (*ROOMS[stage], *BESIDE[stage], "__init__.py", "pipeline/__init__.py", "pipeline/steps/__init__.py")
+    known = (
+        *ROOMS[stage],
+        *BESIDE[stage],
+        "__init__.py",
+        "pipeline/__init__.py",
+        "pipeline/steps/__init__.py",
+    )
     for name in reached(f"gsbench.pipeline.steps.{STEPS[stage]}"):
         file = modules()[name].relative_to(PACKAGE).as_posix()
         if file.partition("/")[0].removesuffix(".py") not in WITHOUT_NUMBERS:
@@ -136,15 +153,20 @@ def test_an_edit_is_seen_by_the_next_process_and_a_comment_is_not(package: Path)
     assert changed_rooms(before) == [], "this process has loaded what it was"
     again()
     assert changed_rooms(before) == ["train"]
-    assert states_of(ROOMS["scene"]) == {room: before.get(room) or keys._state(room) for room in ROOMS["scene"]}
+    assert states_of(ROOMS["scene"]) == {
+        room: before.get(room) or keys._state(room) for room in ROOMS["scene"]
+    }
     loss.unlink()
     again()
     assert changed_rooms(before) == ["train"]
     assert changed_rooms({"gone": "0"}) == ["gone"]
 
 
-def test_where_all_is_as_released_nothing_is_in_the_key(package: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert edited(states_of(ROOMS["train"])) == states_of(ROOMS["train"])  # before the first release
+def test_where_all_is_as_released_nothing_is_in_the_key(
+    package: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # before the first release
+    assert edited(states_of(ROOMS["train"])) == states_of(ROOMS["train"])
     script("released").main()
     again()
     with monkeypatch.context() as patch:
@@ -159,7 +181,9 @@ def test_where_all_is_as_released_nothing_is_in_the_key(package: Path, monkeypat
     assert list(edited(states_of(ROOMS["train"]))) == changed_rooms(released) == ["eval/ssim.py"]
     script(
         "released"
-    ).main()  # of the next release, where the version of the stage is bumped by hand, or the numbers are the same
+        # of the next release, where the version of the stage is bumped by hand, or the numbers are
+        # the same
+    ).main()
     again()
     assert changed_rooms(released) == []
 
@@ -195,22 +219,34 @@ def digest(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-def values_of(*targets: str, allowed: tuple[str, ...] = ("own_code", "helper")) -> dict[str, object]:
-    return {"densify": {"inner": [{"_target_": name} for name in targets]}, "allow_targets": list(allowed)}
+def values_of(
+    *targets: str, allowed: tuple[str, ...] = ("own_code", "helper")
+) -> dict[str, object]:
+    return {
+        "densify": {"inner": [{"_target_": name} for name in targets]},
+        "allow_targets": list(allowed),
+    }
 
 
 def test_a_users_class_has_all_modules_that_were_allowed(home: Path) -> None:
     for name in ("own_code", "helper", "unrelated"):
         (home / f"{name}.py").write_text(CLASS)
     assert user_modules(values_of("gsbench.densify.ADC")) == {}
-    assert user_modules(values_of("own_code.Mine")) == {n: digest(home / f"{n}.py") for n in ("own_code", "helper")}
+    assert user_modules(values_of("own_code.Mine")) == {
+        n: digest(home / f"{n}.py") for n in ("own_code", "helper")
+    }
     assert user_modules(values_of("nowhere_to_be_found.X", allowed=("bash", "json", "yaml"))) == {}
 
 
 def test_a_package_is_hashed_whole_and_its_name_does_not_matter(home: Path) -> None:
     (home / "pack" / "inner").mkdir(parents=True)
     (home / "pack" / "folder.py").mkdir()
-    files = {"mine.py": CLASS, "inner/deep.py": "X = 1\n", "inner/kernel.cu": "int x;\n", "notes.txt": "a"}
+    files = {
+        "mine.py": CLASS,
+        "inner/deep.py": "X = 1\n",
+        "inner/kernel.cu": "int x;\n",
+        "notes.txt": "a",
+    }
     for name, text in files.items():
         (home / "pack" / name).write_text(text)  # without __init__.py: a namespace
     first = module_digest("pack")
@@ -252,7 +288,9 @@ def test_the_file_of_another_folder_is_found_whatever_this_process_has_imported(
 
 
 def test_what_was_imported_and_is_not_named_is_told(home: Path) -> None:
-    (home / "own_code.py").write_text("import sys\nsys.path.insert(0, 'lib')\nimport late, json.tool, helper\n" + CLASS)
+    (home / "own_code.py").write_text(
+        "import sys\nsys.path.insert(0, 'lib')\nimport late, json.tool, helper\n" + CLASS
+    )
     (home / "lib").mkdir()
     (home / "lib" / "late.py").touch()
     (home / "helper.py").touch()
@@ -281,7 +319,9 @@ def test_a_file_that_has_just_come_is_found(home: Path) -> None:
 # ---- what enters a key
 
 
-@pytest.mark.parametrize(("one", "other"), [("f()", "g()"), ("1", "2"), ("if a:\n 'x'", "if a:\n 'y'")])
+@pytest.mark.parametrize(
+    ("one", "other"), [("f()", "g()"), ("1", "2"), ("if a:\n 'x'", "if a:\n 'y'")]
+)
 def test_only_docstrings_are_left_out(one: str, other: str) -> None:
     assert syntax_of(one.encode()) != syntax_of(other.encode())
 
@@ -311,19 +351,30 @@ def test_a_users_class_enters_a_key_with_its_code_and_all_its_options() -> None:
     options = {"threads": 2, "place": "a", "pair": [1, 2]}
     named = {"class": "tests.runs.test_keys.Own", "source": {"tests": "0abc"}} | options
     assert options_of("densify", Own(), user) == named
-    assert options_of("eval", Own(), user, "eval.extra.own") == named  # defined elsewhere, whatever it is called
+    # defined elsewhere, whatever it is called
+    assert options_of("eval", Own(), user, "eval.extra.own") == named
     stage = Stage("scene", 1)  # of gsbench's own
-    assert [user.is_behind(stage, place) for place in ("densify", "eval.extra.own", "init")] == [True, False, False]
+    assert [user.is_behind(stage, place) for place in ("densify", "eval.extra.own", "init")] == [
+        True,
+        False,
+        False,
+    ]
     assert options_of("init", stage, user) == {
-        "class": "gsbench.runs.keys.Stage", "name": "scene", "version": 1, "resumable": False, "scratch": []
-    }  # fmt: skip
+        "class": "gsbench.runs.keys.Stage",
+        "name": "scene",
+        "version": 1,
+        "resumable": False,
+        "scratch": [],
+    }
 
 
 def test_a_rasterizer_enters_a_key_by_its_name_or_as_a_users_class() -> None:
     rasterizer = SimpleNamespace(name="cpu")  # defined outside gsbench
     assert rasterizer_inputs(rasterizer, UserCode({"m": "1"})) == {
-        "name": "cpu", "class": "types.SimpleNamespace", "source": {"m": "1"}
-    }  # fmt: skip
+        "name": "cpu",
+        "class": "types.SimpleNamespace",
+        "source": {"m": "1"},
+    }
     assert rasterizer_inputs(Stage("cpu", 1)) == "cpu"
 
 

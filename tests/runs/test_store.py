@@ -74,7 +74,9 @@ def test_every_input_and_the_version_make_another_key(store: Store) -> None:
 
 @pytest.mark.parametrize("name", ["a.txt", "sub/b.bin", MANIFEST])
 @pytest.mark.parametrize("damage", ["flip", "truncate", "delete"])
-def test_damage_is_named_and_mended(store: Store, name: str, damage: str, caplog: pytest.LogCaptureFixture) -> None:
+def test_damage_is_named_and_mended(
+    store: Store, name: str, damage: str, caplog: pytest.LogCaptureFixture
+) -> None:
     path = store.get(Step(LETTERS, {"x": 1}, write_letters)).path / name
     content = bytearray(path.read_bytes())
     content[len(content) // 3] ^= 4
@@ -132,7 +134,10 @@ def test_every_flipped_bit_of_a_manifest_is_noticed_or_harmless(store: Store) ->
             continue
         for key in ("stage", "version", "inputs", "key"):
             assert getattr(manifest, key) == json.loads(sound)[key]
-        assert {name: entry.size for name, entry in manifest.outputs.items()} == {"a.txt": 5, "sub/b.bin": 256}
+        assert {name: entry.size for name, entry in manifest.outputs.items()} == {
+            "a.txt": 5,
+            "sub/b.bin": 256,
+        }
 
 
 def flip_a_bit(path: Path) -> None:
@@ -275,13 +280,16 @@ def toy(store: Store, number: int, *options: str) -> subprocess.Popen[str]:
 
 @pytest.mark.slow
 def test_killed_at_random_moments_the_work_is_finished_and_right(store: Store) -> None:
-    """SIGKILL a process that builds three results, again and again; nothing torn is ever published."""
+    """SIGKILL a process that builds three results, again and again; nothing torn is ever
+    published."""
     rng = random.Random(1)
     kills = 0
     for _ in range(100):
-        process = toy(store, 3, "--slow", "--ready")  # six seconds of pauses, on any machine: more than three waits
+        # six seconds of pauses, on any machine: more than three waits
+        process = toy(store, 3, "--slow", "--ready")
         assert process.stdout is not None
-        assert process.stdout.readline() == "ready\n"  # a busy machine may need longer to start than to be killed
+        # a busy machine may need longer to start than to be killed
+        assert process.stdout.readline() == "ready\n"
         try:
             process.wait(rng.uniform(0.0, 1.4))
             break
@@ -298,8 +306,13 @@ def test_killed_at_random_moments_the_work_is_finished_and_right(store: Store) -
     for number in range(3):
         entry = store.get(Step(TOY, toy_inputs(number), refuse))
         assert (entry.path / "lines.txt").read_text() == expected_text(number)
-    # Who held a lock may stand beside it, where its holder was killed between publishing and letting go.
-    left = {path.name for path in (store.root / "toy").iterdir() if not path.name.endswith((".lock", ".lock.holder"))}
+    # Who held a lock may stand beside it, where its holder was killed between publishing and
+    # letting go.
+    left = {
+        path.name
+        for path in (store.root / "toy").iterdir()
+        if not path.name.endswith((".lock", ".lock.holder"))
+    }
     assert left == {TOY.key(toy_inputs(number)) for number in range(3)}
 
 
@@ -334,7 +347,9 @@ def small_disk(tmp_path: Path):  # type: ignore[no-untyped-def]
     disk = tmp_path / "disk"
     disk.mkdir()
     mounted = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", str(disk)], capture_output=True, check=False
+        ["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", str(disk)],
+        capture_output=True,
+        check=False,
     )
     if mounted.returncode != 0:
         pytest.skip("needs the right to mount a small tmpfs (root)")

@@ -42,7 +42,9 @@ def outside(tmp_path: Path) -> Path:
 def trial(tmp_path: Path) -> Path:
     """A finished trial in the runs folder, by its results alone."""
     folder = tmp_path / "runs" / "x" / "s" / "a-b" / "01234567-seed0"
-    named = {group: {"name": name} for group, name in {"scene": "s", "init": "a", "densify": "b"}.items()}
+    named = {
+        group: {"name": name} for group, name in {"scene": "s", "init": "a", "densify": "b"}.items()
+    }
     write_results(folder, {"name": "x", "seed": 0, **named})
     return folder
 
@@ -62,7 +64,9 @@ def _forget(folder: Path) -> None:
 
 
 def _declare(folder: Path) -> None:
-    trial: Any = SimpleNamespace(files=TrialFolder(folder), values={"seed": 0, "eval": {"primary": "psnr"}})
+    trial: Any = SimpleNamespace(
+        files=TrialFolder(folder), values={"seed": 0, "eval": {"primary": "psnr"}}
+    )
     declare([trial])
 
 
@@ -113,7 +117,9 @@ def _pipe(path: Path, outside: Path) -> None:
 
 
 @pytest.mark.parametrize("make", [_link, _folder_link, _pipe])
-@pytest.mark.parametrize("name", ["per_view.csv", "renders", "ground_truth/v.png", "log.txt", ".lock.holder"])
+@pytest.mark.parametrize(
+    "name", ["per_view.csv", "renders", "ground_truth/v.png", "log.txt", ".lock.holder"]
+)
 def test_a_trial_that_holds_something_strange_is_left_out(
     name: str, make: Callable[[Path, Path], None], trial: Path, outside: Path
 ) -> None:
@@ -128,7 +134,9 @@ def test_a_trial_that_holds_something_strange_is_left_out(
 
 
 @pytest.mark.parametrize("make", [_link, _pipe])
-def test_no_link_and_no_pipe_is_read(make: Callable[[Path, Path], None], trial: Path, outside: Path) -> None:
+def test_no_link_and_no_pipe_is_read(
+    make: Callable[[Path, Path], None], trial: Path, outside: Path
+) -> None:
     for name in ("declared.jsonl", ".lock", ".lock.holder"):
         make(trial / name, outside)
     with pytest.raises(DamagedError):
@@ -138,7 +146,10 @@ def test_no_link_and_no_pipe_is_read(make: Callable[[Path, Path], None], trial: 
 
 
 def test_a_store_builds_in_no_linked_folder(tmp_path: Path, outside: Path) -> None:
-    store, step = Store(tmp_path / "runs" / "store"), Step(TOY, toy_inputs(1), lambda folder: build(folder, 1, 0.0))
+    store, step = (
+        Store(tmp_path / "runs" / "store"),
+        Step(TOY, toy_inputs(1), lambda folder: build(folder, 1, 0.0)),
+    )
     partial = store.partial(step.stage, step.key)
     partial.parent.mkdir(parents=True)
     partial.symlink_to(outside)
@@ -153,7 +164,9 @@ def test_a_store_builds_in_no_linked_folder(tmp_path: Path, outside: Path) -> No
     assert (outside / "moved").is_dir()
 
 
-def test_what_a_killed_build_linked_is_removed_and_what_it_led_to_stays(tmp_path: Path, outside: Path) -> None:
+def test_what_a_killed_build_linked_is_removed_and_what_it_led_to_stays(
+    tmp_path: Path, outside: Path
+) -> None:
     partial = tmp_path / "partial"
     (partial / "work").mkdir(parents=True)
     (partial / "work" / "images").symlink_to(outside)

@@ -1,4 +1,5 @@
-"""A finished trial's files are held against what was written down of them, and what was changed is named."""
+"""A finished trial's files are held against what was written down of them, and what was changed is
+named."""
 
 from __future__ import annotations
 
@@ -36,7 +37,9 @@ def edit(path: Path, old: str, new: str) -> None:
     os.utime(path, ns=(state.st_atime_ns, state.st_mtime_ns))
 
 
-def test_changed_results_are_left_out_and_named(trial: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_changed_results_are_left_out_and_named(
+    trial: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     edit(trial / "results.json", "26.5", "43.2")
     experiment = load_experiment(trial.parents[3], EXPERIMENT)
     assert [one.seed for one in experiment.trials] == [1]
@@ -72,10 +75,14 @@ def test_results_without_a_record_of_them_are_believed(trial: Path) -> None:
     assert TrialFolder(trial).record().metrics == {"psnr": 43.2}
 
 
-def test_changed_views_and_curves_are_not_used(trial: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_changed_views_and_curves_are_not_used(
+    trial: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     edit(trial / "per_view.csv", "a,25.5\nb,27.5", "a,24.5\nb,28.5")  # the mean is as it was
     edit(trial / "metrics.jsonl", "20.2", "40.2")
-    (one,) = (one for one in load_experiment(trial.parents[3], EXPERIMENT).trials if one.path == trial)
+    (one,) = (
+        one for one in load_experiment(trial.parents[3], EXPERIMENT).trials if one.path == trial
+    )
     with pytest.raises(InputError, match=r"per_view\.csv was changed after it was written"):
         read_views(one)
     assert one.folder.curves() == []
@@ -91,19 +98,27 @@ def test_settings_are_those_that_the_results_were_made_by(trial: Path) -> None:
 
 
 def test_a_failed_trial_leaves_when_its_class_was_mended(trial: Path) -> None:
-    """Equal settings under another hash: a class was edited meanwhile, and the later trial is done."""
+    """Equal settings under another hash: a class was edited meanwhile, and the later trial is
+    done."""
     old = trial.with_name(f"0ld0ld00-{trial.name.partition('-')[2]}")
     old.mkdir()
     (old / "config.yaml").write_text((trial / "config.yaml").read_text())
-    (old / "failed.json").write_text(json.dumps({"error": "TypeError", "message": "mine.Mine has no x"}))
+    (old / "failed.json").write_text(
+        json.dumps({"error": "TypeError", "message": "mine.Mine has no x"})
+    )
     found = {one.folder: one for one in states_of_experiment(trial.parents[2])}
     assert found[old].state == "superseded"
     assert f"{trial.name} is done, made by later code: mine.Mine has no x" in found[old].note
-    edit(old / "config.yaml", '"volume_threshold": 0.03', '"volume_threshold": 0.04')  # other settings: still missing
-    assert {one.folder: one.state for one in states_of_experiment(trial.parents[2])}[old] == "failed"
+    # other settings: still missing
+    edit(old / "config.yaml", '"volume_threshold": 0.03', '"volume_threshold": 0.04')
+    assert {one.folder: one.state for one in states_of_experiment(trial.parents[2])}[
+        old
+    ] == "failed"
     edit(old / "config.yaml", '"volume_threshold": 0.04', '"volume_threshold": 0.03')
     (trial / "results.json").unlink()  # nothing has taken its place
-    assert {one.folder: one.state for one in states_of_experiment(trial.parents[2])}[old] == "failed"
+    assert {one.folder: one.state for one in states_of_experiment(trial.parents[2])}[
+        old
+    ] == "failed"
 
 
 def test_a_folder_knows_its_place(trial: Path) -> None:
@@ -133,13 +148,16 @@ def test_states_are_told_from_the_files(tmp_path: Path) -> None:
 def test_the_stage_and_the_last_iteration_of_a_training(tmp_path: Path) -> None:
     folder = TrialFolder(tmp_path)
     assert folder.stage_and_step() == ("", 0)
-    (tmp_path / "building.json").write_text(json.dumps({"stage": "train", "folder": str(tmp_path / "built")}))
+    (tmp_path / "building.json").write_text(
+        json.dumps({"stage": "train", "folder": str(tmp_path / "built")})
+    )
     assert folder.stage_and_step() == ("train", 0)
     (tmp_path / "built").mkdir()
     rows = "".join(json.dumps({"step": step, "loss": 0.1}) + "\n" for step in range(1000))
     (tmp_path / "built" / "metrics.jsonl").write_text(rows + '{"step": 10')
     assert folder.stage_and_step() == ("train", 10)
-    (tmp_path / "built" / "metrics.jsonl").write_text('{"step": 7' + " " * 5000)  # only the end of a large file is read
+    # only the end of a large file is read
+    (tmp_path / "built" / "metrics.jsonl").write_text('{"step": 7' + " " * 5000)
     assert folder.stage_and_step() == ("train", 0)
 
 
@@ -167,7 +185,12 @@ def test_equal_results_keep_their_time_and_others_do_not(trial: Path) -> None:
     made_of = folder.made_of()
     assert made_of is not None
     assert made_of.entries == {"train": str(trial)}
-    assert set(made_of.published) == {"per_view.csv", "metrics.jsonl", "events.jsonl", "volume_histograms.jsonl"}
+    assert set(made_of.published) == {
+        "per_view.csv",
+        "metrics.jsonl",
+        "events.jsonl",
+        "volume_histograms.jsonl",
+    }
     assert set(made_of.digests) == set(made_of.published)
 
 
@@ -221,10 +244,16 @@ def test_pictures_are_sorted_by_name(trial: Path) -> None:
         (("made_of", "folders"), {"/nowhere": 1}, "files have come to /nowhere, or gone"),
         (("made_of", "published", "per_view.csv"), [1, 2], r"per_view\.csv has changed"),
         (("made_of", "digests", "per_view.csv"), "0", r"per_view\.csv has changed"),
-        (("made_of", "entries"), {"train": "/nowhere"}, "its stage train in the store is damaged or gone"),
+        (
+            ("made_of", "entries"),
+            {"train": "/nowhere"},
+            "its stage train in the store is damaged or gone",
+        ),
     ],
 )
-def test_what_has_changed_since_is_named(trial: Path, place: tuple[str, ...], value: object, reason: str) -> None:
+def test_what_has_changed_since_is_named(
+    trial: Path, place: tuple[str, ...], value: object, reason: str
+) -> None:
     folder, path = TrialFolder(trial), trial / "results.json"
     values = folder.settings()
     folder.write_finished(values, replace(folder.record(), hashes={"config": config_hash(values)}))
@@ -234,7 +263,9 @@ def test_what_has_changed_since_is_named(trial: Path, place: tuple[str, ...], va
     for key in place[:-1]:
         inner = inner[key]
     inner[place[-1]] = value
-    content["made_of"]["results"] = sha256_of({key: own for key, own in content.items() if key != "made_of"})
+    content["made_of"]["results"] = sha256_of(
+        {key: own for key, own in content.items() if key != "made_of"}
+    )
     path.write_text(json.dumps(content))
     assert re.search(reason, folder.why_not_done(values))
 
@@ -250,7 +281,9 @@ def test_a_metric_that_can_be_computed_by_now_is_a_reason(trial: Path) -> None:
     folder.write_finished(values, replace(record, awaited=["flip"]))
     assert (folder.why_not_done(values, unavailable), asked) == ("", [values["eval"]])
     folder.write_finished(values, replace(record, awaited=["lpips_vgg", "flip"]))
-    assert folder.why_not_done(values, unavailable) == "it lacks lpips_vgg, which can be computed now"
+    assert (
+        folder.why_not_done(values, unavailable) == "it lacks lpips_vgg, which can be computed now"
+    )
     assert folder.why_not_done(values) == "it lacks lpips_vgg, flip"
     (trial / "results.json").unlink()
     assert folder.why_not_done(values) == "results.json is not there, or not complete"

@@ -21,10 +21,24 @@ from gsbench.runs.trial_record import (
 )
 
 RESULTS = {
-    "status": "complete", "experiment": "x", "scene": "s", "init": "a", "densify": "b", "seed": 0, "raster": "cpu",
-    "protocol": "paper-1", "iterations": 7, "metrics": {}, "unavailable": {}, "seconds": {}, "num_init_points": 1,
-    "num_gaussians": 2, "peak_memory_mb": 3.0, "hashes": {}, "versions": {},
-}  # fmt: skip
+    "status": "complete",
+    "experiment": "x",
+    "scene": "s",
+    "init": "a",
+    "densify": "b",
+    "seed": 0,
+    "raster": "cpu",
+    "protocol": "paper-1",
+    "iterations": 7,
+    "metrics": {},
+    "unavailable": {},
+    "seconds": {},
+    "num_init_points": 1,
+    "num_gaussians": 2,
+    "peak_memory_mb": 3.0,
+    "hashes": {},
+    "versions": {},
+}
 PATH = Path("results.json")
 
 
@@ -67,7 +81,10 @@ def test_what_is_not_told_of_a_metric_or_a_failure_has_its_default() -> None:
         ({"split": "every_nth", "sectors": 8}, "every_nth"),
         ({"split": "every_nth", "sectors": 8, "match_views": True}, "every_nth, matched with 8"),
         ({"split": "sector", "sector": 0, "sectors": 8}, "sector 0 of 8"),
-        ({"split": "sector", "sector": 0, "sectors": 8, "match_views": True}, "sector 0 of 8, matched"),
+        (
+            {"split": "sector", "sector": 0, "sectors": 8, "match_views": True},
+            "sector 0 of 8, matched",
+        ),
         ({"split": "every_nth", "train_list": "a.txt"}, "list"),
         ({"split": "every_nth", "test_list": "a.txt", "match_views": True}, "list"),
         ({"split": "every_nth", "validation": True}, "every_nth, validation"),
@@ -90,7 +107,9 @@ def test_the_rule_of_a_split_in_words(settings: dict[str, Any], text: str) -> No
         ({"step": 1, "loss": "x"}, False),
     ],
 )
-def test_a_row_has_an_iteration_and_numbers(row: dict[str, Any], sound: bool, tmp_path: Path) -> None:
+def test_a_row_has_an_iteration_and_numbers(
+    row: dict[str, Any], sound: bool, tmp_path: Path
+) -> None:
     assert read_rows(tmp_path / "absent.jsonl") == []
     path = tmp_path / "metrics.jsonl"
     path.write_text(json.dumps({"step": 1}) + "\n" + json.dumps(row) + "\n")

@@ -1,6 +1,8 @@
-"""A stage that is slow enough to be killed and loads no torch: it writes numbered lines, going on where it was stopped.
+"""A stage that is slow enough to be killed and loads no torch: it writes numbered lines, going on
+where it was stopped.
 
-Run as a program: ``python -m tests.runs.toy STORE COUNT [--slow] [--ready]``; the last says so when it begins.
+Run as a program: ``python -m tests.runs.toy STORE COUNT [--slow] [--ready]``; the last says so when
+it begins.
 """
 
 from __future__ import annotations
@@ -28,7 +30,8 @@ def expected_text(number: int) -> str:
 
 
 def build(folder: Path, number: int, pause: float) -> None:
-    """Keep the lines so far in a file that is replaced whole, as a training does with its checkpoints."""
+    """Keep the lines so far in a file that is replaced whole, as a training does with its
+    checkpoints."""
     progress = folder / "so_far.progress"
     lines = progress.read_text().splitlines() if progress.exists() else []
     while len(lines) < LINES:
@@ -50,7 +53,9 @@ def main(argv: list[str]) -> int:
     for number in range(int(argv[1])):
         pause = 0.05 if "--slow" in argv else 0.01
         cached.append(
-            store.get(Step(TOY, toy_inputs(number), lambda folder, n=number, p=pause: build(folder, n, p))).cached
+            store.get(
+                Step(TOY, toy_inputs(number), lambda folder, n=number, p=pause: build(folder, n, p))
+            ).cached
         )
     print("found" if all(cached) else "built")
     return 0

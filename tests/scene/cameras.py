@@ -28,4 +28,7 @@ def looking(
 def cameras_of(model: pycolmap.Reconstruction) -> dict[str, Camera]:
     """The cameras of all registered images by name."""
     registered = [image for image in model.images.values() if image.has_pose]
-    return {image.name: pinhole_camera(model.cameras[image.camera_id], image.cam_from_world()) for image in registered}
+    return {
+        image.name: pinhole_camera(model.cameras[image.camera_id], image.cam_from_world())
+        for image in registered
+    }

@@ -22,7 +22,8 @@ from .conftest import smooth_image
 
 
 def reprojection_errors(model: pycolmap.Reconstruction) -> list[float]:
-    """|projected 3D point - stored 2D point| in px, by pycolmap's own camera model, over all observations."""
+    """|projected 3D point - stored 2D point| in px, by pycolmap's own camera model, over all
+    observations."""
     errors = []
     for point in model.points3D.values():
         for element in point.track.elements:
@@ -42,19 +43,27 @@ def reprojection_errors(model: pycolmap.Reconstruction) -> list[float]:
     ],
 )
 def test_cameras_follow_smaller_files(make_scene, model, params):
-    root = make_scene(size=(41, 30), camera_size=(162, 121), model=model, params=params)  # 162/4 = 40.5, 121/4 = 30.25
+    # 162/4 = 40.5, 121/4 = 30.25
+    root = make_scene(size=(41, 30), camera_size=(162, 121), model=model, params=params)
     fitted = read_reference(read_colmap("toy", root))
     camera = next(iter(fitted.cameras.values()))
     assert (camera.width, camera.height) == (41, 30)
     assert camera.focal_length_x == pytest.approx(160 * 41 / 162)
-    assert camera.focal_length_y == pytest.approx(params[-3 if model == "SIMPLE_PINHOLE" else 1] * 30 / 121)
+    assert camera.focal_length_y == pytest.approx(
+        params[-3 if model == "SIMPLE_PINHOLE" else 1] * 30 / 121
+    )
     assert fitted.num_points3D() == 9
     assert max(reprojection_errors(fitted)) < 1e-9
-    assert fitted.points3D[1].color.tolist() == read_model(root / "sparse/0").points3D[1].color.tolist()
+    assert (
+        fitted.points3D[1].color.tolist()
+        == read_model(root / "sparse/0").points3D[1].color.tolist()
+    )
 
 
 def test_subset_drops_images_and_their_observations(make_scene, tmp_path: Path):
-    fitted = read_reference(read_colmap("toy", make_scene(), max_images=3, split=SplitRule(test_every=0)))
+    fitted = read_reference(
+        read_colmap("toy", make_scene(), max_images=3, split=SplitRule(test_every=0))
+    )
     assert sorted(image.name for image in fitted.images.values()) == ["00.png", "02.png", "04.png"]
     assert {point.track.length() for point in fitted.points3D.values()} == {3}
     assert max(reprojection_errors(fitted)) < 1e-9
@@ -68,7 +77,8 @@ def test_subset_drops_images_and_their_observations(make_scene, tmp_path: Path):
 def test_points_of_fewer_than_two_kept_images_go(make_scene):
     root = make_scene()
     model = read_model(root / "sparse/0")
-    for image_id in (3, 4, 5, 6):  # point 1, the first 2D point of every image, stays in 00.png and 01.png only
+    # point 1, the first 2D point of every image, stays in 00.png and 01.png only
+    for image_id in (3, 4, 5, 6):
         model.delete_observation(image_id, 0)
     model.write_binary(root / "sparse/0")
     fitted = read_reference(read_colmap("toy", root, max_images=3))
@@ -86,7 +96,9 @@ def test_files_of_one_camera_with_two_sizes(make_scene):
 def test_size_that_disagrees(make_scene):
     root = make_scene(size=(40, 30))
     Image.fromarray(smooth_image(40, 26)).save(root / "images/01.png")
-    with pytest.raises(InputError, match=r"01\.png: the image is 40x26 px but its camera in the COLMAP model 40x30"):
+    with pytest.raises(
+        InputError, match=r"01\.png: the image is 40x26 px but its camera in the COLMAP model 40x30"
+    ):
         read_reference(read_colmap("toy", root))
     exif = Image.Exif()
     exif[0x0112] = 6
@@ -113,22 +125,33 @@ def test_written_cameras_project_alike(tmp_path: Path, text: bool):
     for k in range(4):
         rotation, _ = np.linalg.qr(rng.normal(size=(3, 3)))
         rotation *= np.sign(np.linalg.det(rotation))
-        cameras[f"{k}.png"] = Camera(64, 48, 60.0 + (k > 1), 61.0, 31.0, 25.0, rotation, rng.normal(size=3))
+        cameras[f"{k}.png"] = Camera(
+            64, 48, 60.0 + (k > 1), 61.0, 31.0, 25.0, rotation, rng.normal(size=3)
+        )
     write_model(tmp_path / "model", cameras, text=text)
     model = pycolmap.Reconstruction(tmp_path / "model")
     assert model.num_cameras() == 2
     for name, camera in cameras.items():
         point = camera.rotation.T @ (np.array([0.3, -0.2, 2.0]) - camera.translation)
         expected = [camera.fx * 0.15 + camera.cx, camera.fy * -0.1 + camera.cy]
-        np.testing.assert_allclose(model.find_image_with_name(name).project_point(point), expected, atol=1e-9)
+        np.testing.assert_allclose(
+            model.find_image_with_name(name).project_point(point), expected, atol=1e-9
+        )
         back = cameras_of(model)[name]
         np.testing.assert_allclose(back.rotation, camera.rotation, atol=1e-12)
-        np.testing.assert_allclose(back.center, model.find_image_with_name(name).projection_center(), atol=1e-12)
+        np.testing.assert_allclose(
+            back.center, model.find_image_with_name(name).projection_center(), atol=1e-12
+        )
 
 
 def test_models_of_cameras_are_those_of_colmap() -> None:
-    """Their numbers, how many parameters they have, and that the first ones are the focal lengths."""
-    known = {int(number): name for name, number in pycolmap.CameraModelId.__members__.items() if name != "INVALID"}
+    """Their numbers, how many parameters they have, and that the first ones are the focal
+    lengths."""
+    known = {
+        int(number): name
+        for name, number in pycolmap.CameraModelId.__members__.items()
+        if name != "INVALID"
+    }
     assert {number: name for number, (name, _) in _MODELS.items()} == known
     for name, length in _MODELS.values():
         camera = pycolmap.Camera.create_from_model_name(1, name, 50.0, 40, 30)
@@ -141,11 +164,13 @@ def test_models_of_cameras_are_those_of_colmap() -> None:
 
 
 POSE = (1.0, 0, 0, 0, 0, 0, 5)
-LARGEST = {"camera": 2**32 - 2, "image": 2**32 - 2, "point": 2**64 - 2}  # COLMAP's numbers for "none" are one above
+# COLMAP's numbers for "none" are one above
+LARGEST = {"camera": 2**32 - 2, "image": 2**32 - 2, "point": 2**64 - 2}
 
 
 def sound_model() -> list[tuple[str, tuple]]:
-    """The calls of `ModelChecks` for a model with two images and two points, each with numbers at both ends."""
+    """The calls of `ModelChecks` for a model with two images and two points, each with numbers at
+    both ends."""
     return [
         ("camera", (0, "SIMPLE_PINHOLE", 1, 1, (0.5, 0, 0))),
         ("camera", (LARGEST["camera"], "OPENCV", 40, 30, (50.0, 50, -20, 15, 0, -0.1, 0, 0))),
@@ -183,7 +208,9 @@ def sound_model() -> list[tuple[str, tuple]]:
         (4, 2, [(0, 0)], "2D point 0 of image 0"),
     ],
 )
-def test_what_no_model_may_hold_is_refused(call: int | None, argument: int, value: object, said: str) -> None:
+def test_what_no_model_may_hold_is_refused(
+    call: int | None, argument: int, value: object, said: str
+) -> None:
     checks = ModelChecks()
     for place, (name, arguments) in enumerate(sound_model()):
         if place != call:
@@ -199,7 +226,9 @@ def test_what_no_model_may_hold_is_refused(call: int | None, argument: int, valu
 @pytest.fixture(params=["bin", "txt"])
 def rigs(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     """A model of two rigs with three cameras each, as COLMAP writes it."""
-    options = pycolmap.SyntheticDatasetOptions(num_rigs=2, num_cameras_per_rig=3, num_frames_per_rig=2, num_points3D=9)
+    options = pycolmap.SyntheticDatasetOptions(
+        num_rigs=2, num_cameras_per_rig=3, num_frames_per_rig=2, num_points3D=9
+    )
     model = pycolmap.synthesize_dataset(options)
     if request.param == "bin":
         model.write_binary(tmp_path)
@@ -229,12 +258,17 @@ def test_a_rig_without_a_sensor_has_no_reference(rigs: Path) -> None:
 
 @pytest.mark.parametrize(
     ("stem", "start", "at", "said"),
-    [("rigs", 33, 7, "a sensor of rig 1"), ("rigs", 98, 17, "a sensor of rig 1"), ("frames", 16, 2, "frame 1")],
+    [
+        ("rigs", 33, 7, "a sensor of rig 1"),
+        ("rigs", 98, 17, "a sensor of rig 1"),
+        ("frames", 16, 2, "frame 1"),
+    ],
 )
 def test_a_pose_of_a_rig_or_a_frame_without_a_direction_is_refused(
     rigs: Path, stem: str, start: int, at: int, said: str
 ) -> None:
-    """``start`` of a pose: behind the count, ids and, in a rig, the reference, the sensor and a mark."""
+    """``start`` of a pose: behind the count, ids and, in a rig, the reference, the sensor and a
+    mark."""
     (file,) = rigs.glob(f"{stem}.*")
     if file.suffix == ".bin":
         data = file.read_bytes()
@@ -273,7 +307,9 @@ def test_a_pose_of_a_rig_or_a_frame_without_a_direction_is_refused(
         ("points3D", "1 0 0 5 0 255 0 0.1 1", "point 1 lacks numbers"),
     ],
 )
-def test_a_line_of_a_text_model_that_lacks_something_is_named(tmp_path: Path, stem: str, line: str, said: str) -> None:
+def test_a_line_of_a_text_model_that_lacks_something_is_named(
+    tmp_path: Path, stem: str, line: str, said: str
+) -> None:
     lines = {
         "cameras": "# a comment\n1 PINHOLE 40 30 50 50 20 15",
         "images": "1 1 0 0 0 0 0 5 1 a.png\n1 2 -1",

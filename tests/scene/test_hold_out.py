@@ -98,17 +98,24 @@ def test_validation_of_lists_takes_every_nth_of_the_training_list() -> None:
 
 def test_a_put_away_view_is_no_part_of_the_capture(make_scene: Callable[..., Path]) -> None:
     root = make_scene(names=NAMES[:9])
-    plain, judged = (read_colmap("toy", root, split=SplitRule(test_every=3, validation=v)) for v in (False, True))
+    plain, judged = (
+        read_colmap("toy", root, split=SplitRule(test_every=3, validation=v)) for v in (False, True)
+    )
     assert plain.test_names == ("00.png", "03.png", "06.png")
     assert judged.image_names == tuple(name for name in NAMES[:9] if name not in plain.test_names)
     assert judged.test_names == ("01.png", "05.png")
     fingerprint = judged.fingerprint
     (root / "images" / "00.png").write_bytes((root / "images" / "01.png").read_bytes())
-    assert read_colmap("toy", root, split=SplitRule(test_every=3, validation=True)).fingerprint == fingerprint
+    assert (
+        read_colmap("toy", root, split=SplitRule(test_every=3, validation=True)).fingerprint
+        == fingerprint
+    )
     assert read_colmap("toy", root, split=SplitRule(test_every=3)).fingerprint != plain.fingerprint
 
 
-def test_sectors_of_a_folder_use_its_cameras_under_other_file_names(make_scene: Callable[..., Path]) -> None:
+def test_sectors_of_a_folder_use_its_cameras_under_other_file_names(
+    make_scene: Callable[..., Path],
+) -> None:
     root = make_scene(names=NAMES[:8])
     for name in NAMES[:8]:
         (root / "images" / name).rename(root / "images" / f"{name[:2]}.jpg")
@@ -127,13 +134,18 @@ def test_lists_of_nerfbaselines_are_found_by_their_names(make_scene: Callable[..
         capture = read("toy", root, split=SplitRule(split="list"))
         assert capture.test_names == tuple(NAMES[:2])
         assert capture.train_names == tuple(NAMES[2:7])
-    assert read_colmap("toy", root).test_names == ("00.png",), "lists that nobody named hold out nothing"
+    assert read_colmap("toy", root).test_names == ("00.png",), (
+        "lists that nobody named hold out nothing"
+    )
 
 
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"split": "matched"}, r"sweep it, as in -m scene\.split=every_nth,sector scene\.match_views=true"),
+        (
+            {"split": "matched"},
+            r"sweep it, as in -m scene\.split=every_nth,sector scene\.match_views=true",
+        ),
         ({"sector": 8}, "the last is 7"),
         ({"split": "sector", "test_list": "a.txt"}, "both say"),
         ({"split": "list", "match_views": True}, "cannot be matched"),
@@ -142,7 +154,9 @@ def test_lists_of_nerfbaselines_are_found_by_their_names(make_scene: Callable[..
         ({"split": "random"}, "scene.split"),
     ],
 )
-def test_settings_that_contradict_each_other_are_refused(settings: dict[str, str], message: str) -> None:
+def test_settings_that_contradict_each_other_are_refused(
+    settings: dict[str, str], message: str
+) -> None:
     with pytest.raises(InputError, match=message):
         SceneConfig(**({"name": "a", "kind": "colmap", "path": "/a"} | settings))  # type: ignore[arg-type]
 
@@ -185,7 +199,10 @@ def test_settings_without_a_value_are_those_of_the_paper() -> None:
     assert (config.max_images, config.test_every, config.sectors, config.sector) == (200, 8, 8, 0)
     assert (config.views, config.width, config.height, config.seed) == (48, 400, 300, 0)
     assert (config.downscale, config.max_size) == (1, None)
-    for kind, path, said in (("colmap", None, "scene.path is not set"), ("courtyard", "/a", "built-in courtyard")):
+    for kind, path, said in (
+        ("colmap", None, "scene.path is not set"),
+        ("courtyard", "/a", "built-in courtyard"),
+    ):
         with pytest.raises(InputError, match=said):
             SceneConfig(name="a", kind=kind, path=path)  # type: ignore[arg-type]
     with pytest.raises(InputError, match="at least 16 px are needed"):

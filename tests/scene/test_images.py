@@ -27,7 +27,8 @@ def test_lossless_formats_come_back_exactly(tmp_path: Path, suffix: str):
 def test_modes_become_rgb(tmp_path: Path):
     path = tmp_path / "a.png"
     Image.fromarray(np.array([[[200, 100, 50, 255], [200, 100, 50, 0]]], dtype=np.uint8)).save(path)
-    assert read_image(path).tolist() == [[[200, 100, 50], [0, 0, 0]]]  # transparency lies over black
+    # transparency lies over black
+    assert read_image(path).tolist() == [[[200, 100, 50], [0, 0, 0]]]
     Image.fromarray(np.array([[7, 250]], dtype=np.uint8)).save(path)
     assert read_image(path).tolist() == [[[7, 7, 7], [250, 250, 250]]]
     Image.fromarray(np.array([[0x1234, 0xFFFF]], dtype=np.uint16)).save(path)
@@ -86,7 +87,8 @@ def test_sizes_never_grow_and_the_longest_side_is_exact():
 
 
 @pytest.mark.parametrize(
-    ("size", "same"), [((40, 26), False), ((42, 30), True), ((43, 30), False), ((40, 31), True), ((40, 32), False)]
+    ("size", "same"),
+    [((40, 26), False), ((42, 30), True), ((43, 30), False), ((40, 31), True), ((40, 32), False)],
 )
 def test_sides_may_be_rounded_by_one_pixel(size: tuple[int, int], same: bool):
     assert same_up_to_rounding(size, (40, 30)) == same
@@ -103,7 +105,8 @@ def test_a_side_in_training_has_sixteen_pixels():
 def test_area_is_the_block_mean_and_lanczos_keeps_a_ramp():
     image = smooth_image(40, 30)
     blocks = image.reshape(15, 2, 20, 2, 3).mean(axis=(1, 3))
-    assert np.abs(resize_image(image, 20, 15, "area") - blocks).max() <= 1.0  # Pillow rounds after each of two passes
+    # Pillow rounds after each of two passes
+    assert np.abs(resize_image(image, 20, 15, "area") - blocks).max() <= 1.0
     ramp = np.repeat(np.arange(0, 200, 2, dtype=np.uint8)[None, :, None], 30, 0).repeat(3, 2)
     small = resize_image(ramp, 50, 15, "lanczos")
     np.testing.assert_allclose(small[7, 5:-5, 0], np.arange(1, 200, 4)[5:-5], atol=1.01)

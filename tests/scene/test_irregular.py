@@ -1,4 +1,5 @@
-"""Captures that hold what is no photograph: pipes, devices, links in circles, other formats, names of any length."""
+"""Captures that hold what is no photograph: pipes, devices, links in circles, other formats, names
+of any length."""
 
 from __future__ import annotations
 
@@ -28,7 +29,9 @@ from gsbench.scene.images import (
 from gsbench.scene.options import SplitRule
 from gsbench.scene.readers import fingerprint, read_photos
 
-pytestmark = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes and links of a POSIX system")
+pytestmark = pytest.mark.skipif(
+    not hasattr(os, "mkfifo"), reason="pipes and links of a POSIX system"
+)
 SECONDS = 20
 
 
@@ -72,7 +75,12 @@ READERS: list[tuple[str, Callable[[Path], object]]] = [
     (".ply", check_ply),
     (".ply", read_points),
     (".txt", read_points),
-    (".txt", lambda path: read_photos("x", path.parent, images="images", split=SplitRule(test_list=str(path)))),
+    (
+        ".txt",
+        lambda path: read_photos(
+            "x", path.parent, images="images", split=SplitRule(test_list=str(path))
+        ),
+    ),
 ]
 
 
@@ -106,7 +114,9 @@ def test_links_in_a_circle_are_followed_once(photos: Path) -> None:
     assert list_images(photos) == ["a.png", "b.png", "c.png"]
 
 
-def test_a_folder_goes_by_its_own_name_and_a_linked_one_by_the_link(photos: Path, tmp_path: Path) -> None:
+def test_a_folder_goes_by_its_own_name_and_a_linked_one_by_the_link(
+    photos: Path, tmp_path: Path
+) -> None:
     (photos / "z").mkdir()
     (photos / "a.png").rename(photos / "z" / "a.png")
     (photos / "alias").symlink_to("z")
@@ -118,7 +128,9 @@ def test_a_folder_goes_by_its_own_name_and_a_linked_one_by_the_link(photos: Path
     assert list_images(photos) == ["c.png", "far/b.png", "z/a.png"]
 
 
-def test_photographs_that_cannot_be_read_are_counted(photos: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_photographs_that_cannot_be_read_are_counted(
+    photos: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     (photos / "d.HEIC").touch()
     assert list_images(photos) == ["a.png", "b.png", "c.png"]
     assert f"{photos}: 1 HEIC file is not read" in caplog.text
@@ -130,7 +142,9 @@ def test_a_dangling_link_is_named(photos: Path, tmp_path: Path) -> None:
         read_photos("x", tmp_path)
 
 
-@pytest.mark.parametrize("form", ["DDS", "JPEG2000", "GIF", "ICNS", "PPM", "TGA", "PCX", "SGI", "PDF", "EPS"])
+@pytest.mark.parametrize(
+    "form", ["DDS", "JPEG2000", "GIF", "ICNS", "PPM", "TGA", "PCX", "SGI", "PDF", "EPS"]
+)
 def test_other_formats_are_refused_whatever_their_name(form: str, tmp_path: Path) -> None:
     Image.new("RGB", (16, 16)).save(tmp_path / "a.bin", format=form)
     for suffix in IMAGE_SUFFIXES:
@@ -147,7 +161,8 @@ def test_the_formats_of_photographs_are_read_whatever_their_name(form: str, tmp_
 
 
 @pytest.mark.parametrize(
-    "exif", [b"Exif\0\0" + bytes(range(200)), b"Exif\0\0MM\0*\0\0\0\x08\xff\xff" + bytes(20), b"Exif"]
+    "exif",
+    [b"Exif\0\0" + bytes(range(200)), b"Exif\0\0MM\0*\0\0\0\x08\xff\xff" + bytes(20), b"Exif"],
 )
 def test_a_damaged_exif_is_as_none(exif: bytes, tmp_path: Path) -> None:
     Image.new("RGB", (16, 12)).save(tmp_path / "a.jpg", exif=exif)
@@ -155,12 +170,16 @@ def test_a_damaged_exif_is_as_none(exif: bytes, tmp_path: Path) -> None:
     assert read_image(tmp_path / "a.jpg").shape == (12, 16, 3)
 
 
-def test_names_that_make_no_file_name_are_refused_before_any_work(photos: Path, tmp_path: Path) -> None:
+def test_names_that_make_no_file_name_are_refused_before_any_work(
+    photos: Path, tmp_path: Path
+) -> None:
     long = "ä" * 120 + ".png"  # 244 bytes
     (photos / "a.png").rename(photos / long)
     with pytest.raises(InputError, match="a name of more than 220 bytes"):
         read_photos("x", tmp_path, split=SplitRule(test_every=2))
-    with pytest.raises(InputError, match=r"the pictures of a/b\.png and a__b\.jpg would both be a__b\.png"):
+    with pytest.raises(
+        InputError, match=r"the pictures of a/b\.png and a__b\.jpg would both be a__b\.png"
+    ):
         check_picture_names(["a/b.png", "a__b.jpg"], photos)
     check_picture_names(["a/b.png", "a/c.png"], photos)
 
@@ -168,7 +187,9 @@ def test_names_that_make_no_file_name_are_refused_before_any_work(photos: Path, 
 @pytest.mark.parametrize("kind", ["binary", "text"])
 @pytest.mark.parametrize("file", ["frames", "rigs", "images"])
 @pytest.mark.parametrize("length", [1.001, 2.0, 0.01])
-def test_quaternions_of_any_length_are_rotations(kind: str, file: str, length: float, tmp_path: Path) -> None:
+def test_quaternions_of_any_length_are_rotations(
+    kind: str, file: str, length: float, tmp_path: Path
+) -> None:
     options = pycolmap.SyntheticDatasetOptions()
     options.num_frames_per_rig, options.num_points3D, options.num_cameras_per_rig = 3, 12, 2
     options.sensor_from_rig_rotation_stddev = 5.0
@@ -192,7 +213,8 @@ def test_quaternions_of_any_length_are_rotations(kind: str, file: str, length: f
 
 
 def write_rigs(folder: Path, cameras: int) -> tuple[list[str], Callable[[list[str]], None]]:
-    """Write a model of rigs of ``cameras``; return its first rig's words, and a function that writes others."""
+    """Write a model of rigs of ``cameras``; return its first rig's words, and a function that
+    writes others."""
     options = pycolmap.SyntheticDatasetOptions()
     options.num_frames_per_rig, options.num_points3D, options.num_cameras_per_rig = 3, 12, cameras
     pycolmap.synthesize_dataset(options).write_text(folder)
@@ -200,7 +222,9 @@ def write_rigs(folder: Path, cameras: int) -> tuple[list[str], Callable[[list[st
     first = next(number for number, line in enumerate(lines) if line and not line.startswith("#"))
 
     def write(words: list[str]) -> None:
-        (folder / "rigs.txt").write_text("\n".join([*lines[:first], " ".join(words), *lines[first + 1 :]]))
+        (folder / "rigs.txt").write_text(
+            "\n".join([*lines[:first], " ".join(words), *lines[first + 1 :]])
+        )
 
     return lines[first].split(), write
 
@@ -214,12 +238,16 @@ def test_each_sensor_of_a_rig_is_checked(tmp_path: Path) -> None:
     write([*words[:4], *without_pose, *fields[1], *fields[2]])
     check_model(tmp_path)
     write([*words[:4], *without_pose, *fields[1], *fields[2][:3], *["0"] * 4, *fields[2][7:]])
-    with pytest.raises(InputError, match=r"rigs\.txt: a sensor of rig 1 has no pose that can be used"):
+    with pytest.raises(
+        InputError, match=r"rigs\.txt: a sensor of rig 1 has no pose that can be used"
+    ):
         check_model(tmp_path)
 
 
 def test_a_rig_whose_sensor_has_no_rotation_is_refused(tmp_path: Path) -> None:
     words, write = write_rigs(tmp_path, 2)
     write([*words[:7], *["0"] * 4, *words[11:]])
-    with pytest.raises(InputError, match=r"rigs\.txt: a sensor of rig 1 has no pose that can be used"):
+    with pytest.raises(
+        InputError, match=r"rigs\.txt: a sensor of rig 1 has no pose that can be used"
+    ):
         read_model(tmp_path)

@@ -1,4 +1,5 @@
-"""From capture and model to a scene: undistortion of every camera model, sizes, cache, missing poses."""
+"""From capture and model to a scene: undistortion of every camera model, sizes, cache, missing
+poses."""
 
 from __future__ import annotations
 
@@ -32,7 +33,20 @@ MODELS = {
     "RADIAL_FISHEYE": [150, 100, 75, 0.02, 0.001],
     "OPENCV_FISHEYE": [150, 152, 100, 75, 0.01, 0.001, 0, 0],
     "FOV": [150, 150, 100, 75, 0.3],
-    "THIN_PRISM_FISHEYE": [150, 150, 100, 75, 0.01, 0.001, 0.0005, 0.0005, 0.001, 0.001, 0.0001, 0.0001],
+    "THIN_PRISM_FISHEYE": [
+        150,
+        150,
+        100,
+        75,
+        0.01,
+        0.001,
+        0.0005,
+        0.0005,
+        0.001,
+        0.001,
+        0.0001,
+        0.0001,
+    ],
     "RAD_TAN_THIN_PRISM_FISHEYE": [150, 150, 100, 75, 0.01, 0, 0, 0, 0, 0, 0.001, 0, 0, 0, 0, 0],
     "SIMPLE_DIVISION": [150, 100, 75, -0.1],
     "DIVISION": [150, 152, 100, 75, -0.1],
@@ -40,24 +54,34 @@ MODELS = {
     "FISHEYE": [150, 150, 100, 75],
     "EUCM": [150, 150, 100, 75, 0.5, 1.1],
 }
-SPOTS = np.array([[x, y, 1.0] for x in (-0.3, 0.0, 0.35) for y in (-0.25, 0.05, 0.2)])  # camera space
+# camera space
+SPOTS = np.array([[x, y, 1.0] for x in (-0.3, 0.0, 0.35) for y in (-0.25, 0.05, 0.2)])
 
 
 def test_every_model_of_this_pycolmap_is_tested():
-    known = set(pycolmap.CameraModelId.__members__) - {"INVALID", "PINHOLE", "SIMPLE_PINHOLE", "EQUIRECTANGULAR"}
+    known = set(pycolmap.CameraModelId.__members__) - {
+        "INVALID",
+        "PINHOLE",
+        "SIMPLE_PINHOLE",
+        "EQUIRECTANGULAR",
+    }
     assert known == set(MODELS)
 
 
 @pytest.mark.parametrize("name", MODELS)
 def test_spots_land_where_a_pinhole_sees_them(name: str):
-    source = pycolmap.Camera(camera_id=1, model=name, width=WIDTH, height=HEIGHT, params=MODELS[name])
+    source = pycolmap.Camera(
+        camera_id=1, model=name, width=WIDTH, height=HEIGHT, params=MODELS[name]
+    )
     rows, columns = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     image = np.zeros((HEIGHT, WIDTH))
     for spot in SPOTS:  # one soft spot where COLMAP's own distortion puts each point
         x, y = source.img_from_cam(spot)
         image += np.exp(-((columns - x) ** 2 + (rows - y) ** 2) / (2 * 1.5**2))
     pixels = np.repeat((255 * image.clip(0, 1)).astype(np.uint8)[..., None], 3, axis=2)
-    flat, pinhole = undistort(pixels, CameraModel(name, WIDTH, HEIGHT, tuple(map(float, MODELS[name]))))
+    flat, pinhole = undistort(
+        pixels, CameraModel(name, WIDTH, HEIGHT, tuple(map(float, MODELS[name])))
+    )
     assert flat.shape == (pinhole.height, pinhole.width, 3)
     found = 0
     for spot in SPOTS:
@@ -67,18 +91,31 @@ def test_spots_land_where_a_pinhole_sees_them(name: str):
         left, top = int(x) - 5, int(y) - 5
         window = flat[top : top + 11, left : left + 11, 0].astype(float)
         ys, xs = np.mgrid[:11, :11] + 0.5
-        center = np.array([(window * xs).sum() + left * window.sum(), (window * ys).sum() + top * window.sum()])
+        center = np.array(
+            [(window * xs).sum() + left * window.sum(), (window * ys).sum() + top * window.sum()]
+        )
         np.testing.assert_allclose(center / window.sum(), [x, y], atol=0.12)
         found += 1
     assert found == len(SPOTS)
 
 
-PERSPECTIVE = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "FOV", "SIMPLE_DIVISION", "DIVISION", "EUCM")
+PERSPECTIVE = (
+    "SIMPLE_RADIAL",
+    "RADIAL",
+    "OPENCV",
+    "FULL_OPENCV",
+    "FOV",
+    "SIMPLE_DIVISION",
+    "DIVISION",
+    "EUCM",
+)
 
 
 @pytest.mark.parametrize("amount", [0.0, 1e-7, 1.0])
 @pytest.mark.parametrize("name", MODELS)
-def test_a_point_is_seen_at_the_pixel_where_pycolmap_undistorts_it(make_scene, tmp_path: Path, name: str, amount):
+def test_a_point_is_seen_at_the_pixel_where_pycolmap_undistorts_it(
+    make_scene, tmp_path: Path, name: str, amount
+):
     """Zero and tiny coefficients leave pixels alone in perspective models, and in no fisheye."""
     plain = pycolmap.Camera.create_from_model_name(1, name, 150.0, WIDTH, HEIGHT)
     params = np.array(MODELS[name], dtype=float)
@@ -101,12 +138,18 @@ def test_a_point_is_seen_at_the_pixel_where_pycolmap_undistorts_it(make_scene, t
             assert view.image.shape[:2] == (wanted.height, wanted.width)
         for point in np.random.default_rng(0).uniform((-1, -1, 4), (1, 1, 6), (20, 3)):
             x, y, z = view.camera.rotation @ point + view.camera.translation
-            seen = [view.camera.fx * x / z + view.camera.cx, view.camera.fy * y / z + view.camera.cy]
-            np.testing.assert_allclose(seen, wanted.img_from_cam(image.cam_from_world() * point), atol=1e-3)
+            seen = [
+                view.camera.fx * x / z + view.camera.cx,
+                view.camera.fy * y / z + view.camera.cy,
+            ]
+            np.testing.assert_allclose(
+                seen, wanted.img_from_cam(image.cam_from_world() * point), atol=1e-3
+            )
 
 
 def test_distortion_below_a_twentieth_of_a_pixel_is_ignored_and_above_it_is_not():
-    corner = np.hypot(WIDTH, HEIGHT) / 2  # px from the centre; f = 1 in these units, so k moves it by k r^3
+    # px from the centre; f = 1 in these units, so k moves it by k r^3
+    corner = np.hypot(WIDTH, HEIGHT) / 2
     for moved, ignored in ((0.049, True), (-0.049, True), (0.051, False), (-0.051, False)):
         params = [150.0, WIDTH / 2, HEIGHT / 2, moved / 150.0 / (corner / 150.0) ** 3]
         camera = pycolmap.Camera(model="SIMPLE_RADIAL", width=WIDTH, height=HEIGHT, params=params)
@@ -114,7 +157,9 @@ def test_distortion_below_a_twentieth_of_a_pixel_is_ignored_and_above_it_is_not(
         assert plain_camera(camera).distorted is not ignored
     cancelling = [150, 150, 100, 75, 0.1, 0, 0, 0, 0, 0.1, 0, 0]  # (1 + .1 r^2) / (1 + .1 r^2)
     camera = pycolmap.Camera(model="FULL_OPENCV", width=WIDTH, height=HEIGHT, params=cancelling)
-    assert plain_camera(camera) == CameraModel("PINHOLE", WIDTH, HEIGHT, (150.0, 150.0, 100.0, 75.0))
+    assert plain_camera(camera) == CameraModel(
+        "PINHOLE", WIDTH, HEIGHT, (150.0, 150.0, 100.0, 75.0)
+    )
 
 
 def test_panoramas_are_refused(tmp_path: Path):
@@ -123,7 +168,9 @@ def test_panoramas_are_refused(tmp_path: Path):
         undistort(np.zeros((HEIGHT, WIDTH, 3), dtype=np.uint8), camera)
     Image.new("RGB", (WIDTH, HEIGHT)).save(tmp_path / "a.png")
     with pytest.raises(InputError, match="EQUIRECTANGULAR"):  # and so from the isolated process
-        prepare_all([ImageToPrepare(tmp_path / "a.png", camera, tmp_path / "b.png", UNCHANGED)], no_progress)
+        prepare_all(
+            [ImageToPrepare(tmp_path / "a.png", camera, tmp_path / "b.png", UNCHANGED)], no_progress
+        )
 
 
 def test_images_are_prepared_sixteen_at_a_time_in_their_order(tmp_path: Path):
@@ -132,7 +179,9 @@ def test_images_are_prepared_sixteen_at_a_time_in_their_order(tmp_path: Path):
         Image.new("RGB", (width, 10)).save(tmp_path / f"{width}.png")
         camera = CameraModel("PINHOLE", width, 10, (5.0, 6.0, width / 2, 4.0))
         target = tmp_path / "made" / f"{width}.png"
-        images.append(ImageToPrepare(tmp_path / f"{width}.png", camera, target, Downscaling(2, None, "area")))
+        images.append(
+            ImageToPrepare(tmp_path / f"{width}.png", camera, target, Downscaling(2, None, "area"))
+        )
     cameras = prepare_all(images, lambda *state: told.append(state))
     assert told == [("views", done, 36) for done in (16, 32, 36)]
     for image, camera in zip(images, cameras, strict=True):
@@ -149,7 +198,9 @@ def test_untouched_views_are_the_files(make_scene, tmp_path: Path):
     assert [view.name for view in scene.test] == ["00.png"]
     assert len(scene.train) == 5
     for view in (*scene.train, *scene.test):
-        np.testing.assert_array_equal(view.image, np.asarray(Image.open(root / "images" / view.name)))
+        np.testing.assert_array_equal(
+            view.image, np.asarray(Image.open(root / "images" / view.name))
+        )
         assert (view.camera.fx, view.camera.cx, view.camera.cy) == (50.0, 20.0, 15.0)
     assert not list((tmp_path / "cache").rglob("*.png"))
     # camera k stands at x = -0.1 k; training views 1..5: mean -0.3, farthest 0.2 away
@@ -170,14 +221,20 @@ def test_downscaled_and_distorted_views_come_back_from_the_cache(make_scene, tmp
         for a, b in zip(first.train, scene.train, strict=True):
             np.testing.assert_array_equal(a.image, b.image)
             np.testing.assert_array_equal(a.camera.rotation, b.camera.rotation)
-            assert (a.camera.width, a.camera.fx, a.camera.cy) == (b.camera.width, b.camera.fx, b.camera.cy)
+            assert (a.camera.width, a.camera.fx, a.camera.cy) == (
+                b.camera.width,
+                b.camera.fx,
+                b.camera.cy,
+            )
     camera = first.train[0].camera
     assert first.train[0].image.shape == (camera.height, camera.width, 3)
     assert camera.width < 41
     assert not list((tmp_path / "cache").glob(".*"))  # no work folder is left behind
     load_scene(capture, capture.model, tmp_path / "cache", downscale=4)
     assert len(list((tmp_path / "cache").iterdir())) == 2
-    load_scene(capture, capture.model, tmp_path / "cache", made_by={"scene/images.py": "edited"}, **options)
+    load_scene(
+        capture, capture.model, tmp_path / "cache", made_by={"scene/images.py": "edited"}, **options
+    )
     assert done == [("views", 6, 6)] * 3  # what other code has prepared is not taken
     assert len(list((tmp_path / "cache").iterdir())) == 3
     model = read_model(capture.model)
@@ -196,7 +253,9 @@ def test_images_that_were_not_selected_are_not_prepared(make_scene, tmp_path: Pa
     load_scene(capture, capture.model, tmp_path / "cache", downscale=2)
     (file,) = (tmp_path / "cache").rglob("cameras.json")
     assert list(json.loads(file.read_text())["views"]) == ["00.png", "02.png", "04.png"]
-    assert sorted(path.name for path in file.parent.glob("*.png")) == [f"0000{k}.png" for k in range(3)]
+    assert sorted(path.name for path in file.parent.glob("*.png")) == [
+        f"0000{k}.png" for k in range(3)
+    ]
 
 
 def test_a_file_of_another_shape_than_its_camera_is_refused(make_scene, tmp_path: Path):
@@ -265,4 +324,6 @@ def test_real_photos_of_a_distorted_camera(shared: Path, tmp_path: Path):
     assert {max(view.camera.width, view.camera.height) for view in scene.train} == {300}
     model = pycolmap.Reconstruction(capture.model)
     view = scene.train[0]
-    np.testing.assert_allclose(view.camera.center, model.find_image_with_name(view.name).projection_center(), atol=1e-9)
+    np.testing.assert_allclose(
+        view.camera.center, model.find_image_with_name(view.name).projection_center(), atol=1e-9
+    )

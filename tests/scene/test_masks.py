@@ -1,4 +1,5 @@
-"""Masks: which file belongs to which photograph, what is not a mask, and what is left of what they hide."""
+"""Masks: which file belongs to which photograph, what is not a mask, and what is left of what they
+hide."""
 
 from __future__ import annotations
 
@@ -14,7 +15,14 @@ from PIL import Image
 
 from gsbench.errors import InputError
 from gsbench.pipeline.steps.scene import masking_step
-from gsbench.scene.images import fill_ignored, find_masks, prepare_photograph, prepared_mask, read_mask, resize_mask
+from gsbench.scene.images import (
+    fill_ignored,
+    find_masks,
+    prepare_photograph,
+    prepared_mask,
+    read_mask,
+    resize_mask,
+)
 from gsbench.scene.load import load_scene
 from gsbench.scene.options import SceneConfig
 from gsbench.scene.readers import read_colmap, read_photos
@@ -81,17 +89,23 @@ def test_masks_below_bare_photographs_are_no_photographs(make_scene: MakeScene) 
 def test_a_missing_mask_and_a_missing_folder_are_named(make_scene: MakeScene) -> None:
     root = with_masks(make_scene())
     (root / "masks" / "03.png.png").unlink()
-    with pytest.raises(InputError, match=r"no mask of 03\.png in .*masks: add 03\.png\.png \(all white") as caught:
+    with pytest.raises(
+        InputError, match=r"no mask of 03\.png in .*masks: add 03\.png\.png \(all white"
+    ) as caught:
         read_colmap("toy", root, masks="masks")
     assert "\n" not in str(caught.value)
-    with pytest.raises(InputError, match=r"no such folder; set scene\.masks to one of: images, masks, sparse"):
+    with pytest.raises(
+        InputError, match=r"no such folder; set scene\.masks to one of: images, masks, sparse"
+    ):
         read_colmap("toy", root, masks="mask")
 
 
 def test_a_mask_of_another_size_is_refused(make_scene: MakeScene) -> None:
     root = with_masks(make_scene())
     path = save(root / "masks" / "02.png.png", half(20, 15))
-    with pytest.raises(InputError, match=rf"{path}: the mask is 20x15 px and its image 02\.png 40x30"):
+    with pytest.raises(
+        InputError, match=rf"{path}: the mask is 20x15 px and its image 02\.png 40x30"
+    ):
         read_colmap("toy", root, masks="masks")
 
 
@@ -127,8 +141,14 @@ def test_a_mask_in_a_palette_or_with_opaque_alpha_is_read(tmp_path: Path) -> Non
     ("pixels", "said"),
     [
         (np.zeros((5, 7), np.uint8), "black all over"),
-        (np.random.default_rng(0).integers(0, 256, (20, 30, 3), dtype=np.uint8), "in colours, and no mask"),
-        (np.random.default_rng(0).integers(0, 256, (20, 30), dtype=np.uint8), "% of its pixels are grey"),
+        (
+            np.random.default_rng(0).integers(0, 256, (20, 30, 3), dtype=np.uint8),
+            "in colours, and no mask",
+        ),
+        (
+            np.random.default_rng(0).integers(0, 256, (20, 30), dtype=np.uint8),
+            "% of its pixels are grey",
+        ),
         (np.stack([half(), half(), half(), half()], -1), "not by transparency"),
     ],
 )
@@ -141,7 +161,9 @@ def test_what_is_no_mask_is_refused_in_one_line_that_names_it(tmp_path: Path, pi
 
 
 def test_a_damaged_mask_is_refused(tmp_path: Path) -> None:
-    path = save(tmp_path / "m.png", np.random.default_rng(0).integers(0, 2, (64, 64), dtype=np.uint8) * 255)
+    path = save(
+        tmp_path / "m.png", np.random.default_rng(0).integers(0, 2, (64, 64), dtype=np.uint8) * 255
+    )
     path.write_bytes(path.read_bytes()[:-60])
     with pytest.raises(InputError, match=r"m\.png: the mask is damaged"):
         read_mask(path)
@@ -152,7 +174,9 @@ def test_a_damaged_mask_is_refused(tmp_path: Path) -> None:
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(1, 23), st.integers(1, 23), st.integers(0, 2**32 - 1))
-def test_what_is_filled_in_owes_nothing_to_what_was_there(height: int, width: int, seed: int) -> None:
+def test_what_is_filled_in_owes_nothing_to_what_was_there(
+    height: int, width: int, seed: int
+) -> None:
     rng = np.random.default_rng(seed)
     counts = rng.random((height, width)) < rng.random()
     counts[rng.integers(height), rng.integers(width)] = True
@@ -169,14 +193,21 @@ def test_a_plane_is_filled_with_its_own_colour_and_a_ramp_without_a_step() -> No
     plain = np.full((50, 60, 3), (10, 200, 90), dtype=np.uint8)
     counts = np.ones((50, 60), bool)
     counts[10:40, 15:45] = False
-    np.testing.assert_array_equal(fill_ignored(np.where(counts[..., None], plain, 0).astype(np.uint8), counts), plain)
-    ramp = np.repeat(np.repeat(np.linspace(0, 240, 60)[None, :, None], 50, 0), 3, 2).astype(np.uint8)
+    np.testing.assert_array_equal(
+        fill_ignored(np.where(counts[..., None], plain, 0).astype(np.uint8), counts), plain
+    )
+    ramp = np.repeat(np.repeat(np.linspace(0, 240, 60)[None, :, None], 50, 0), 3, 2).astype(
+        np.uint8
+    )
     filled = fill_ignored(ramp, counts).astype(int)
-    assert np.abs(np.diff(filled[25, :, 0])).max() < 60, "black in its place would make a step of 180"
+    assert np.abs(np.diff(filled[25, :, 0])).max() < 60, (
+        "black in its place would make a step of 180"
+    )
 
 
 def test_between_two_pixels_the_filling_is_linear() -> None:
-    """Blocks of two pixels have the values 0 and 100; a finer pixel lies a quarter of a block from its middle."""
+    """Blocks of two pixels have the values 0 and 100; a finer pixel lies a quarter of a block from
+    its middle."""
     row = np.array([[0, 7, 9, 100]], dtype=np.uint8)[..., None].repeat(3, 2)
     counts = np.array([[True, False, False, True]])
     assert fill_ignored(row, counts)[0, :, 0].tolist() == [0, 25, 75, 100]
@@ -196,7 +227,9 @@ def test_between_two_pixels_the_filling_is_linear() -> None:
         (half(8, 6), 255, "white", False),
     ],
 )
-def test_a_photograph_that_stays_as_it_is_is_copied(tmp_path: Path, mask, alpha, backdrop, copied) -> None:
+def test_a_photograph_that_stays_as_it_is_is_copied(
+    tmp_path: Path, mask, alpha, backdrop, copied
+) -> None:
     pixels = np.full((6, 8, 4), (200, 100, 50, alpha), np.uint8)
     original = save(tmp_path / "in" / "a.png", pixels if alpha < 255 else pixels[..., :3])
     masks = {} if mask is None else {"a.png": save(tmp_path / "a.png", mask)}
@@ -208,12 +241,15 @@ def test_a_photograph_that_stays_as_it_is_is_copied(tmp_path: Path, mask, alpha,
         shade = 255 if alpha == 9 else 0
         expected = np.rint((alpha * pixels[0, 0, :3].astype(float) + (255 - alpha) * shade) / 255)
         with Image.open(made) as picture:
-            np.testing.assert_allclose(np.asarray(picture), np.broadcast_to(expected, (6, 8, 3)), atol=1)
+            np.testing.assert_allclose(
+                np.asarray(picture), np.broadcast_to(expected, (6, 8, 3)), atol=1
+            )
 
 
 @pytest.mark.parametrize(("width", "height"), [(25, 18), (10, 9), (20, 12), (17, 13)])
 def test_a_resized_pixel_counts_where_all_in_its_area_do(width: int, height: int) -> None:
-    """In its area is what has its centre there; what has it on the edge may belong to either side."""
+    """In its area is what has its centre there; what has it on the edge may belong to either
+    side."""
     counts = np.random.default_rng(1).random((36, 50)) > 0.05
     found = resize_mask(counts, width, height)
 
@@ -224,7 +260,9 @@ def test_a_resized_pixel_counts_where_all_in_its_area_do(width: int, height: int
     for row in range(height):
         for column in range(width):
             inner, outer = (
-                counts[np.ix_(centres(row, height, 36, slack), centres(column, width, 50, slack))].all()
+                counts[
+                    np.ix_(centres(row, height, 36, slack), centres(column, width, 50, slack))
+                ].all()
                 for slack in (-1e-6, 1e-6)
             )
             assert outer <= found[row, column] <= inner
@@ -251,7 +289,8 @@ def test_views_have_their_masks_at_the_final_size(make_scene: MakeScene, tmp_pat
 
 
 def test_a_mask_is_undistorted_with_its_photograph(make_scene: MakeScene, tmp_path: Path) -> None:
-    """A photograph that is as its mask, white and black, stays so: a pixel counts where it is white."""
+    """A photograph that is as its mask, white and black, stays so: a pixel counts where it is
+    white."""
     root = make_scene(size=(120, 90), model="SIMPLE_RADIAL", params=(100, 60, 45, 0.15))
     for k, path in enumerate((root / "images").iterdir()):
         disc = np.hypot(*np.mgrid[-45:45, -60:60]) > 20 + k
@@ -294,7 +333,10 @@ def test_what_is_prepared_keeps_exif_and_is_a_photograph_to_colmap(tmp_path: Pat
     image.save(tmp_path / "in" / "a.jpg", exif=exif.tobytes())
     save(tmp_path / "m.png", half(45, 30))
     prepare_photograph(tmp_path / "out", tmp_path / "in", {"a.jpg": tmp_path / "m.png"}, "a.jpg")
-    cameras = [pycolmap.infer_camera_from_image(tmp_path / place / "a.jpg") for place in ("in", "out/images")]
+    cameras = [
+        pycolmap.infer_camera_from_image(tmp_path / place / "a.jpg")
+        for place in ("in", "out/images")
+    ]
     assert cameras[0].has_prior_focal_length
     assert cameras[1].has_prior_focal_length
     assert cameras[0].params.tolist() == cameras[1].params.tolist()

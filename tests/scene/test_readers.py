@@ -38,12 +38,21 @@ def test_the_older_three_file_layout(make_scene):
 
 
 def test_photos_in_images_or_directly_or_nested(make_scene):
-    root = make_scene(names=("cam1/01.PNG", "cam1/02.png", "cam2/01.JPEG", "z.tif", "y.webp", "x.bmp"))
+    root = make_scene(
+        names=("cam1/01.PNG", "cam1/02.png", "cam2/01.JPEG", "z.tif", "y.webp", "x.bmp")
+    )
     (root / "images" / ".hidden.png").write_bytes(b"no image")
     (root / "images" / "notes.txt").write_text("no image")
     for path in (root, root / "images"):
         capture = read_photos("toy", path)
-        assert capture.image_names == ("cam1/01.PNG", "cam1/02.png", "cam2/01.JPEG", "x.bmp", "y.webp", "z.tif")
+        assert capture.image_names == (
+            "cam1/01.PNG",
+            "cam1/02.png",
+            "cam2/01.JPEG",
+            "x.bmp",
+            "y.webp",
+            "z.tif",
+        )
         assert capture.model is None
     assert read_photos("toy", root, images="images/cam1/..").images == root / "images/cam1/.."
 
@@ -66,7 +75,11 @@ def test_files_with_another_extension_and_missing_ones(make_scene, caplog):
         (["b.JPG"], ["b.png"], {"b.JPG": "b.png"}),
         (["img_1.jpg"], ["IMG_1.JPG"], {"img_1.jpg": "IMG_1.JPG"}),
         (["cam/img_1.jpg"], ["Cam/IMG_1.PNG", "IMG_1.PNG"], {"cam/img_1.jpg": "Cam/IMG_1.PNG"}),
-        (["img.jpg", "IMG.jpg"], ["IMG.jpg", "img.png"], {"IMG.jpg": "IMG.jpg", "img.jpg": "img.png"}),
+        (
+            ["img.jpg", "IMG.jpg"],
+            ["IMG.jpg", "img.png"],
+            {"IMG.jpg": "IMG.jpg", "img.jpg": "img.png"},
+        ),
         (["IMG.jpg", "img.jpg"], ["img.png"], {"img.jpg": "img.png"}),
         (["img.jpg"], ["IMG.JPG", "IMG.png"], {"img.jpg": "IMG.JPG"}),
         (["ä.jpg"], ["Ä.JPG"], {"ä.jpg": "Ä.JPG"}),
@@ -99,13 +112,19 @@ def test_names_match_their_files_or_an_error_names_both(wanted, files, matches):
         ({"sparse/0": 4, "colmap/sparse/0": 6}, "sparse/0"),
     ],
 )
-def test_of_several_models_the_one_with_the_most_images_is_read(make_scene, caplog, models, chosen, text: bool):
+def test_of_several_models_the_one_with_the_most_images_is_read(
+    make_scene, caplog, models, chosen, text: bool
+):
     for sparse, count in models.items():
         root = make_scene(names=[f"{k}.png" for k in range(count)], sparse=sparse, text=text)
     capture = read_colmap("toy", root)
     assert capture.model == root / chosen
     assert len(capture.image_names) == models[chosen]
-    others = [sparse for sparse in models if sparse != chosen and sparse.split("/")[0] == chosen.split("/")[0]]
+    others = [
+        sparse
+        for sparse in models
+        if sparse != chosen and sparse.split("/")[0] == chosen.split("/")[0]
+    ]
     assert ("scene.sparse chooses another" in caplog.text) is bool(others)
     assert all(f"{other}: {models[other]} image" in caplog.text for other in others)
     assert read_colmap("toy", root, sparse=chosen).model == root / chosen
@@ -116,7 +135,9 @@ def test_a_model_beside_others_whose_images_cannot_be_counted_is_named(make_scen
     root = make_scene()
     make_scene(sparse="sparse/1")
     (root / "sparse/0/images.bin").write_bytes(b"\1")
-    with pytest.raises(InputError, match=r"sparse/0/images\.bin: its images cannot be counted.*scene\.sparse"):
+    with pytest.raises(
+        InputError, match=r"sparse/0/images\.bin: its images cannot be counted.*scene\.sparse"
+    ):
         read_colmap("toy", root)
     assert read_colmap("toy", root, sparse="sparse/1").model == root / "sparse/1"
 
@@ -124,7 +145,9 @@ def test_a_model_beside_others_whose_images_cannot_be_counted_is_named(make_scen
 @pytest.mark.parametrize("text", [False, True])
 @pytest.mark.parametrize("mark", [b"", codecs.BOM_UTF8])
 @pytest.mark.parametrize("line_end", [b"\n", b"\r\n"])
-def test_names_with_blanks_are_read_whole_after_any_mark_and_line_end(make_scene, text: bool, mark, line_end):
+def test_names_with_blanks_are_read_whole_after_any_mark_and_line_end(
+    make_scene, text: bool, mark, line_end
+):
     names = [f"my  photo {k}.png" for k in range(6)]
     root = make_scene(names=names, text=text)
     for file in (root / "sparse/0").glob("*.txt"):
@@ -134,7 +157,9 @@ def test_names_with_blanks_are_read_whole_after_any_mark_and_line_end(make_scene
     model = read_model(root / "sparse/0")
     assert sorted(image.name for image in model.images.values()) == names
     (root / "tests.txt").write_bytes(mark + names[3].encode() + line_end)
-    assert read_colmap("toy", root, split=SplitRule(test_list="tests.txt")).test_names == (names[3],)
+    assert read_colmap("toy", root, split=SplitRule(test_list="tests.txt")).test_names == (
+        names[3],
+    )
 
 
 @pytest.mark.parametrize(
@@ -142,7 +167,10 @@ def test_names_with_blanks_are_read_whole_after_any_mark_and_line_end(make_scene
     [
         (lambda text: text.encode("utf-16"), "UTF-16 or UTF-32: save it as UTF-8"),
         (lambda text: text.encode("utf-32"), "UTF-16 or UTF-32: save it as UTF-8"),
-        (lambda text: text.replace(".", ",").encode(), r"decimal commas \(.*\), where COLMAP writes points"),
+        (
+            lambda text: text.replace(".", ",").encode(),
+            r"decimal commas \(.*\), where COLMAP writes points",
+        ),
     ],
 )
 @pytest.mark.parametrize("stem", ["cameras", "images", "points3D"])
@@ -158,7 +186,8 @@ def test_selection_is_even_and_comes_before_the_split(make_scene):
     assert select_images(list("abcdefghij"), 4) == ["a", "c", "f", "h"]
     for count, most in ((292, 98), (7, 3), (200, 200), (201, 200)):
         chosen = [int(name) for name in select_images([str(k) for k in range(count)], most)]
-        gaps = {b - a for a, b in zip(chosen, [*chosen[1:], count], strict=True)}  # closed ring: back to the first
+        # closed ring: back to the first
+        gaps = {b - a for a, b in zip(chosen, [*chosen[1:], count], strict=True)}
         assert len(chosen) == most
         assert max(gaps) - min(gaps) <= 1
     capture = read_colmap("toy", make_scene(), max_images=3, split=SplitRule(test_every=2))
@@ -226,7 +255,9 @@ def test_bad_folders(make_scene, tmp_path: Path):
     with pytest.raises(InputError, match="0 images"):
         read_photos("toy", empty)
     root = make_scene()
-    with pytest.raises(InputError, match=r"images_8: no such folder; set scene\.images to one of: images, sparse"):
+    with pytest.raises(
+        InputError, match=r"images_8: no such folder; set scene\.images to one of: images, sparse"
+    ):
         read_colmap("toy", root, images="images_8")
     for name in list_images(root / "images")[2:]:
         (root / "images" / name).unlink()
@@ -248,15 +279,24 @@ def test_truncated_model_is_one_clear_line(make_scene, file: str, keep: float):
     assert "\n" not in str(caught.value)
 
 
-def test_a_scene_is_called_after_its_folder_and_a_missing_model_is_named(make_scene, tmp_path: Path) -> None:
+def test_a_scene_is_called_after_its_folder_and_a_missing_model_is_named(
+    make_scene, tmp_path: Path
+) -> None:
     assert SceneConfig(name=None, kind="photos", path=str(tmp_path / "my fern")).name == "my fern"
     assert SceneConfig(name=None, kind="photos", path="/").name == "scene"
-    assert missing_model("fern", tmp_path, None).startswith(f"scene fern: {tmp_path}: no COLMAP model in")
+    assert missing_model("fern", tmp_path, None).startswith(
+        f"scene fern: {tmp_path}: no COLMAP model in"
+    )
     root = make_scene(sparse="model")
     assert missing_model("fern", root, "model") == ""
-    assert missing_model("fern", root, "other").startswith(f"scene fern: {root / 'other'}: no COLMAP model here")
+    assert missing_model("fern", root, "other").startswith(
+        f"scene fern: {root / 'other'}: no COLMAP model here"
+    )
 
 
 def test_a_list_that_is_not_there_is_said_in_few_words(make_scene):
-    with pytest.raises(InputError, match=r"scene\.test_list: .*cannot be read \(No such file or directory\): name a"):
+    with pytest.raises(
+        InputError,
+        match=r"scene\.test_list: .*cannot be read \(No such file or directory\): name a",
+    ):
         read_colmap("toy", make_scene(), split=SplitRule(test_list="\\n"))

@@ -19,7 +19,10 @@ looking = partial(cameras.looking, size=(40, 30), focal=50.0)
 
 def ring(degrees: list[float], radius: float = 3.0) -> list[Camera]:
     angles = np.radians(degrees)
-    return [looking(np.array([radius * np.cos(a), radius * np.sin(a), 1.5]), np.zeros(3)) for a in angles]
+    return [
+        looking(np.array([radius * np.cos(a), radius * np.sin(a), 1.5]), np.zeros(3))
+        for a in angles
+    ]
 
 
 def turned(camera: Camera, rotation: np.ndarray, shift: np.ndarray, scale: float) -> Camera:
@@ -42,7 +45,9 @@ def is_cyclic_run(found: set[int], order: list[int]) -> bool:
 
 
 @given(st.integers(0, 99), st.integers(2, 6), st.booleans())
-def test_a_ring_is_cut_by_azimuth_whatever_its_names_and_gauge(seed: int, sectors: int, far: bool) -> None:
+def test_a_ring_is_cut_by_azimuth_whatever_its_names_and_gauge(
+    seed: int, sectors: int, far: bool
+) -> None:
     rng = np.random.default_rng(seed)
     degrees = list(rng.permutation(np.arange(24) * 15.0))
     rotation, shift = some_rotation(seed), np.array([5.0, -3.0, 2.0]) * (100 if far else 1)
@@ -51,14 +56,19 @@ def test_a_ring_is_cut_by_azimuth_whatever_its_names_and_gauge(seed: int, sector
     assert "surround" in found.description
     assert found.order[0] == 0, "a closed ring begins at the first camera"
     around = [int(index) for index in np.argsort(degrees)]
-    parts = [{found.order[place] for place in sector_range(24, part, sectors)} for part in range(sectors)]
+    parts = [
+        {found.order[place] for place in sector_range(24, part, sectors)} for part in range(sectors)
+    ]
     assert sorted(index for part in parts for index in part) == list(range(24))
     assert all(is_cyclic_run(part, around) for part in parts)
 
 
 def test_azimuths_do_not_depend_on_heights_and_are_rounded_to_a_millionth_of_a_degree() -> None:
     angles = np.radians([*range(0, 360, 20), -3e-7])
-    eyes = [np.array([3 * np.cos(a), 3 * np.sin(a), 1.0 + (k % 2) * (k < 18)]) for k, a in enumerate(angles)]
+    eyes = [
+        np.array([3 * np.cos(a), 3 * np.sin(a), 1.0 + (k % 2) * (k < 18)])
+        for k, a in enumerate(angles)
+    ]
     found = arrange_cameras([looking(eye, np.zeros(3)) for eye in eyes])
     assert found.order == (0, 18, *range(1, 18))
     assert "gaps up to 20 degrees" in found.description
@@ -66,9 +76,18 @@ def test_azimuths_do_not_depend_on_heights_and_are_rounded_to_a_millionth_of_a_d
 
 def test_an_open_ring_begins_after_its_gap() -> None:
     cameras = ring([100.0, 60.0, 20.0, 140.0, 180.0, 220.0, 260.0])  # nothing from 260 to 380
-    assert [round(np.degrees(np.arctan2(*cameras[k].center[1::-1])) % 360) for k in arrange_cameras(cameras).order] == [
-        20, 60, 100, 140, 180, 220, 260,
-    ]  # fmt: skip
+    assert [
+        round(np.degrees(np.arctan2(*cameras[k].center[1::-1])) % 360)
+        for k in arrange_cameras(cameras).order
+    ] == [
+        20,
+        60,
+        100,
+        140,
+        180,
+        220,
+        260,
+    ]
 
 
 def test_cameras_on_one_side_are_cut_by_planes_in_order() -> None:
@@ -88,7 +107,8 @@ def test_parallel_and_outward_looking_cameras_are_cut_by_planes() -> None:
         row = [looking(place, place + np.array([0.0, 5.0, 0.0])) for place in places]
         assert arrange_cameras(row).order == (3, 1, 0, 2, 4)
     outward = [
-        looking(camera.center, 2 * camera.center - [0, 0, 1.5]) for camera in ring([0.0, 90.0, 180.0, 270.0, 45.0])
+        looking(camera.center, 2 * camera.center - [0, 0, 1.5])
+        for camera in ring([0.0, 90.0, 180.0, 270.0, 45.0])
     ]
     assert "do not look at one place" in arrange_cameras(outward).description
 
@@ -103,7 +123,8 @@ def test_nine_of_ten_cameras_must_look_towards_the_centre() -> None:
 
 
 def test_a_first_camera_straight_above_has_no_azimuth_to_count_from() -> None:
-    """All directions in which it looks and their means are exact here, so that it is above to the last digit."""
+    """All directions in which it looks and their means are exact here, so that it is above to the
+    last digit."""
     around = np.array([[3.0, 0, 0], [0, 3, 0], [-3, 0, 0], [0, -3, 0]])
     level = [looking(place, np.zeros(3)) for place in around]
     above = np.array([[[1.0, 0, 0], [0, -1, 0], [0, 0, -1]], [[-1.0, 0, 0], [0, 1, 0], [0, 0, -1]]])
@@ -117,7 +138,8 @@ def test_an_exact_ring_is_cut_alike_whatever_the_last_digits_are() -> None:
     cameras = [ring_camera(k * 2 * np.pi / 48, 40, 30) for k in range(48)]
     noise = np.random.default_rng(0).normal(scale=1e-12, size=(48, 3))
     shaken = [
-        Camera(40, 30, 50, 50, 20, 15, c.rotation, c.translation + d) for c, d in zip(cameras, noise, strict=True)
+        Camera(40, 30, 50, 50, 20, 15, c.rotation, c.translation + d)
+        for c, d in zip(cameras, noise, strict=True)
     ]
     assert arrange_cameras(cameras).order == arrange_cameras(shaken).order == tuple(range(48))
 
@@ -143,5 +165,7 @@ def test_nearness_is_the_least_angle_and_the_least_distance() -> None:
         assert entry[DISTANCE] == pytest.approx(min(places) / 2.0)
     assert nearest_training_cameras(training, training, 2.0) == [{ANGLE: 0.0, DISTANCE: 0.0}] * 3
     assert nearest_training_cameras(test, training[:1], 0.0)[0].keys() == {ANGLE}
-    assert nearest_training_cameras(test, training, 0.5)[0][DISTANCE] == pytest.approx(4 * found[0][DISTANCE])
+    assert nearest_training_cameras(test, training, 0.5)[0][DISTANCE] == pytest.approx(
+        4 * found[0][DISTANCE]
+    )
     assert nearest_training_cameras([], training, 1.0) == []

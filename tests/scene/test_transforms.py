@@ -1,4 +1,5 @@
-"""transforms.json: cameras by the documented formulas, restated here; what is missing, damaged or not understood."""
+"""transforms.json: cameras by the documented formulas, restated here; what is missing, damaged or
+not understood."""
 
 from __future__ import annotations
 
@@ -26,7 +27,8 @@ SHARED = {"w": 40, "h": 30, "fl_x": 50.0, "fl_y": 51.0, "cx": 19.5, "cy": 15.5}
 
 
 def looking_at_origin(eye: np.ndarray) -> np.ndarray:
-    """Camera to world [4, 4] in OpenGL's axes: x right, y up, looking along -z; the world's up is z."""
+    """Camera to world [4, 4] in OpenGL's axes: x right, y up, looking along -z; the world's up is
+    z."""
     back = eye / np.linalg.norm(eye)
     right = np.cross([0.0, 0.0, 1.0], back)
     right /= np.linalg.norm(right)
@@ -38,14 +40,21 @@ def looking_at_origin(eye: np.ndarray) -> np.ndarray:
 EYES = [np.array([3 * math.cos(a), 3 * math.sin(a), 1.0]) for a in np.linspace(0, 5, 6)]
 
 
-def write(folder: Path, document: dict[str, Any] | None = None, name: str = "transforms.json", **changes: Any) -> Path:
+def write(
+    folder: Path,
+    document: dict[str, Any] | None = None,
+    name: str = "transforms.json",
+    **changes: Any,
+) -> Path:
     """A folder with six photographs and the file; ``changes`` are its further keys."""
     frames = []
     for k, eye in enumerate(EYES):
         path = folder / "images" / f"{k}.png"
         path.parent.mkdir(parents=True, exist_ok=True)
         Image.new("RGB", (40, 30), (40 * k, 100, 100)).save(path)
-        frames.append({"file_path": f"./images/{k}.png", "transform_matrix": looking_at_origin(eye).tolist()})
+        frames.append(
+            {"file_path": f"./images/{k}.png", "transform_matrix": looking_at_origin(eye).tolist()}
+        )
     whole = (SHARED | {"frames": frames} | changes) if document is None else document
     (folder / name).write_text(json.dumps(whole))
     return folder
@@ -66,7 +75,8 @@ def project(model: pycolmap.Reconstruction, name: str, point: np.ndarray) -> np.
 
 
 def test_a_point_falls_where_the_formulas_of_the_format_say(tmp_path: Path) -> None:
-    """In the camera's axes x right, y up, z towards the viewer: column cx + fl_x x/-z, row cy - fl_y y/-z."""
+    """In the camera's axes x right, y up, z towards the viewer: column cx + fl_x x/-z, row cy -
+    fl_y y/-z."""
     capture = capture_of(write(tmp_path / "in"), tmp_path / "made")
     model = read_model(capture.model)  # type: ignore[arg-type]
     for k, eye in enumerate(EYES):
@@ -75,7 +85,9 @@ def test_a_point_falls_where_the_formulas_of_the_format_say(tmp_path: Path) -> N
             wanted = [19.5 + 50 * x / -z, 15.5 - 51 * y / -z]
             np.testing.assert_allclose(project(model, f"images/{k}.png", point), wanted, atol=1e-9)
     above = project(model, "images/0.png", np.array([0, 0, 0.5]))
-    assert above[1] < project(model, "images/0.png", np.zeros(3))[1], "what is higher is further up in the picture"
+    assert above[1] < project(model, "images/0.png", np.zeros(3))[1], (
+        "what is higher is further up in the picture"
+    )
 
 
 def test_what_was_applied_is_undone_for_cameras_and_points(tmp_path: Path) -> None:
@@ -98,13 +110,18 @@ def test_what_was_applied_is_undone_for_cameras_and_points(tmp_path: Path) -> No
         ply_file_path="p.ply",
     )
     lines = [f"{x} {y} {z} 10 20 {k}" for k, (x, y, z) in enumerate(saved)]
-    header = "ply\nformat ascii 1.0\nelement vertex 5\n" + "".join(f"property double {c}\n" for c in "xyz")
+    header = "ply\nformat ascii 1.0\nelement vertex 5\n" + "".join(
+        f"property double {c}\n" for c in "xyz"
+    )
     header += "".join(f"property uchar {c}\n" for c in ("red", "green", "blue")) + "end_header\n"
     (folder / "p.ply").write_text(header + "\n".join(lines) + "\n")
     moved = capture_of(folder, tmp_path / "two")
     models = [read_model(capture.model) for capture in (plain, moved)]  # type: ignore[arg-type]
     for k in range(6):
-        one, other = (model.find_image_with_name(f"images/{k}.png").cam_from_world().matrix() for model in models)
+        one, other = (
+            model.find_image_with_name(f"images/{k}.png").cam_from_world().matrix()
+            for model in models
+        )
         np.testing.assert_allclose(one, other, atol=1e-9)
     cloud = read_cloud(moved.model)  # type: ignore[arg-type]
     np.testing.assert_allclose(cloud.points, points, atol=1e-9)
@@ -115,7 +132,11 @@ def test_what_was_applied_is_undone_for_cameras_and_points(tmp_path: Path) -> No
     ("said", "model", "params"),
     [
         ({}, "PINHOLE", [50, 51, 19.5, 15.5]),
-        ({"k1": 0.1, "k2": -0.02, "p1": 0.001, "p2": 0.002}, "OPENCV", [50, 51, 19.5, 15.5, 0.1, -0.02, 0.001, 0.002]),
+        (
+            {"k1": 0.1, "k2": -0.02, "p1": 0.001, "p2": 0.002},
+            "OPENCV",
+            [50, 51, 19.5, 15.5, 0.1, -0.02, 0.001, 0.002],
+        ),
         (
             {"camera_model": "OPENCV_FISHEYE", "k1": 0.1, "k2": 0.2, "k3": 0.3, "k4": 0.4},
             "OPENCV_FISHEYE",
@@ -140,7 +161,8 @@ def test_intrinsics_of_the_file_or_of_each_frame(tmp_path: Path, said, model, pa
 
 
 def test_blenders_angle_its_missing_extension_its_parts_and_its_alpha(tmp_path: Path) -> None:
-    """NeRF's synthetic scenes: focal = .5 w / tan(.5 angle), a centre in the middle, transforms_test.json held out."""
+    """NeRF's synthetic scenes: focal = .5 w / tan(.5 angle), a centre in the middle,
+    transforms_test.json held out."""
     angle = 0.6911112070083618
     for part, count in (("train", 5), ("test", 3), ("val", 2)):
         frames = []
@@ -153,17 +175,25 @@ def test_blenders_angle_its_missing_extension_its_parts_and_its_alpha(tmp_path: 
             pixels[21, 24] = (10 * count, 10 * k, 0, 255)  # no photograph twice
             Image.fromarray(pixels).save(path)
             matrix = looking_at_origin(EYES[k]).tolist()
-            frames.append({"file_path": f"./{part}/r_{k}", "rotation": 0.01, "transform_matrix": matrix})
-        (tmp_path / f"transforms_{part}.json").write_text(json.dumps({"camera_angle_x": angle, "frames": frames}))
+            frames.append(
+                {"file_path": f"./{part}/r_{k}", "rotation": 0.01, "transform_matrix": matrix}
+            )
+        (tmp_path / f"transforms_{part}.json").write_text(
+            json.dumps({"camera_angle_x": angle, "frames": frames})
+        )
     capture = capture_of(tmp_path, tmp_path / "made", split="list")
     assert capture.test_names == tuple(f"test/r_{k}.png" for k in range(3))
     assert capture.train_names == tuple(f"train/r_{k}.png" for k in range(5))
     camera = read_transforms(tmp_path).images["train/r_0.png"][0]
     assert camera.params == pytest.approx((0.5 * 40 / math.tan(0.5 * angle),) * 2 + (20, 20))
-    assert capture_of(tmp_path, tmp_path / "every").test_names == ("test/r_0.png",)  # the rule, not the files
+    # the rule, not the files
+    assert capture_of(tmp_path, tmp_path / "every").test_names == ("test/r_0.png",)
     assert not any(name.startswith("val/") for name in read_transforms(tmp_path).images)
     (tmp_path / "transforms_test.json").unlink()
-    assert read_transforms(tmp_path).split == ([f"train/r_{k}.png" for k in range(5)], ["val/r_0.png", "val/r_1.png"])
+    assert read_transforms(tmp_path).split == (
+        [f"train/r_{k}.png" for k in range(5)],
+        ["val/r_0.png", "val/r_1.png"],
+    )
     from gsbench.pipeline.steps.scene import masked_capture, masking_step
 
     assert masking_step(capture, "black") is None
@@ -208,20 +238,44 @@ def test_the_file_is_among_what_a_trial_is_made_of(tmp_path: Path) -> None:
     [
         (lambda d: d.pop("frames"), "lacks 'frames'"),
         (lambda d: d["frames"][1].pop("transform_matrix"), "lacks 'frames.1.transform_matrix'"),
-        (lambda d: d["frames"][1].update(transform_matrix=[[1, 0, 0, 0]]), r"frames\.1\.transform_matrix is "),
-        (lambda d: d["frames"][1]["transform_matrix"][0].pop(), r"frames\.1\.transform_matrix\.0 is "),
-        (lambda d: d["frames"][1]["transform_matrix"][0].append(0), r"frames\.1\.transform_matrix\.0 is "),
-        (lambda d: d["frames"][1]["transform_matrix"].append([0] * 4), r"frames\.1\.transform_matrix is "),
-        (lambda d: d["frames"][1]["transform_matrix"].__setitem__(0, [2, 0, 0, 0]), "scales, shears or mirrors"),
-        (lambda d: d["frames"][1]["transform_matrix"].__setitem__(2, [0.0] * 4), "scales, shears or mirrors"),
+        (
+            lambda d: d["frames"][1].update(transform_matrix=[[1, 0, 0, 0]]),
+            r"frames\.1\.transform_matrix is ",
+        ),
+        (
+            lambda d: d["frames"][1]["transform_matrix"][0].pop(),
+            r"frames\.1\.transform_matrix\.0 is ",
+        ),
+        (
+            lambda d: d["frames"][1]["transform_matrix"][0].append(0),
+            r"frames\.1\.transform_matrix\.0 is ",
+        ),
+        (
+            lambda d: d["frames"][1]["transform_matrix"].append([0] * 4),
+            r"frames\.1\.transform_matrix is ",
+        ),
+        (
+            lambda d: d["frames"][1]["transform_matrix"].__setitem__(0, [2, 0, 0, 0]),
+            "scales, shears or mirrors",
+        ),
+        (
+            lambda d: d["frames"][1]["transform_matrix"].__setitem__(2, [0.0] * 4),
+            "scales, shears or mirrors",
+        ),
         (
             lambda d: d.update(applied_transform=[[1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 1, 0]]),
             "applied_transform .*mirrors",
         ),
         (lambda d: d.update(applied_scale=0), "applied_scale must be positive"),
-        (lambda d: d.update(camera_model="EQUIRECTANGULAR"), "camera_model EQUIRECTANGULAR is not known here"),
+        (
+            lambda d: d.update(camera_model="EQUIRECTANGULAR"),
+            "camera_model EQUIRECTANGULAR is not known here",
+        ),
         *(
-            (lambda d, key=key: d.update({key: 0.1}), "k4, k5 and k6 are read of OPENCV_FISHEYE and FULL_OPENCV alone")
+            (
+                lambda d, key=key: d.update({key: 0.1}),
+                "k4, k5 and k6 are read of OPENCV_FISHEYE and FULL_OPENCV alone",
+            )
             for key in ("k4", "k5", "k6")
         ),
         (lambda d: d.update(is_fisheye=True, p1=0.1), "OPENCV_FISHEYE has k1 to k4 alone"),
@@ -233,9 +287,18 @@ def test_the_file_is_among_what_a_trial_is_made_of(tmp_path: Path) -> None:
             for key in REFUSED
             for value in ([0.0, 0.5],)
         ),
-        (lambda d: d["frames"][2].update(rolling_shutter=[0, 0, 0.1, 0]), r"rolling_shutter \(frame 2\): "),
-        (lambda d: d.update(train_filenames=["images/1.png"], test_filenames=["images/9.png"]), "held-out filenames"),
-        (lambda d: d.update(train_filenames=["images/1.png"], val_filenames=["images/1.png"]), "trained and tested on"),
+        (
+            lambda d: d["frames"][2].update(rolling_shutter=[0, 0, 0.1, 0]),
+            r"rolling_shutter \(frame 2\): ",
+        ),
+        (
+            lambda d: d.update(train_filenames=["images/1.png"], test_filenames=["images/9.png"]),
+            "held-out filenames",
+        ),
+        (
+            lambda d: d.update(train_filenames=["images/1.png"], val_filenames=["images/1.png"]),
+            "trained and tested on",
+        ),
         (lambda d: (d.pop("fl_x"), d.update(camera_angle_x=4.0)), "no focal length"),
         (lambda d: (d.pop("fl_x"), d.update(camera_angle_x=0)), "no focal length"),
         (lambda d: d.update(fl_x=0), "no focal length"),
@@ -246,10 +309,15 @@ def test_the_file_is_among_what_a_trial_is_made_of(tmp_path: Path) -> None:
         (lambda d: d["frames"][1].update(file_path="/etc/passwd"), "lies outside the folder"),
         (lambda d: d.update(ply_file_path="/etc/passwd"), "lies outside the folder"),
         (lambda d: d.update(ply_file_path="p.ply"), "names p.ply, which is not there"),
-        (lambda d: d["frames"][1].update(file_path="images/0.png"), r"images/0\.png is there twice"),
+        (
+            lambda d: d["frames"][1].update(file_path="images/0.png"),
+            r"images/0\.png is there twice",
+        ),
     ],
 )
-def test_what_cannot_be_understood_is_one_line_that_names_the_file(tmp_path: Path, change, said) -> None:
+def test_what_cannot_be_understood_is_one_line_that_names_the_file(
+    tmp_path: Path, change, said
+) -> None:
     folder = write(tmp_path / "in")
     document = json.loads((folder / "transforms.json").read_text())
     change(document)
@@ -271,18 +339,24 @@ def test_a_line_of_pixels_is_a_picture(tmp_path: Path) -> None:
 
 
 def test_no_file_and_a_name_without_a_decision(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"neither transforms\.json nor transforms_train\.json is here"):
+    with pytest.raises(
+        InputError, match=r"neither transforms\.json nor transforms_train\.json is here"
+    ):
         read_transforms(tmp_path)
     folder = write(tmp_path / "in")
     Image.new("RGB", (40, 30)).save(folder / "images" / "0.jpg")
     document = json.loads((folder / "transforms.json").read_text())
     document["frames"][0]["file_path"] = "images/0"
     (folder / "transforms.json").write_text(json.dumps(document))
-    with pytest.raises(InputError, match=r"images/0 may be images/0\.jpg or images/0\.png: keep one"):
+    with pytest.raises(
+        InputError, match=r"images/0 may be images/0\.jpg or images/0\.png: keep one"
+    ):
         read_transforms(folder)
 
 
-def test_images_without_a_file_are_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_images_without_a_file_are_left_out(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     folder = write(tmp_path / "in")
     (folder / "images" / "4.png").unlink()
     assert len(read_transforms(folder).images) == 5
@@ -290,7 +364,9 @@ def test_images_without_a_file_are_left_out(tmp_path: Path, caplog: pytest.LogCa
 
 
 def test_the_file_is_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    source = CaptureSource(SceneConfig(name="t", kind="transforms", path=str(write(tmp_path / "in"))))
+    source = CaptureSource(
+        SceneConfig(name="t", kind="transforms", path=str(write(tmp_path / "in")))
+    )
     read, files = transforms.read_bytes, []
     monkeypatch.setattr(transforms, "read_bytes", lambda path: files.append(path) or read(path))
     assert source.step is not None
@@ -311,15 +387,23 @@ def focal(side: float, degrees: float) -> float:
         ({"x_fov": 70.0, "y_fov": 50.0}, focal(40, 70), focal(30, 50)),
         ({"camera_angle_x": 1.2}, focal(40, math.degrees(1.2)), focal(40, math.degrees(1.2))),
         ({"camera_angle_y": 0.9}, focal(30, math.degrees(0.9)), focal(30, math.degrees(0.9))),
-        ({"camera_angle_x": 1.2, "camera_angle_y": 0.9}, focal(40, math.degrees(1.2)), focal(30, math.degrees(0.9))),
+        (
+            {"camera_angle_x": 1.2, "camera_angle_y": 0.9},
+            focal(40, math.degrees(1.2)),
+            focal(30, math.degrees(0.9)),
+        ),
         ({"fl_y": 51.0}, 51.0, 51.0),
         ({"fl_x": 50.0, "camera_angle_y": 0.9}, 50.0, focal(30, math.degrees(0.9))),
         ({"fl_x": 50.0, "fl_y": 51.0, "x_fov": 70.0, "camera_angle_y": 0.9}, 50.0, 51.0),
     ],
 )
 @pytest.mark.parametrize("of_each_frame", [False, True])
-def test_every_way_to_give_a_field_of_view(tmp_path: Path, said, focal_x, focal_y, of_each_frame: bool) -> None:
-    folder = write(tmp_path / "in", **({"fl_x": None, "fl_y": None} | ({} if of_each_frame else said)))
+def test_every_way_to_give_a_field_of_view(
+    tmp_path: Path, said, focal_x, focal_y, of_each_frame: bool
+) -> None:
+    folder = write(
+        tmp_path / "in", **({"fl_x": None, "fl_y": None} | ({} if of_each_frame else said))
+    )
     if of_each_frame:
         document = json.loads((folder / "transforms.json").read_text())
         document["frames"] = [frame | said for frame in document["frames"]]
@@ -328,17 +412,24 @@ def test_every_way_to_give_a_field_of_view(tmp_path: Path, said, focal_x, focal_
         assert camera.params[:2] == pytest.approx((focal_x, focal_y))
 
 
-@pytest.mark.parametrize("said", [{"k3": 0.05}, {"camera_model": "FULL_OPENCV", "k3": 0.05, "k4": 0.02, "k6": 0.01}])
+@pytest.mark.parametrize(
+    "said", [{"k3": 0.05}, {"camera_model": "FULL_OPENCV", "k3": 0.05, "k4": 0.02, "k6": 0.01}]
+)
 def test_higher_coefficients_distort_as_in_opencv(tmp_path: Path, said: dict[str, Any]) -> None:
-    """OpenCV's documented formula: (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6)."""
+    """OpenCV's documented formula: (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6
+    r^6)."""
     capture = capture_of(write(tmp_path / "in", k1=0.1, k2=-0.02, **said), tmp_path / "made")
     model = read_model(capture.model)  # type: ignore[arg-type]
     k = {key: said.get(key, 0.0) for key in ("k3", "k4", "k6")}
     for x, y in ((0.3, -0.2), (-0.6, 0.5)):
         r2 = x * x + y * y
-        factor = (1 + 0.1 * r2 - 0.02 * r2**2 + k["k3"] * r2**3) / (1 + k["k4"] * r2 + k["k6"] * r2**3)
+        factor = (1 + 0.1 * r2 - 0.02 * r2**2 + k["k3"] * r2**3) / (
+            1 + k["k4"] * r2 + k["k6"] * r2**3
+        )
         seen = next(iter(model.cameras.values())).img_from_cam(np.array([x, y, 1.0]))
-        np.testing.assert_allclose(seen, [19.5 + 50 * x * factor, 15.5 + 51 * y * factor], atol=1e-9)
+        np.testing.assert_allclose(
+            seen, [19.5 + 50 * x * factor, 15.5 + 51 * y * factor], atol=1e-9
+        )
 
 
 @pytest.mark.parametrize("key", sorted(HARMLESS | set(REFUSED)))
@@ -347,7 +438,9 @@ def test_what_says_nothing_changes_nothing_in_silence(tmp_path: Path, key: str, 
     values = (None,) if key.startswith("transform_matrix") else (None, 0, False, [0.0, 0.0])
     for value in (*values, *([1.5, "text", [1.0]] if key in HARMLESS else [])):
         found = read_transforms(write(tmp_path / "in", **{key: value})).images
-        assert [camera for camera, *_ in found.values()] == [camera for camera, *_ in wanted.values()]
+        assert [camera for camera, *_ in found.values()] == [
+            camera for camera, *_ in wanted.values()
+        ]
     assert not caplog.text
 
 
@@ -365,12 +458,18 @@ def test_unknown_keys_are_named_in_one_line(tmp_path: Path, caplog) -> None:
 @pytest.mark.parametrize(
     ("lists", "train", "test"),
     [
-        ({"train_filenames": [0, 1, 2], "val_filenames": [3], "test_filenames": [4, 5]}, (0, 1, 2), (4, 5)),
+        (
+            {"train_filenames": [0, 1, 2], "val_filenames": [3], "test_filenames": [4, 5]},
+            (0, 1, 2),
+            (4, 5),
+        ),
         ({"train_filenames": [0, 1, 2], "val_filenames": [3]}, (0, 1, 2), (3,)),
         ({"test_filenames": [4]}, (0, 1, 2, 3, 5), (4,)),
     ],
 )
-def test_nerfstudios_lists_of_names_are_the_split(tmp_path: Path, lists, train, test, caplog) -> None:
+def test_nerfstudios_lists_of_names_are_the_split(
+    tmp_path: Path, lists, train, test, caplog
+) -> None:
     named = {key: [f"./images/{k}.png" for k in numbers] for key, numbers in lists.items()}
     folder = write(tmp_path / "in", **named)
     capture = capture_of(folder, tmp_path / "made", split="list")
@@ -397,5 +496,7 @@ def test_byte_order_marks(tmp_path: Path) -> None:
     assert len(read_transforms(folder).images) == 6
     for encoding in ("utf-16", "utf-32"):
         (folder / "transforms.json").write_text(text, encoding=encoding)
-        with pytest.raises(InputError, match=r"json cannot be read: it is UTF-16 or UTF-32: save it as UTF-8"):
+        with pytest.raises(
+            InputError, match=r"json cannot be read: it is UTF-16 or UTF-32: save it as UTF-8"
+        ):
             read_transforms(folder)

@@ -26,14 +26,17 @@ from tests.train.conftest import orbit_camera
     ("names", "wanted", "left_out"),
     [
         (["a.jpg", "a.png", "b.jpg"], (), {"a.png": "a.jpg"}),
-        (["a.jpg", "a.png", "b.png"], (), {"a.jpg": "a.png"}),  # the format that more photographs have
+        # the format that more photographs have
+        (["a.jpg", "a.png", "b.png"], (), {"a.jpg": "a.png"}),
         (["a.JPEG", "a.png", "b.png", "c.JPG", "c.tif"], (), {"a.png": "a.JPEG", "c.tif": "c.JPG"}),
         (["a.jpg", "a.png", "b.jpg"], {"a.png"}, {"a.jpg": "a.png"}),
         (["1/a.jpg", "2/a.png"], (), {}),
         (["a.jpg", "a.v2.jpg"], (), {}),
     ],
 )
-def test_of_photographs_with_one_name_one_is_used(names: list[str], wanted: set[str], left_out: dict[str, str]) -> None:
+def test_of_photographs_with_one_name_one_is_used(
+    names: list[str], wanted: set[str], left_out: dict[str, str]
+) -> None:
     assert copies_by_name(names, wanted) == left_out
 
 
@@ -56,10 +59,13 @@ def test_a_folder_with_every_photograph_in_two_formats_is_read_once(
     assert (capture.fingerprint, alone.left_out) == (alone.fingerprint, {})
 
 
-def test_a_training_file_with_the_content_of_a_test_view_is_left_out(make_scene: Callable[..., Path]) -> None:
+def test_a_training_file_with_the_content_of_a_test_view_is_left_out(
+    make_scene: Callable[..., Path],
+) -> None:
     root = make_scene()
     shutil.copy(root / "images/00.png", root / "images/03.png")  # 00.png is the test view
-    shutil.copy(root / "images/04.png", root / "images/05.png")  # copies within training are the user's choice
+    # copies within training are the user's choice
+    shutil.copy(root / "images/04.png", root / "images/05.png")
     capture = read_colmap("toy", root)
     assert capture.test_names == ("00.png",)
     assert capture.train_names == ("01.png", "02.png", "04.png", "05.png")
@@ -71,7 +77,9 @@ def test_copies_across_lists_are_found(make_scene: Callable[..., Path]) -> None:
     shutil.copy(root / "images/02.png", root / "images/05.png")
     (root / "train.txt").write_text("00.png\n01.png\n05.png\n")
     (root / "test.txt").write_text("02.png\n03.png\n")
-    capture = read_colmap("toy", root, split=SplitRule("list", train_list="train.txt", test_list="test.txt"))
+    capture = read_colmap(
+        "toy", root, split=SplitRule("list", train_list="train.txt", test_list="test.txt")
+    )
     assert (capture.train_names, capture.left_out) == (("00.png", "01.png"), {"05.png": "02.png"})
 
 
@@ -104,10 +112,20 @@ def scene_of(test: np.ndarray, other: np.ndarray, mask: np.ndarray | None = None
         (lambda image: image[:, ::-1].copy(), False, False),
         (lambda image: picture(77), False, False),
     ],
-    ids=["equal", "encoded again", "next of a burst", "another exposure", "mirrored", "another place"],
+    ids=[
+        "equal",
+        "encoded again",
+        "next of a burst",
+        "another exposure",
+        "mirrored",
+        "another place",
+    ],
 )
 def test_equal_pixels_are_left_out_and_near_twins_are_reported(
-    caplog: pytest.LogCaptureFixture, change: Callable[[np.ndarray], np.ndarray], left_out: bool, is_near: bool
+    caplog: pytest.LogCaptureFixture,
+    change: Callable[[np.ndarray], np.ndarray],
+    left_out: bool,
+    is_near: bool,
 ) -> None:
     scene = without_copies(scene_of(picture(0), change(picture(0))))
     assert len(scene.train) == (3 if left_out else 4)
@@ -135,7 +153,10 @@ def test_a_split_without_training_views_of_its_own_is_refused() -> None:
 def test_flat_pictures_are_twins_only_if_they_are_equal(caplog: pytest.LogCaptureFixture) -> None:
     grey = np.full((128, 160, 3), 100, dtype=np.uint8)
     with caplog.at_level(logging.WARNING):
-        assert without_copies(scene_of(grey, grey + 1)).twins == without_copies(scene_of(picture(0), picture(5))).twins
+        assert (
+            without_copies(scene_of(grey, grey + 1)).twins
+            == without_copies(scene_of(picture(0), picture(5))).twins
+        )
         assert without_copies(scene_of(grey, grey)).twins.left_out == {"twin.png": "0.png"}
 
 

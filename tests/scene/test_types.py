@@ -19,9 +19,21 @@ SOUND: dict[str, Any] = {
 @pytest.mark.parametrize(
     ("name", "value"),
     [
-        *[("width", 0), ("height", 0), ("fx", 0.0), ("fy", 0.0), ("fx", -1.0), ("fy", np.inf), ("fx", np.nan)],
+        *[
+            ("width", 0),
+            ("height", 0),
+            ("fx", 0.0),
+            ("fy", 0.0),
+            ("fx", -1.0),
+            ("fy", np.inf),
+            ("fx", np.nan),
+        ],
         *[("cx", np.inf), ("cy", np.nan)],
-        *[("rotation", 1.01 * np.eye(3)), ("rotation", np.eye(4)), ("rotation", np.full((3, 3), np.nan))],
+        *[
+            ("rotation", 1.01 * np.eye(3)),
+            ("rotation", np.eye(4)),
+            ("rotation", np.full((3, 3), np.nan)),
+        ],
         *[("translation", np.zeros(2)), ("translation", np.array([0.0, np.nan, 0.0]))],
     ],
 )
@@ -32,13 +44,18 @@ def test_only_what_is_no_camera_is_refused(name: str, value: object) -> None:
 
 
 def test_numbers_of_any_type_become_float64() -> None:
-    camera = Camera(**(SOUND | {"rotation": [[0, -1, 0], [1, 0, 0], [0, 0, 1]], "translation": [1, 2, 3]}))
+    camera = Camera(
+        **(SOUND | {"rotation": [[0, -1, 0], [1, 0, 0], [0, 0, 1]], "translation": [1, 2, 3]})
+    )
     assert camera.rotation.dtype == camera.translation.dtype == np.float64
     assert camera.center.tolist() == [-2, 1, -3]
 
 
 def test_a_camera_of_one_focal_length_has_it_on_both_sides() -> None:
-    for model, params in (("SIMPLE_PINHOLE", (50.0, 20.0, 15.0)), ("PINHOLE", (50.0, 50.0, 20.0, 15.0))):
+    for model, params in (
+        ("SIMPLE_PINHOLE", (50.0, 20.0, 15.0)),
+        ("PINHOLE", (50.0, 50.0, 20.0, 15.0)),
+    ):
         camera = to_pinhole(CameraModel(model, 40, 30, params))
         assert (camera.fx, camera.fy, camera.cx, camera.cy) == (50.0, 50.0, 20.0, 15.0)
         assert (camera.width, camera.height) == (40, 30)

@@ -1,4 +1,5 @@
-"""A sweep in a real Slurm: out of time, requeued by hand, queued twice; it ends as an undisturbed one.
+"""A sweep in a real Slurm: out of time, requeued by hand, queued twice; it ends as an undisturbed
+one.
 
 Needs a running Slurm: ``scripts/slurm_one_node.sh start`` sets one up on this machine.
 """
@@ -40,8 +41,19 @@ class Broken(ADC):
             raise RuntimeError("it is broken")
         return super().refine(step, gaussians, rng)
 """
-PAUSE = 0.2  # seconds an iteration: with 300 of them a trial does not fit into Slurm's shortest time limit, a minute
-SWEEP = ["--config-dir", "conf", "-m", *SMALL, "name=cluster", "densify=slow", "allow_targets=[slow]", "tracking=none"]
+# seconds an iteration: with 300 of them a trial does not fit into Slurm's shortest time limit, a
+# minute
+PAUSE = 0.2
+SWEEP = [
+    "--config-dir",
+    "conf",
+    "-m",
+    *SMALL,
+    "name=cluster",
+    "densify=slow",
+    "allow_targets=[slow]",
+    "tracking=none",
+]
 CLUSTER = [
     "launch=slurm",
     "launch.timeout_min=1",
@@ -55,7 +67,9 @@ CLUSTER = [
 @pytest.fixture(scope="session", autouse=True)
 def slurm() -> None:
     if shutil.which("sinfo") is None:
-        pytest.skip("no Slurm here: scripts/slurm_one_node.sh start (root, Debian or Ubuntu) sets one up")
+        pytest.skip(
+            "no Slurm here: scripts/slurm_one_node.sh start (root, Debian or Ubuntu) sets one up"
+        )
     try:
         states = subprocess.run(
             ["sinfo", "-h", "-o", "%T"], capture_output=True, text=True, timeout=120, check=True
@@ -76,16 +90,25 @@ def place(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def start(place: Path, environment: dict[str, str], runs: Path, *words: str, pause: float = 0) -> subprocess.Popen[str]:
+def start(
+    place: Path, environment: dict[str, str], runs: Path, *words: str, pause: float = 0
+) -> subprocess.Popen[str]:
     variables = environment | {"GSBENCH_RUNS": str(runs), "PAUSE": str(pause)}
     command = [sys.executable, "-m", "gsbench.cli", *words]
     return subprocess.Popen(
-        command, cwd=place, env=variables, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+        command,
+        cwd=place,
+        env=variables,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
     )
 
 
 def models(runs: Path) -> dict[str, bytes]:
-    return {path.parent.name: path.read_bytes() for path in runs.glob("cluster/*/*/*/point_cloud.ply")}
+    return {
+        path.parent.name: path.read_bytes() for path in runs.glob("cluster/*/*/*/point_cloud.ply")
+    }
 
 
 def job_logs(runs: Path) -> str:
@@ -93,11 +116,15 @@ def job_logs(runs: Path) -> str:
 
 
 def queue() -> list[str]:
-    listing = subprocess.run(["squeue", "--me", "-h", "-r", "-o", "%i"], capture_output=True, text=True, check=True)
+    listing = subprocess.run(
+        ["squeue", "--me", "-h", "-r", "-o", "%i"], capture_output=True, text=True, check=True
+    )
     return listing.stdout.split()
 
 
-def test_sweep_runs_out_of_time_is_requeued_and_ends_as_undisturbed(place: Path, environment: dict[str, str]) -> None:
+def test_sweep_runs_out_of_time_is_requeued_and_ends_as_undisturbed(
+    place: Path, environment: dict[str, str]
+) -> None:
     whole = start(place, environment, place / "whole", *SWEEP, "seed=0,1")
     output, _ = whole.communicate(timeout=300)
     assert whole.returncode == 0, output
@@ -105,12 +132,16 @@ def test_sweep_runs_out_of_time_is_requeued_and_ends_as_undisturbed(place: Path,
     runs = place / "runs"
     first = start(place, environment, runs, *SWEEP, "seed=0,1", *CLUSTER, pause=PAUSE)
     deadline = time.monotonic() + 120
-    while len(list(runs.glob("store/train/.*.partial/metrics.jsonl"))) < 2 and time.monotonic() < deadline:
+    while (
+        len(list(runs.glob("store/train/.*.partial/metrics.jsonl"))) < 2
+        and time.monotonic() < deadline
+    ):
         time.sleep(0.2)
     queued = queue()
     assert len(queued) == 2
     time.sleep(3)
-    subprocess.run(["scontrol", "requeue", queued[0]], check=True)  # as a preemption does: SIGTERM, then the queue
+    # as a preemption does: SIGTERM, then the queue
+    subprocess.run(["scontrol", "requeue", queued[0]], check=True)
     first.send_signal(signal.SIGINT)
     output, _ = first.communicate(timeout=120)
     assert first.returncode == 130
@@ -126,7 +157,9 @@ def test_sweep_runs_out_of_time_is_requeued_and_ends_as_undisturbed(place: Path,
     assert not set(queue()) & set(queued)
     assert sorted(models(runs)) == sorted(models(place / "whole"))
     assert models(runs) == models(place / "whole")
-    assert len(list(runs.glob(".jobs/cluster/*_submission.sh"))) == 1, "the trials were submitted a second time"
+    assert len(list(runs.glob(".jobs/cluster/*_submission.sh"))) == 1, (
+        "the trials were submitted a second time"
+    )
     assert "Requeued job" in logs
     assert logs.count("stopping at iteration") >= 2, logs
     assert logs.count("going on from iteration") >= 2, logs
@@ -138,13 +171,18 @@ def gsbench(
     """The program, to its end, with its own sayings on stdout and log lines on stderr."""
     variables = environment | {"GSBENCH_RUNS": str(place / "runs"), "PAUSE": str(pause)}
     command = [sys.executable, "-m", "gsbench.cli", *words]
-    return subprocess.run(command, cwd=place, env=variables, capture_output=True, text=True, timeout=240, check=False)
+    return subprocess.run(
+        command, cwd=place, env=variables, capture_output=True, text=True, timeout=240, check=False
+    )
 
 
 def states(place: Path, environment: dict[str, str]) -> dict[str, str]:
     """What ``gsbench status`` says of each arm."""
     listing = json.loads(gsbench(place, environment, "status", "cluster", "--json").stdout)
-    return {Path(trial["folder"]).parent.name.removeprefix("random-"): trial["state"] for trial in listing}
+    return {
+        Path(trial["folder"]).parent.name.removeprefix("random-"): trial["state"]
+        for trial in listing
+    }
 
 
 def wait_for_states(place: Path, environment: dict[str, str], **wanted: str) -> None:
@@ -154,9 +192,18 @@ def wait_for_states(place: Path, environment: dict[str, str], **wanted: str) -> 
         time.sleep(1)
 
 
-def test_submitted_and_left_status_and_retry_do_the_rest(place: Path, environment: dict[str, str]) -> None:
+def test_submitted_and_left_status_and_retry_do_the_rest(
+    place: Path, environment: dict[str, str]
+) -> None:
     (place / "broken").touch()
-    sweep = [*SWEEP, "densify=slow,broken", *CLUSTER, "launch.timeout_min=10", "launch.parallel=1", "launch.wait=false"]
+    sweep = [
+        *SWEEP,
+        "densify=slow,broken",
+        *CLUSTER,
+        "launch.timeout_min=10",
+        "launch.parallel=1",
+        "launch.wait=false",
+    ]
 
     first = gsbench(place, environment, *sweep, pause=PAUSE)
     assert first.returncode == 0, first.stderr
@@ -168,11 +215,15 @@ def test_submitted_and_left_status_and_retry_do_the_rest(place: Path, environmen
     assert listing.returncode == 0
     assert f"Slurm job {array}_1, pending (" in listing.stdout
     assert "nothing to retry" in gsbench(place, environment, "retry", "cluster").stdout
-    assert "2 trials: 1 running, 1 queued" in gsbench(place, environment, *sweep, "--dry-run").stdout
+    assert (
+        "2 trials: 1 running, 1 queued" in gsbench(place, environment, *sweep, "--dry-run").stdout
+    )
 
     second = gsbench(place, environment, *sweep, pause=PAUSE)
     assert (second.returncode, second.stdout) == (0, first.stdout), second.stderr
-    assert len(list(place.glob("runs/.jobs/cluster/*_submission.sh"))) == 1, "the trials were submitted a second time"
+    assert len(list(place.glob("runs/.jobs/cluster/*_submission.sh"))) == 1, (
+        "the trials were submitted a second time"
+    )
 
     wait_for_states(place, environment, slow="done", broken="failed")
     listing = gsbench(place, environment, "status", "cluster")
@@ -187,7 +238,9 @@ def test_submitted_and_left_status_and_retry_do_the_rest(place: Path, environmen
     assert not list(place.glob("runs/cluster/*/*/*/.submitted.json"))
 
 
-def test_job_that_was_cancelled_is_missing_and_can_be_run_elsewhere(place: Path, environment: dict[str, str]) -> None:
+def test_job_that_was_cancelled_is_missing_and_can_be_run_elsewhere(
+    place: Path, environment: dict[str, str]
+) -> None:
     later = [*CLUSTER, "launch.wait=false", "launch.sbatch={begin: now+1hour}"]
     done = gsbench(place, environment, *SWEEP, *later)
     assert done.returncode == 0, done.stderr
@@ -195,7 +248,10 @@ def test_job_that_was_cancelled_is_missing_and_can_be_run_elsewhere(place: Path,
     assert states(place, environment) == {"slow": "queued"}
     subprocess.run(["scancel", job], check=True)
     wait_for_states(place, environment, slow="missing")
-    assert f"Slurm job {job} has ended, log: " in gsbench(place, environment, "status", "cluster").stdout
+    assert (
+        f"Slurm job {job} has ended, log: "
+        in gsbench(place, environment, "status", "cluster").stdout
+    )
     words = ["launch=serial", "allow_targets=[slow]"]  # which knows no launch.wait
     again = gsbench(place, environment, "retry", "cluster", *words)
     assert again.returncode == 0, again.stderr
@@ -204,15 +260,21 @@ def test_job_that_was_cancelled_is_missing_and_can_be_run_elsewhere(place: Path,
 
 def test_failed_trial_and_killed_job_are_reported(place: Path, environment: dict[str, str]) -> None:
     runs = place / "runs"
-    slow = start(place, environment, runs, *SWEEP, "seed=0", *CLUSTER, "launch.timeout_min=10", pause=PAUSE)
+    slow = start(
+        place, environment, runs, *SWEEP, "seed=0", *CLUSTER, "launch.timeout_min=10", pause=PAUSE
+    )
     bad = start(place, environment, runs, *SWEEP, "seed=1,2", "densify.split_size=-1", *CLUSTER)
     output, _ = bad.communicate(timeout=120)
     assert bad.returncode == 2, output
     assert "densify.split_size" in output
     deadline = time.monotonic() + 120
-    while not list(runs.glob("store/train/.*.partial/metrics.jsonl")) and time.monotonic() < deadline:
+    while (
+        not list(runs.glob("store/train/.*.partial/metrics.jsonl")) and time.monotonic() < deadline
+    ):
         time.sleep(0.2)
-    (folder,) = [path.parent for path in runs.glob("cluster/*/*/*/.submitted.json") if "seed0" in str(path)]
+    (folder,) = [
+        path.parent for path in runs.glob("cluster/*/*/*/.submitted.json") if "seed0" in str(path)
+    ]
     job = json.loads((folder / ".submitted.json").read_text())["job"]
     holder = json.loads((folder / ".lock.holder").read_text())
     status = subprocess.run(

@@ -13,7 +13,8 @@ from gsbench.system.device import free_bytes, select_device
 
 @pytest.fixture
 def rounding() -> Iterator[None]:
-    """TF32 allowed, as torch allows it to convolutions by default; the process's settings come back afterwards."""
+    """TF32 allowed, as torch allows it to convolutions by default; the process's settings come back
+    afterwards."""
     backends = (torch.backends.cudnn, torch.backends.cuda.matmul)
     before = [backend.allow_tf32 for backend in backends]
     for backend in backends:
@@ -56,7 +57,9 @@ def test_what_torch_has_reserved_and_does_not_use_is_free(monkeypatch: pytest.Mo
 
 
 @pytest.mark.parametrize("name", ["auto", "cuda", "cuda:1"])
-def test_no_gpu_rounds_float32_to_tf32(rounding: None, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_gpu_rounds_float32_to_tf32(
+    rounding: None, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     select_device("cpu")
     assert torch.backends.cudnn.allow_tf32
     pretend(monkeypatch, 2)
@@ -65,13 +68,20 @@ def test_no_gpu_rounds_float32_to_tf32(rounding: None, name: str, monkeypatch: p
     assert not torch.backends.cuda.matmul.allow_tf32
 
 
-def test_a_gpu_that_another_program_holds_is_named(rounding: None, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_gpu_that_another_program_holds_is_named(
+    rounding: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def held(device: torch.device) -> None:
-        raise RuntimeError("CUDA error: all CUDA-capable devices are busy or unavailable\nCUDA kernel errors might ...")
+        raise RuntimeError(
+            "CUDA error: all CUDA-capable devices are busy or unavailable\nCUDA kernel errors "
+            "might ..."
+        )
 
     pretend(monkeypatch, 1)
     monkeypatch.setattr(torch.cuda, "mem_get_info", held)
-    with pytest.raises(InputError, match=r"device=auto: CUDA error: .* unavailable; does another program hold"):
+    with pytest.raises(
+        InputError, match=r"device=auto: CUDA error: .* unavailable; does another program hold"
+    ):
         select_device("auto")
 
 

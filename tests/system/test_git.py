@@ -16,7 +16,11 @@ MARK = "#!/bin/sh\ntouch '{mark}'\ncat\n"
 @pytest.fixture
 def repository(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A repository with one commit, in which a file was changed since; the current folder."""
-    for name, value in {"GIT_CONFIG_GLOBAL": "/dev/null", "GIT_CONFIG_NOSYSTEM": "1", "HOME": str(tmp_path)}.items():
+    for name, value in {
+        "GIT_CONFIG_GLOBAL": "/dev/null",
+        "GIT_CONFIG_NOSYSTEM": "1",
+        "HOME": str(tmp_path),
+    }.items():
         monkeypatch.setenv(name, value)
     folder = tmp_path / "capture"
     folder.mkdir()
@@ -31,7 +35,9 @@ def repository(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def git(*words: str) -> str:
-    return subprocess.run(["git", *words], check=True, capture_output=True, text=True).stdout.strip()
+    return subprocess.run(
+        ["git", *words], check=True, capture_output=True, text=True
+    ).stdout.strip()
 
 
 def test_commit_and_changes_are_told(repository: Path) -> None:
@@ -47,8 +53,12 @@ def test_a_folder_that_the_repository_does_not_follow_is_no_checkout(repository:
     assert checkout_of(inner, "b.py") == {}
 
 
-@pytest.mark.parametrize("setting", ["core.fsmonitor", "filter.x.clean", "filter.x.process", "Filter.y.CLEAN"])
-def test_git_starts_nothing_that_a_capture_names(repository: Path, tmp_path: Path, setting: str) -> None:
+@pytest.mark.parametrize(
+    "setting", ["core.fsmonitor", "filter.x.clean", "filter.x.process", "Filter.y.CLEAN"]
+)
+def test_git_starts_nothing_that_a_capture_names(
+    repository: Path, tmp_path: Path, setting: str
+) -> None:
     name = setting.split(".")[1]
     (repository / ".gitattributes").write_text(f"*.txt filter={name}\n")
     (repository / "a.txt").write_text("two")

@@ -23,7 +23,9 @@ def test_the_name_is_that_of_the_project_file() -> None:
     assert f"{DISTRIBUTION}[dim,search,tensorboard,view]" in content["dependency-groups"]["dev"]
 
 
-def test_from_a_checkout_the_hint_installs_the_checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_from_a_checkout_the_hint_installs_the_checkout(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     assert checkout() == ROOT
     monkeypatch.chdir(ROOT)
     assert install_command("view") == "pip install -e '.[view]'"
@@ -65,20 +67,28 @@ def test_no_text_sends_anyone_to_the_project_that_has_our_name() -> None:
     foreign = re.compile(r"pip install [^`\n]*\bgsbench(?!-3dgs)(\[|['\"`\s]|$)", re.MULTILINE)
     assert foreign.search("pip install 'gsbench[view]'")
     assert not foreign.search("pip install 'gsbench-3dgs[view]'")
-    places = [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "notebooks").glob("*.py")]
+    places = [
+        *ROOT.glob("*.md"),
+        *(ROOT / "docs").rglob("*.md"),
+        *(ROOT / "notebooks").glob("*.py"),
+    ]
     places += [*(ROOT / "src").rglob("*.py"), *(ROOT / "conf").rglob("*.yaml")]
     assert [str(path) for path in places if foreign.search(path.read_text(encoding="utf-8"))] == []
 
 
 @pytest.mark.skipif(shutil.which("make") is None, reason="needs make")
 def test_the_image_is_built_by_commands_that_there_are() -> None:
-    """Docker builds what the README's two commands build: every ``make`` of the Dockerfile is a target."""
+    """Docker builds what the README's two commands build: every ``make`` of the Dockerfile is a
+    target."""
     targets = re.findall(r"RUN make (\S+)", (ROOT / "Dockerfile").read_text())
     assert {"demo", "test"} < set(targets)
     for target in targets:
-        done = subprocess.run(["make", "-n", target], cwd=ROOT, capture_output=True, text=True, check=False)
+        done = subprocess.run(
+            ["make", "-n", target], cwd=ROOT, capture_output=True, text=True, check=False
+        )
         assert done.returncode == 0, done.stderr
-    ignored = (ROOT / ".dockerignore").read_text().split()  # whose names without a wildcard are of the root alone
+    # whose names without a wildcard are of the root alone
+    ignored = (ROOT / ".dockerignore").read_text().split()
     assert {name.lstrip("/") for name in (ROOT / ".gitignore").read_text().split()} < set(
         ignored
     )  # nothing of this machine gets in

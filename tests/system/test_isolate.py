@@ -125,7 +125,9 @@ def test_child_ends_with_its_parent(functions, tmp_path: Path, sign: signal.Sign
         run_isolated(isolated_functions.beat, {str(beats)!r})  # no __main__ guard: it must not be imported again
         """)
     )
-    parent = subprocess.Popen([sys.executable, str(script)], stderr=subprocess.PIPE, preexec_fn=heed_interrupts)
+    parent = subprocess.Popen(
+        [sys.executable, str(script)], stderr=subprocess.PIPE, preexec_fn=heed_interrupts
+    )
     deadline = time.monotonic() + PATIENCE
     while not beats.exists() and time.monotonic() < deadline:
         time.sleep(0.02)

@@ -1,4 +1,5 @@
-"""Machine code that is kept on disk belongs to the sources that it was made of, wherever these lie."""
+"""Machine code that is kept on disk belongs to the sources that it was made of, wherever these
+lie."""
 
 from __future__ import annotations
 
@@ -17,18 +18,23 @@ from gsbench.system.jit import PACKAGE, SOURCES, cache_base, cache_folder
 from tests.test_architecture import arrows, modules
 
 KERNEL_MODULES = sorted(
-    path.relative_to(PACKAGE).as_posix() for path in PACKAGE.rglob("*.py") if "\n@kernel\n" in path.read_text()
+    path.relative_to(PACKAGE).as_posix()
+    for path in PACKAGE.rglob("*.py")
+    if "\n@kernel\n" in path.read_text()
 )
 
 
 @pytest.fixture
 def package(tmp_path: Path) -> Path:
     """A copy of gsbench's sources."""
-    return Path(shutil.copytree(PACKAGE, tmp_path / "gsbench", ignore=shutil.ignore_patterns("__pycache__")))
+    return Path(
+        shutil.copytree(PACKAGE, tmp_path / "gsbench", ignore=shutil.ignore_patterns("__pycache__"))
+    )
 
 
 def functions_of(value: Any, seen: set[int]) -> Iterator[FunctionType]:
-    """The Python function behind a compiled one, and those that it calls, as Python itself resolves their names."""
+    """The Python function behind a compiled one, and those that it calls, as Python itself resolves
+    their names."""
     function = getattr(value, "py_func", value)
     if not isinstance(function, FunctionType) or id(function) in seen:
         return
@@ -64,13 +70,17 @@ def test_the_table_has_every_function_that_kernels_reach(module: str) -> None:
         for function in functions_of(value, seen)
     ]
     assert len(reached) > 3
-    missing = {Path(function.__code__.co_filename).resolve() for function in reached} - sources(PACKAGE)
+    missing = {Path(function.__code__.co_filename).resolve() for function in reached} - sources(
+        PACKAGE
+    )
     assert not missing
 
 
 def sources(package: Path) -> set[Path]:
     places = [package / source for source in SOURCES]
-    return {path for place in places for path in (place.rglob("*.py") if place.is_dir() else [place])}
+    return {
+        path for place in places for path in (place.rglob("*.py") if place.is_dir() else [place])
+    }
 
 
 @pytest.mark.parametrize("source", SOURCES)
@@ -88,9 +98,17 @@ def test_a_change_in_any_source_changes_the_folder(package: Path, source: str) -
 
 
 def test_the_table_has_all_that_kernels_import() -> None:
-    """But for what sets the kernels' calls up: memory, threads, cameras as numbers, files and words."""
+    """But for what sets the kernels' calls up: memory, threads, cameras as numbers, files and
+    words."""
     known = {path.relative_to(PACKAGE).as_posix() for path in sources(PACKAGE)}
-    around = {"logs.py", "errors.py", "system/machine.py", "system/resources.py", "scene/types.py", "scene/colmap.py"}
+    around = {
+        "logs.py",
+        "errors.py",
+        "system/machine.py",
+        "system/resources.py",
+        "scene/types.py",
+        "scene/colmap.py",
+    }
     around |= {"eval/images.py", "eval/protocol.py", "scene/options.py", "__init__.py"}
     files = {name: path.relative_to(PACKAGE).as_posix() for name, path in modules().items()}
     for name, targets in arrows().items():

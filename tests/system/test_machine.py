@@ -13,10 +13,22 @@ import pytest
 import torch
 
 from gsbench.system import machine
-from gsbench.system.machine import cpu_name, describe_machine, kernel_target, kind_of_machine, x86_level
+from gsbench.system.machine import (
+    cpu_name,
+    describe_machine,
+    kernel_target,
+    kind_of_machine,
+    x86_level,
+)
 
-ARM_64 = "processor\t: 0\nBogoMIPS\t: 243.75\nCPU implementer\t: 0x41\nCPU architecture: 8\nCPU part\t: 0xd40\n"
-XEON = "processor : 0\nvendor_id : GenuineIntel\nmodel name :  Intel(R)  Xeon(R)\n\nprocessor : 1\nmodel name : other\n"
+ARM_64 = (
+    "processor\t: 0\nBogoMIPS\t: 243.75\nCPU implementer\t: 0x41\nCPU architecture: 8\nCPU "
+    "part\t: 0xd40\n"
+)
+XEON = (
+    "processor : 0\nvendor_id : GenuineIntel\nmodel name :  Intel(R)  Xeon(R)\n\nprocessor : "
+    "1\nmodel name : other\n"
+)
 
 
 def test_record_is_plain_text_and_full() -> None:
@@ -36,7 +48,9 @@ def test_record_is_plain_text_and_full() -> None:
         ("Model : Raspberry Pi 5", "Raspberry Pi 5"),
     ],
 )
-def test_linux_names(content: str, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_linux_names(
+    content: str, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "cpuinfo").write_text(content)
     monkeypatch.setattr(machine, "CPU_INFO", tmp_path / "cpuinfo")
     monkeypatch.setattr(sys, "platform", "linux")
@@ -59,7 +73,9 @@ def test_levels_follow_the_psabi() -> None:
     v2 = {"sse3", "ssse3", "sse4.1", "sse4.2", "popcnt", "cx16", "sahf", "sse2"}
     v3 = v2 | {"avx", "avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe"}
     v4 = v3 | {"avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"}
-    assert [x86_level(features) for features in (set(), v2, v3, v4)] == [f"x86-64-v{k}" for k in (1, 2, 3, 4)]
+    assert [x86_level(features) for features in (set(), v2, v3, v4)] == [
+        f"x86-64-v{k}" for k in (1, 2, 3, 4)
+    ]
     assert x86_level(v4 - {"avx512vl"}) == "x86-64-v3"
     assert x86_level(v4 - {"sse4.2"}) == "x86-64-v1"
 
@@ -67,13 +83,17 @@ def test_levels_follow_the_psabi() -> None:
 def test_target_of_the_kernels_is_the_one_that_was_asked_for() -> None:
     code = "from gsbench.system.machine import kernel_target; print(kernel_target())"
     changed = dict(os.environ) | {"NUMBA_CPU_NAME": "generic"}
-    asked = subprocess.run([sys.executable, "-c", code], env=changed, capture_output=True, text=True, check=True)
+    asked = subprocess.run(
+        [sys.executable, "-c", code], env=changed, capture_output=True, text=True, check=True
+    )
     assert asked.stdout.startswith("generic")
     if "NUMBA_CPU_NAME" not in os.environ:
         assert not kernel_target().startswith("generic")
 
 
-@pytest.mark.parametrize("variable", ["NUMBA_NUM_THREADS=0", "NUMBA_NUM_THREADS=-1", "NUMBA_DISABLE_JIT=x"])
+@pytest.mark.parametrize(
+    "variable", ["NUMBA_NUM_THREADS=0", "NUMBA_NUM_THREADS=-1", "NUMBA_DISABLE_JIT=x"]
+)
 def test_a_variable_that_numba_cannot_read_is_one_line(variable: str) -> None:
     name, _, value = variable.partition("=")
     code = (
@@ -81,7 +101,9 @@ def test_a_variable_that_numba_cannot_read_is_one_line(variable: str) -> None:
         "try:\n    import gsbench.raster.cpu\nexcept InputError as error:\n    print(error)"
     )
     changed = dict(os.environ) | {name: value}
-    asked = subprocess.run([sys.executable, "-c", code], env=changed, capture_output=True, text=True, check=True)
+    asked = subprocess.run(
+        [sys.executable, "-c", code], env=changed, capture_output=True, text=True, check=True
+    )
     assert name in asked.stdout
     assert asked.stdout.count("\n") == 1
 
@@ -92,5 +114,7 @@ def test_numba_reads_no_settings_of_the_current_folder(tmp_path: Path) -> None:
         "import gsbench.raster.cpu\nfrom numba.core import config\nconfig.reload_config()\n"
         "print(config.DISABLE_JIT, int(config.OPT))"
     )
-    asked = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True)
+    asked = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True
+    )
     assert asked.stdout == "0 3\n"

@@ -37,7 +37,9 @@ def test_peak_can_be_counted_anew() -> None:
     assert peak_memory_mb(CPU) < high - LARGE_MB
 
 
-def test_systems_without_proc_use_what_they_have(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_systems_without_proc_use_what_they_have(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     counted = peak_resident_mb()
     monkeypatch.setattr(memory, "STATUS", tmp_path / "missing")
     if memory.resource is not None:
@@ -50,6 +52,9 @@ def test_systems_without_proc_use_what_they_have(tmp_path: Path, monkeypatch: py
 
 def test_the_pipeline_is_imported_where_there_is_no_resource_module() -> None:
     """As on Windows, where psutil does without it."""
-    code = "import sys, psutil; sys.modules['resource'] = None; import gsbench.runs.keys, gsbench.bench"
+    code = (
+        "import sys, psutil; sys.modules['resource'] = None; import gsbench.runs.keys, "
+        "gsbench.bench"
+    )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

@@ -41,7 +41,12 @@ def test_slots_gpus_and_threads(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     ],
 )
 def test_trials_at_once_suit_cores_memory_and_gpus(
-    cores: int, gigabytes: int, most: int | None, gpus: int, expected: int, monkeypatch: pytest.MonkeyPatch
+    cores: int,
+    gigabytes: int,
+    most: int | None,
+    gpus: int,
+    expected: int,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("gsbench.system.resources.available_cores", lambda: cores)
     monkeypatch.setattr("gsbench.system.resources.installed_gpus", lambda: ["0"] * gpus)

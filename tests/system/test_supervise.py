@@ -1,4 +1,5 @@
-"""No process outlives the function that started it, however it was started: daemons included, on Linux."""
+"""No process outlives the function that started it, however it was started: daemons included, on
+Linux."""
 
 from __future__ import annotations
 
@@ -17,10 +18,13 @@ from gsbench.errors import TrainingError
 from gsbench.external.program import run_program
 from tests.processes import heed_interrupts, is_running
 
-pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="daemons get away where nobody can adopt orphans")
+pytestmark = pytest.mark.skipif(
+    sys.platform != "linux", reason="daemons get away where nobody can adopt orphans"
+)
 PATIENCE = 60.0  # seconds within which what never comes is told from a slow machine
 
-# A daemon as in Stevens: forked twice, in a session of its own, with an empty environment. It notes its process id.
+# A daemon as in Stevens: forked twice, in a session of its own, with an empty environment. It notes
+# its process id.
 DAEMON = """
 import os, sys, time
 def daemon(mark, code="import time; time.sleep(600)"):
@@ -38,7 +42,9 @@ def daemon(mark, code="import time; time.sleep(600)"):
     while not os.path.exists(mark):
         time.sleep(0.01)
 """
-SIGNALS = "import signal, time; [signal.signal(s, signal.SIG_IGN) for s in (1, 2, 15)]; time.sleep(600)"
+SIGNALS = (
+    "import signal, time; [signal.signal(s, signal.SIG_IGN) for s in (1, 2, 15)]; time.sleep(600)"
+)
 FORKS = "import os, time; [os.fork() for _ in range(4)]; time.sleep(600)"
 
 
@@ -56,18 +62,25 @@ def is_gone(mark: Path) -> bool:
 @pytest.mark.parametrize(
     "code", ["import time; time.sleep(600)", SIGNALS, FORKS], ids=["sleeps", "heeds none", "forks"]
 )
-@pytest.mark.parametrize("end", ["", "raise SystemExit(3)", "os.kill(os.getpid(), 9)", "time.sleep(600)"])
+@pytest.mark.parametrize(
+    "end", ["", "raise SystemExit(3)", "os.kill(os.getpid(), 9)", "time.sleep(600)"]
+)
 def test_a_daemon_of_a_trainer_ends_with_it(tmp_path: Path, end: str, code: str) -> None:
     program = f"{DAEMON}\ndaemon('mark', {code!r})\n{end}"
     try:
         command = [sys.executable, "-c", program]
-        run_program(command, tmp_path / "log", tmp_path, dict(os.environ), 2.0 if "sleep" in end else None)
+        run_program(
+            command, tmp_path / "log", tmp_path, dict(os.environ), 2.0 if "sleep" in end else None
+        )
         assert not end
     except TrainingError:
         assert end
     assert is_gone(tmp_path / "mark")
     deadline = time.monotonic() + PATIENCE
-    while any(process.info["cmdline"] == [sys.executable, "-c", FORKS] for process in psutil.process_iter(["cmdline"])):
+    while any(
+        process.info["cmdline"] == [sys.executable, "-c", FORKS]
+        for process in psutil.process_iter(["cmdline"])
+    ):
         assert time.monotonic() < deadline
         time.sleep(0.05)
 
@@ -84,7 +97,9 @@ def test_a_daemon_ends_with_gsbench_however_that_ends(tmp_path: Path, sign: sign
         run_program([sys.executable, "-c", program], here / "log", here, dict(os.environ), None)
         """)
     )
-    parent = subprocess.Popen([sys.executable, str(tmp_path / "main.py")], preexec_fn=heed_interrupts)
+    parent = subprocess.Popen(
+        [sys.executable, str(tmp_path / "main.py")], preexec_fn=heed_interrupts
+    )
     deadline = time.monotonic() + PATIENCE
     while not (tmp_path / "mark").exists() and time.monotonic() < deadline:
         time.sleep(0.05)

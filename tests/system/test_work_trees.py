@@ -17,7 +17,11 @@ Git = Callable[..., str]
 @pytest.fixture
 def git(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Git:
     """git in the folder ``theirs``, which is a repository with three commits of a file."""
-    for name, value in {"GIT_CONFIG_GLOBAL": "/dev/null", "GIT_CONFIG_NOSYSTEM": "1", "HOME": str(tmp_path)}.items():
+    for name, value in {
+        "GIT_CONFIG_GLOBAL": "/dev/null",
+        "GIT_CONFIG_NOSYSTEM": "1",
+        "HOME": str(tmp_path),
+    }.items():
         monkeypatch.setenv(name, value)
     folder = tmp_path / "theirs"
     (folder / "inner").mkdir(parents=True)
@@ -58,7 +62,13 @@ def test_neither_hooks_nor_filters_of_the_repository_run(tmp_path: Path, git: Gi
     program = tmp_path / "program"
     program.write_text(f"#!/bin/sh\ntouch {ran}\ncat\n")
     program.chmod(0o755)
-    for key in ("filter.theirs.smudge", "filter.theirs.process", "core.fsmonitor", "core.sshCommand", "core.pager"):
+    for key in (
+        "filter.theirs.smudge",
+        "filter.theirs.process",
+        "core.fsmonitor",
+        "core.sshCommand",
+        "core.pager",
+    ):
         git("config", key, str(program))
     git("config", "log.showSignature", "true")
     git("config", "gpg.program", str(program))

@@ -24,7 +24,8 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def postgresql(tmp_path: Path) -> Iterator[str]:
-    """The address of an empty database in a PostgreSQL server of our own; the test is skipped where there is none."""
+    """The address of an empty database in a PostgreSQL server of our own; the test is skipped where
+    there is none."""
     pytest.importorskip("psycopg2", reason="needs psycopg2-binary")
     homes = (
         sorted(Path("/usr/lib/postgresql").glob("*/bin"), key=lambda path: int(path.parent.name))
@@ -32,9 +33,9 @@ def postgresql(tmp_path: Path) -> Iterator[str]:
         else []
     )
     binaries = [str(path) for path in homes] + os.environ.get("PATH", "").split(os.pathsep)
-    initdb = shutil.which("initdb", path=os.pathsep.join(reversed(binaries[: len(homes)])) or None) or shutil.which(
-        "initdb"
-    )
+    initdb = shutil.which(
+        "initdb", path=os.pathsep.join(reversed(binaries[: len(homes)])) or None
+    ) or shutil.which("initdb")
     if initdb is None:
         pytest.skip("needs a PostgreSQL server (apt-get install postgresql)")
     home = Path(initdb).parent
@@ -46,13 +47,30 @@ def postgresql(tmp_path: Path) -> Iterator[str]:
             pytest.skip("PostgreSQL does not run as root, and there is no runuser")
         prefix = ["runuser", "-u", "nobody", "--"]
         shutil.chown(data, "nobody")
-        for folder in (tmp_path, *tmp_path.parents[:3]):  # a worker of pytest-xdist has a folder of its own
+        # a worker of pytest-xdist has a folder of its own
+        for folder in (tmp_path, *tmp_path.parents[:3]):
             folder.chmod(folder.stat().st_mode | 0o011)
     port = free_port()
-    run = lambda *words: subprocess.run([*prefix, *words], check=True, capture_output=True, timeout=300)  # noqa: E731
+
+    def run(*words: str) -> None:
+        command = [*prefix, *words]
+        subprocess.run(command, check=True, capture_output=True, timeout=300)
+
     run(str(home / "initdb"), "-D", str(data), "-U", "gsbench", "--auth=trust", "--no-sync")
-    settings = f"-p {port} -c listen_addresses=127.0.0.1 -c unix_socket_directories={data} -c fsync=off"
-    run(str(home / "pg_ctl"), "-D", str(data), "-l", str(data / "log"), "-w", "-o", settings, "start")
+    settings = (
+        f"-p {port} -c listen_addresses=127.0.0.1 -c unix_socket_directories={data} -c fsync=off"
+    )
+    run(
+        str(home / "pg_ctl"),
+        "-D",
+        str(data),
+        "-l",
+        str(data / "log"),
+        "-w",
+        "-o",
+        settings,
+        "start",
+    )
     yield f"postgresql+psycopg2://gsbench@127.0.0.1:{port}/postgres"
     stop = [*prefix, str(home / "pg_ctl"), "-D", str(data), "-m", "immediate", "stop"]
     subprocess.run(stop, check=False, timeout=300)

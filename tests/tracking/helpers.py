@@ -21,19 +21,35 @@ RECORDS = 150
 
 
 def options(uri: str | None = None, patience: float = 30.0) -> dict[str, Any]:
-    return {"enabled": True, "uri": uri, "flush_seconds": 0.2, "images": 2, "patience_seconds": patience}
+    return {
+        "enabled": True,
+        "uri": uri,
+        "flush_seconds": 0.2,
+        "images": 2,
+        "patience_seconds": patience,
+    }
 
 
 def trial_values(runs: Path, seed: int = 0, name: str = "tracked") -> dict[str, Any]:
     named = {group: {"name": f"a_{group}"} for group in ("scene", "init", "densify")}
-    return {"name": name, "seed": seed, "runs": str(runs), "train": {"iterations": RECORDS}, **named}
+    return {
+        "name": name,
+        "seed": seed,
+        "runs": str(runs),
+        "train": {"iterations": RECORDS},
+        **named,
+    }
 
 
-def begin_trial(values: dict[str, Any], uri: str | None = None, patience: float = 30.0, **more: Any) -> Path:
+def begin_trial(
+    values: dict[str, Any], uri: str | None = None, patience: float = 30.0, **more: Any
+) -> Path:
     """The folder of a trial that has written its configuration, as the mirror finds it."""
     folder = TrialFolder.of(values).path
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "config.yaml").write_text(json.dumps(values | {"tracking": options(uri, patience) | more}))
+    (folder / "config.yaml").write_text(
+        json.dumps(values | {"tracking": options(uri, patience) | more})
+    )
     return folder
 
 
@@ -46,16 +62,23 @@ def following(settings: dict[str, Any], folder: Path) -> Iterator[None]:
 
 
 def mirror_trial(settings: dict[str, Any], folder: Path, values: dict[str, Any]) -> bool:
-    """Mirror what is missing of an ended trial; False if nothing was missing. Raises what the tracker raises."""
+    """Mirror what is missing of an ended trial; False if nothing was missing. Raises what the
+    tracker raises."""
     return mirror_ended(TrialFolder(folder), settings, values)
 
 
-def write_trial(folder: Path, values: dict[str, Any], records: int = RECORDS, psnr: float = 20.0) -> None:
+def write_trial(
+    folder: Path, values: dict[str, Any], records: int = RECORDS, psnr: float = 20.0
+) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     seed = values["seed"]
-    lines = [{"step": i, "loss": 1 / i, "l1": seed, "seconds": 0.01 * i} for i in range(1, records + 1)]
+    lines = [
+        {"step": i, "loss": 1 / i, "l1": seed, "seconds": 0.01 * i} for i in range(1, records + 1)
+    ]
     (folder / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
-    (folder / "events.jsonl").write_text("".join(json.dumps({"step": i, "cloned": i}) + "\n" for i in (50, 100)))
+    (folder / "events.jsonl").write_text(
+        "".join(json.dumps({"step": i, "cloned": i}) + "\n" for i in (50, 100))
+    )
     if not (folder / "config.yaml").exists():
         begin_trial(values)
     results = {

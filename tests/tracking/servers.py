@@ -14,7 +14,8 @@ BACKLOG = 64
 
 
 class Listener:
-    """A server on a port of its own that accepts every connection, and answers each after ``seconds``, or never."""
+    """A server on a port of its own that accepts every connection, and answers each after
+    ``seconds``, or never."""
 
     def __init__(self, seconds: float | None = None) -> None:
         self.seconds = seconds
@@ -51,7 +52,8 @@ class Listener:
 class Gate(Listener):
     """Passes everything on to the server at ``target`` until ``limit`` bytes were sent to it.
 
-    Then it breaks all connections and refuses new ones, or keeps them and passes nothing on, until it is `mended`.
+    Then it breaks all connections and refuses new ones, or keeps them and passes nothing on, until
+    it is `mended`.
     """
 
     def __init__(self, target: int) -> None:
@@ -78,7 +80,9 @@ class Gate(Listener):
             connection.close()
             return
         self.connections.append(server)
-        threading.Thread(target=self._pass_on, args=(server, connection, False), daemon=True).start()
+        threading.Thread(
+            target=self._pass_on, args=(server, connection, False), daemon=True
+        ).start()
         self._pass_on(connection, server, True)
 
     def _pass_on(self, source: socket.socket, goal: socket.socket, counted: bool) -> None:

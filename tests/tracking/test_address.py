@@ -11,7 +11,15 @@ from gsbench.cli import run
 from gsbench.errors import InputError
 from gsbench.tracking import connect, default_uri, tracker_uri
 from gsbench.tracking.mlflow_sink import STATE, VARIABLE, untyped_address
-from tests.tracking.helpers import begin_trial, found_runs, free_port, mirror_trial, options, trial_values, write_trial
+from tests.tracking.helpers import (
+    begin_trial,
+    found_runs,
+    free_port,
+    mirror_trial,
+    options,
+    trial_values,
+    write_trial,
+)
 
 
 def test_the_address_is_the_configured_one_then_the_environments_then_ours(
@@ -24,7 +32,9 @@ def test_the_address_is_the_configured_one_then_the_environments_then_ours(
     assert tracker_uri("http://127.0.0.1:2", tmp_path) == "http://127.0.0.1:2"
 
 
-def test_an_address_counts_where_it_is_typed_or_of_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_address_counts_where_it_is_typed_or_of_the_environment(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.delenv(VARIABLE, raising=False)
     assert untyped_address({"uri": None}) is None
     assert untyped_address({"uri": "http://a"}) == "http://a"
@@ -75,7 +85,9 @@ def test_sync_leaves_out_a_trial_whose_configuration_lacks_a_group(
     assert said.err == ""
 
 
-@pytest.mark.parametrize("place", ["http://127.0.0.1:{port}/api", "{outside}", "{runs}/mlartifacts/../../outside"])
+@pytest.mark.parametrize(
+    "place", ["http://127.0.0.1:{port}/api", "{outside}", "{runs}/mlartifacts/../../outside"]
+)
 @pytest.mark.slow
 def test_artifacts_go_nowhere_else_than_our_own_folder(
     place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
@@ -113,7 +125,9 @@ def test_no_link_among_the_artifacts_is_written_through(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("address", ["./mlruns", "mlruns", "file:./mlruns", "http:/host"])
-def test_an_address_that_is_a_folder_is_refused_in_one_line(address: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_address_that_is_a_folder_is_refused_in_one_line(
+    address: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert run(["scene=courtyard", f"tracking.uri={address}", "--dry-run"]) == 2
     said = capsys.readouterr().err.splitlines()
     assert len(said) == 1

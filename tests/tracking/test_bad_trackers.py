@@ -1,4 +1,5 @@
-"""Whatever a tracker does, and whenever: a trial that is complete ends with exit code 0, and one line says the rest."""
+"""Whatever a tracker does, and whenever: a trial that is complete ends with exit code 0, and one
+line says the rest."""
 
 from __future__ import annotations
 
@@ -38,10 +39,18 @@ from tests.tracking.helpers import (
 from tests.tracking.servers import Gate, Listener
 
 pytestmark = pytest.mark.slow
-# Not measured, only the limit within which a program that hangs for good is told from a slow machine.
+# Not measured, only the limit within which a program that hangs for good is told from a slow
+# machine.
 SECONDS = 240
 PATIENCE = 4.0
-TINY = [*SMALL, "train.iterations=20", "scene.views=8", "init.count=500", "eval.lpips=[]", "eval.flip=false"]
+TINY = [
+    *SMALL,
+    "train.iterations=20",
+    "scene.views=8",
+    "init.count=500",
+    "eval.lpips=[]",
+    "eval.flip=false",
+]
 
 
 @pytest.fixture(scope="module")
@@ -50,9 +59,20 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def start(runs: Path, *words: str) -> subprocess.Popen[str]:
-    kept = {key: value for key, value in child_environment().items() if not key.startswith(("GSBENCH_", "MLFLOW_"))}
+    kept = {
+        key: value
+        for key, value in child_environment().items()
+        if not key.startswith(("GSBENCH_", "MLFLOW_"))
+    }
     return subprocess.Popen(
-        [sys.executable, "-m", "gsbench.cli", *TINY, f"tracking.patience_seconds={PATIENCE}", *words],
+        [
+            sys.executable,
+            "-m",
+            "gsbench.cli",
+            *TINY,
+            f"tracking.patience_seconds={PATIENCE}",
+            *words,
+        ],
         cwd=runs,
         env=kept | {"GSBENCH_RUNS": str(runs)},
         stdout=subprocess.PIPE,
@@ -70,7 +90,9 @@ def check_complete(runs: Path, name: str, code: int, errors: str) -> None:
     assert json.loads(results.read_text())["status"] == "complete"
 
 
-@pytest.mark.parametrize("kind", ["refuses", "never answers", "answers after a minute", "hangs up", "postgresql"])
+@pytest.mark.parametrize(
+    "kind", ["refuses", "never answers", "answers after a minute", "hangs up", "postgresql"]
+)
 def test_a_bad_tracker_costs_a_trial_one_line(kind: str, runs: Path) -> None:
     with ExitStack() as stack:
         port = free_port()
@@ -80,21 +102,34 @@ def test_a_bad_tracker_costs_a_trial_one_line(kind: str, runs: Path) -> None:
             port = stack.enter_context(Listener(seconds=60)).port
         elif kind == "hangs up":
             port = stack.enter_context(Gate(free_port())).port
-        uri = f"postgresql+psycopg2://x@127.0.0.1:{port}/x" if kind == "postgresql" else f"http://127.0.0.1:{port}"
+        uri = (
+            f"postgresql+psycopg2://x@127.0.0.1:{port}/x"
+            if kind == "postgresql"
+            else f"http://127.0.0.1:{port}"
+        )
         name = kind.replace(" ", "_")
-        _, errors = (program := start(runs, f"name={name}", f"tracking.uri={uri}")).communicate(timeout=SECONDS)
+        _, errors = (program := start(runs, f"name={name}", f"tracking.uri={uri}")).communicate(
+            timeout=SECONDS
+        )
     check_complete(runs, name, program.returncode, errors)
 
 
 @pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
-def test_nothing_is_left_of_a_trial_that_is_ended_while_its_tracker_hangs(signum: int, runs: Path) -> None:
+def test_nothing_is_left_of_a_trial_that_is_ended_while_its_tracker_hangs(
+    signum: int, runs: Path
+) -> None:
     name = f"ended_by_{signum}"
     with Listener() as tracker:
         program = start(
-            runs, f"name={name}", f"tracking.uri=http://127.0.0.1:{tracker.port}", "train.iterations=100000"
+            runs,
+            f"name={name}",
+            f"tracking.uri=http://127.0.0.1:{tracker.port}",
+            "train.iterations=100000",
         )
         mirrors = mirrors_of(program)
-        wait_until(lambda: bool(tracker.connections) and any((runs / name).glob("**/building.json")))
+        wait_until(
+            lambda: bool(tracker.connections) and any((runs / name).glob("**/building.json"))
+        )
         program.send_signal(signum)
         _, errors = program.communicate(timeout=SECONDS)
         gone, alive = psutil.wait_procs(mirrors, timeout=SECONDS)
@@ -132,7 +167,9 @@ def mirrors_of(program: subprocess.Popen[str]) -> list[psutil.Process]:
         with suppress(psutil.NoSuchProcess):
             children = psutil.Process(program.pid).children(recursive=True)
             found[:] = [
-                child for child in children if any("gsbench.tracking.mirror" in word for word in child.cmdline())
+                child
+                for child in children
+                if any("gsbench.tracking.mirror" in word for word in child.cmdline())
             ]
         return bool(found)
 
@@ -148,7 +185,9 @@ def wait_until(condition: Callable[[], bool]) -> None:
 
 
 @pytest.fixture(params=["http", "postgresql"])
-def tracker(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Gate, str]]:
+def tracker(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[tuple[Gate, str]]:
     """A tracker that works, behind a gate, and its address there."""
     with ExitStack() as stack:
         if request.param == "http":
@@ -157,19 +196,26 @@ def tracker(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
             port = urlsplit(request.getfixturevalue("postgresql")).port
         gate = stack.enter_context(Gate(port))
         address = f"127.0.0.1:{gate.port}"
-        uri = f"http://{address}" if request.param == "http" else f"postgresql+psycopg2://gsbench@{address}/postgres"
+        uri = (
+            f"http://{address}"
+            if request.param == "http"
+            else f"postgresql+psycopg2://gsbench@{address}/postgres"
+        )
         yield gate, uri
 
 
 def test_a_tracker_may_go_at_any_moment(
     tracker: tuple[Gate, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It is taken away early, late and in between; each time ``sync`` completes one run, with each value once.
+    """It is taken away early, late and in between; each time ``sync`` completes one run, with each
+    value once.
 
-    A transaction that was cut off, of which the database never hears again, keeps nobody from its rows for long.
+    A transaction that was cut off, of which the database never hears again, keeps nobody from its
+    rows for long.
     """
     gate, uri = tracker
-    ensure_experiment(connect(uri, tmp_path), "tracked", tmp_path)  # may take longer than what follows
+    # may take longer than what follows
+    ensure_experiment(connect(uri, tmp_path), "tracked", tmp_path)
     seconds = SETTINGS["PGOPTIONS"].replace("60s", "3s")
     assert seconds != SETTINGS["PGOPTIONS"]
     monkeypatch.setenv("PGOPTIONS", seconds)
@@ -187,14 +233,18 @@ def test_a_tracker_may_go_at_any_moment(
     assert sorted(run.data.tags["seed"] for run in found) == [str(seed) for seed in range(4)]
     for run in found:
         assert run.info.status == "FINISHED"
-        assert history(client, run.info.run_id, "train/loss") == [(i, 1 / i) for i in range(1, RECORDS + 1)]
+        assert history(client, run.info.run_id, "train/loss") == [
+            (i, 1 / i) for i in range(1, RECORDS + 1)
+        ]
         assert run.data.metrics["eval/gaussians"] == 10 + int(run.data.tags["seed"])
 
 
 def mirror_a_trial(runs: Path, uri: str, seed: int, patience: float) -> str:
     """Mirror a trial in a process of its own, which must end well; returns what it said."""
     words = mirror_command(runs, uri, seed, patience)
-    done = subprocess.run(words, env=child_environment(), capture_output=True, text=True, timeout=SECONDS, check=False)
+    done = subprocess.run(
+        words, env=child_environment(), capture_output=True, text=True, timeout=SECONDS, check=False
+    )
     assert done.returncode == 0, done.stderr
     return done.stderr
 
@@ -202,15 +252,39 @@ def mirror_a_trial(runs: Path, uri: str, seed: int, patience: float) -> str:
 @contextmanager
 def mlflow_server(folder: Path) -> Iterator[int]:
     port = free_port()
-    words = ["server", "--backend-store-uri", f"sqlite:///{folder}/mlflow.db", "--artifacts-destination", str(folder)]
-    command = [sys.executable, "-m", "mlflow", *words, "--host", "127.0.0.1", "--port", str(port), "--workers", "1"]
+    words = [
+        "server",
+        "--backend-store-uri",
+        f"sqlite:///{folder}/mlflow.db",
+        "--artifacts-destination",
+        str(folder),
+    ]
+    command = [
+        sys.executable,
+        "-m",
+        "mlflow",
+        *words,
+        "--host",
+        "127.0.0.1",
+        "--port",
+        str(port),
+        "--workers",
+        "1",
+    ]
     lean = {"MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false", "MLFLOW_DISABLE_TELEMETRY": "true"}
     server = subprocess.Popen(
-        command, env=os.environ | lean, start_new_session=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        command,
+        env=os.environ | lean,
+        start_new_session=True,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
     )
 
     def answers() -> bool:
-        with suppress(OSError), urllib.request.urlopen(f"http://127.0.0.1:{port}/health", timeout=5) as answer:
+        with (
+            suppress(OSError),
+            urllib.request.urlopen(f"http://127.0.0.1:{port}/health", timeout=5) as answer,
+        ):
             return bool(answer.status == 200)
         return False
 

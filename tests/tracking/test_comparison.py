@@ -37,13 +37,18 @@ from tests.view.browser import Browser
 NOTE, VIEW = "mlflow.note.content", "mlflow.sharedViewState.gsbench"
 
 
-def write_sweep(runs: Path, arms: tuple[str, ...] = ("adc", "volumetric"), name: str = "swept") -> list[TrialFolder]:
+def write_sweep(
+    runs: Path, arms: tuple[str, ...] = ("adc", "volumetric"), name: str = "swept"
+) -> list[TrialFolder]:
     """Trials of arms, on two scenes with two seeds; later arms have a larger PSNR."""
     folders = []
     for number, arm in enumerate(arms):
         for scene in ("courtyard", "yard"):
             for seed in (0, 1):
-                values = trial_values(runs, seed, name) | {"scene": {"name": scene}, "densify": {"name": arm}}
+                values = trial_values(runs, seed, name) | {
+                    "scene": {"name": scene},
+                    "densify": {"name": arm},
+                }
                 folder = begin_trial(values)
                 write_trial(folder, values, psnr=20 + number + seed / 10)
                 folders.append(TrialFolder(folder))
@@ -62,7 +67,9 @@ def unpacked(tag: str) -> dict[str, Any]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["sqlite", "postgresql"])
-def test_the_files_alone_make_the_page_again(kind: str, tmp_path: Path, request: pytest.FixtureRequest) -> None:
+def test_the_files_alone_make_the_page_again(
+    kind: str, tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
     uri = None if kind == "sqlite" else request.getfixturevalue("postgresql")
     folders = write_sweep(tmp_path / "runs")
     assert list(sync(folders, uri))[-1] == "8 trials mirrored now, 0 before"
@@ -76,7 +83,11 @@ def test_the_files_alone_make_the_page_again(kind: str, tmp_path: Path, request:
     assert {"eval/psnr_dB", "train/gaussians"} <= charted
     assert charted - {"train/gaussians"} <= names  # these files have no counts over iterations
     collapsed = {f"param.arm.{run.data.params['arm']}" for run in found_runs(client, "swept")}
-    assert set(view["groupsExpanded"]) == collapsed == {"param.arm.adc · a_init", "param.arm.volumetric · a_init"}
+    assert (
+        set(view["groupsExpanded"])
+        == collapsed
+        == {"param.arm.adc · a_init", "param.arm.volumetric · a_init"}
+    )
 
 
 def test_a_description_of_somebody_else_stays(runs: Path) -> None:
@@ -137,7 +148,11 @@ def test_portrait_and_landscape_pictures_are_logged_as_they_are(runs: Path) -> N
     assert mirror_trial(options(), folder, values)
     client = connect(None, runs)
     run = run_of(client, 2000)
-    names = [item.path for item in client.list_artifacts(run.info.run_id, "images") if item.path.endswith(".png")]
+    names = [
+        item.path
+        for item in client.list_artifacts(run.info.run_id, "images")
+        if item.path.endswith(".png")
+    ]
     assert len(names) == 6
     for name in names:
         with Image.open(client.download_artifacts(run.info.run_id, name)) as image:
@@ -146,15 +161,24 @@ def test_portrait_and_landscape_pictures_are_logged_as_they_are(runs: Path) -> N
 
 @pytest.mark.slow
 @pytest.mark.browser
-def test_a_browser_shows_the_arms_as_groups_and_a_chart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_browser_shows_the_arms_as_groups_and_a_chart(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     runs, port = tmp_path / "runs", free_port()
     list(sync(write_sweep(runs), None))
-    page = addresses(f"http://127.0.0.1:{port}", publish(runs / "swept", None), mlflow.__version__)["arms"]
+    page = addresses(f"http://127.0.0.1:{port}", publish(runs / "swept", None), mlflow.__version__)[
+        "arms"
+    ]
     started: list[Any] = []
     popen = servers.subprocess.Popen
-    monkeypatch.setattr(servers.subprocess, "Popen", lambda *a, **k: started.append(popen(*a, **k)) or started[-1])
-    thread = threading.Thread(target=servers.ui, args=(["swept", "--port", str(port), "--no-browser"], runs))
-    monkeypatch.setattr(servers, "stop_on_signals", lambda: threading.Lock())  # signals need the main thread
+    monkeypatch.setattr(
+        servers.subprocess, "Popen", lambda *a, **k: started.append(popen(*a, **k)) or started[-1]
+    )
+    thread = threading.Thread(
+        target=servers.ui, args=(["swept", "--port", str(port), "--no-browser"], runs)
+    )
+    # signals need the main thread
+    monkeypatch.setattr(servers, "stop_on_signals", lambda: threading.Lock())
     thread.start()
     try:
         deadline = time.monotonic() + 120
@@ -164,10 +188,17 @@ def test_a_browser_shows_the_arms_as_groups_and_a_chart(tmp_path: Path, monkeypa
         with Browser(page, tmp_path / "profile", (1500, 1000)) as browser:
 
             def evaluated(script: str) -> Any:
-                return browser.call("Runtime.evaluate", expression=script, returnByValue=True)["result"].get("value")
+                return browser.call("Runtime.evaluate", expression=script, returnByValue=True)[
+                    "result"
+                ].get("value")
 
-            bars = "[...document.querySelectorAll('.barlayer .point path')].filter(p => p.getBBox().width > 5).length"
-            browser.wait_until(lambda picture: (evaluated(bars) or 0) >= 4, "two bars in each of two charts")
+            bars = (
+                "[...document.querySelectorAll('.barlayer .point path')].filter(p => "
+                "p.getBBox().width > 5).length"
+            )
+            browser.wait_until(
+                lambda picture: (evaluated(bars) or 0) >= 4, "two bars in each of two charts"
+            )
             text = evaluated("document.body.innerText")
             assert "Group: adc · a_init" in text
             assert "Group: volumetric · a_init" in text

@@ -1,4 +1,5 @@
-"""What people who know MLflow look for: address, user, reasons of failures, files that are found."""
+"""What people who know MLflow look for: address, user, reasons of failures, files that are
+found."""
 
 from __future__ import annotations
 
@@ -47,7 +48,9 @@ def artifacts(client: Any, run: Any) -> set[str]:
     return {item.path for item in client.list_artifacts(run.info.run_id)}
 
 
-def test_a_trial_goes_where_the_environment_says(runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_trial_goes_where_the_environment_says(
+    runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("MLFLOW_TRACKING_URI", default_uri(runs))
     values = trial_values(tmp_path, seed=20)
     folder = begin_trial(values)
@@ -64,7 +67,9 @@ def test_a_failed_run_holds_its_reason_until_it_is_mended(runs: Path) -> None:
     folder = begin_trial(values)
     (folder / "log.txt").write_text("what happened\n")
     with pytest.raises(RuntimeError), following(options(), folder):  # noqa: PT012
-        (folder / "failed.json").write_text(json.dumps({"message": "the loss became nan", "traceback": "…"}))
+        (folder / "failed.json").write_text(
+            json.dumps({"message": "the loss became nan", "traceback": "…"})
+        )
         raise RuntimeError
     client = connect(None, runs)
     run = run_of(client, 22)
@@ -86,20 +91,27 @@ def test_the_model_is_an_artifact_if_asked_for(runs: Path) -> None:
     assert "point_cloud.ply" in artifacts(client, run)
 
 
-def test_the_mirror_of_a_moved_runs_folder_is_made_again_from_the_files(runs: Path, tmp_path: Path) -> None:
+def test_the_mirror_of_a_moved_runs_folder_is_made_again_from_the_files(
+    runs: Path, tmp_path: Path
+) -> None:
     """MLflow keeps absolute addresses, so that the old database would fill the old place."""
     mirrored(runs, seed=26)
     moved = tmp_path / "moved"
     shutil.copytree(runs, moved)
     values = trial_values(moved, seed=26)
     folder = TrialFolder.of(values).path
-    with pytest.raises(InputError, match=r"if this runs folder was moved, remove mlflow.db and mlartifacts there"):
+    with pytest.raises(
+        InputError, match=r"if this runs folder was moved, remove mlflow.db and mlartifacts there"
+    ):
         mirror_trial(options(), folder, values)
     (moved / "mlflow.db").unlink()
     shutil.rmtree(moved / "mlartifacts")
-    command = [sys.executable, "-m", "gsbench.cli", "sync", "tracked"]  # a process that has not opened the old one
+    # a process that has not opened the old one
+    command = [sys.executable, "-m", "gsbench.cli", "sync", "tracked"]
     environment = child_environment() | {"GSBENCH_RUNS": str(moved)}
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=240, check=False)
+    done = subprocess.run(
+        command, env=environment, capture_output=True, text=True, timeout=240, check=False
+    )
     assert f"mirrored {TrialFolder(folder).label}" in done.stdout.splitlines(), done.stderr
     assert list((moved / "mlartifacts" / "tracked").rglob("results.json"))
 
@@ -111,5 +123,7 @@ def test_a_run_that_was_deleted_is_mirrored_anew(runs: Path) -> None:
     assert mirror_trial(options(), TrialFolder.of(values).path, values)
     again = run_of(client, 28)
     assert again.info.run_id != run.info.run_id
-    assert history(client, again.info.run_id, "train/loss") == [(i, 1 / i) for i in range(1, RECORDS + 1)]
+    assert history(client, again.info.run_id, "train/loss") == [
+        (i, 1 / i) for i in range(1, RECORDS + 1)
+    ]
     assert "results.json" in artifacts(client, again)

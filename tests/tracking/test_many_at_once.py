@@ -30,12 +30,19 @@ def run_jobs(runs: Path, uri: str | None) -> None:
     """Eight trials at once, in processes of their own, all new to the tracker."""
     commands = [mirror_command(runs, uri, seed) for seed in range(JOBS)]
     jobs = [
-        subprocess.Popen(command, env=child_environment(), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+        subprocess.Popen(
+            command,
+            env=child_environment(),
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
         for command in commands
     ]
     outputs = [job.communicate(timeout=240)[0] for job in jobs]
     assert [job.returncode for job in jobs] == [0] * JOBS, outputs
-    # A loaded machine may be too slow for the last words of some; sync is what makes up for that, and nothing else is.
+    # A loaded machine may be too slow for the last words of some; sync is what makes up for that,
+    # and nothing else is.
     for seed in range(JOBS):
         values = trial_values(runs, seed)
         mirror_trial(options(uri), TrialFolder.of(values).path, values)
@@ -47,7 +54,9 @@ def check_jobs(client: Any) -> None:
     for run in found:
         seed = int(run.data.tags["seed"])
         assert run.info.status == "FINISHED"
-        assert history(client, run.info.run_id, "train/loss") == [(i, 1 / i) for i in range(1, RECORDS + 1)]
+        assert history(client, run.info.run_id, "train/loss") == [
+            (i, 1 / i) for i in range(1, RECORDS + 1)
+        ]
         assert {value for _, value in history(client, run.info.run_id, "train/l1")} == {float(seed)}
         assert run.data.metrics["eval/gaussians"] == 10 + seed
     assert found_runs(client, "Default") == []

@@ -1,4 +1,5 @@
-"""The MLflow mirror: every metric arrives once and in the right experiment, and a bad tracker harms no trial."""
+"""The MLflow mirror: every metric arrives once and in the right experiment, and a bad tracker harms
+no trial."""
 
 from __future__ import annotations
 
@@ -49,9 +50,14 @@ def test_all_that_the_files_say_is_mirrored_once(runs: Path) -> None:
     assert run.info.status == "FINISHED"
     assert run.data.metrics["eval/psnr_dB"] == 20.0
     assert run.data.params["densify.name"] == "a_densify"
-    assert history(client, run.info.run_id, "train/loss") == [(i, 1 / i) for i in range(1, RECORDS + 1)]
+    assert history(client, run.info.run_id, "train/loss") == [
+        (i, 1 / i) for i in range(1, RECORDS + 1)
+    ]
     assert history(client, run.info.run_id, "train/densify/cloned") == [(50, 50.0), (100, 100.0)]
-    assert {item.path for item in client.list_artifacts(run.info.run_id)} >= {"config.yaml", "results.json"}
+    assert {item.path for item in client.list_artifacts(run.info.run_id)} >= {
+        "config.yaml",
+        "results.json",
+    }
 
 
 def test_a_crash_between_sending_and_noting_it_repeats_nothing(runs: Path) -> None:
@@ -60,7 +66,9 @@ def test_a_crash_between_sending_and_noting_it_repeats_nothing(runs: Path) -> No
     write_trial(folder, values)
     assert mirror_trial(options(), folder, values)
     state = json.loads((folder / STATE).read_text())
-    (folder / STATE).write_text(json.dumps(state | {"complete": None, "logged": {"metrics.jsonl": 70}}))
+    (folder / STATE).write_text(
+        json.dumps(state | {"complete": None, "logged": {"metrics.jsonl": 70}})
+    )
     assert mirror_trial(options(), folder, values)
     client = connect(None, runs)
     run = run_of(client, 2)
@@ -83,7 +91,9 @@ def test_results_that_changed_replace_the_run(runs: Path) -> None:
 def wait_for_run(folder: Path) -> None:
     """Wait until the trial's run is there and noted."""
     deadline = time.monotonic() + SECONDS
-    while "token" not in (json.loads((folder / STATE).read_text()) if (folder / STATE).exists() else {}):
+    while "token" not in (
+        json.loads((folder / STATE).read_text()) if (folder / STATE).exists() else {}
+    ):
         assert time.monotonic() < deadline
         time.sleep(0.1)
 
@@ -115,7 +125,9 @@ def test_curves_of_a_training_in_progress_are_followed(runs: Path, tmp_path: Pat
     client = connect(None, runs)
     seen = 0
     with following(options(), folder):
-        (folder / "building.json").write_text(json.dumps({"stage": "train", "folder": str(tmp_path)}))
+        (folder / "building.json").write_text(
+            json.dumps({"stage": "train", "folder": str(tmp_path)})
+        )
         (tmp_path / "metrics.jsonl").write_text('{"step": 10, "loss": 0.5}\n{"step": 20, "lo')
         wait_for_run(folder)
         deadline = time.monotonic() + SECONDS
@@ -129,7 +141,9 @@ def test_curves_of_a_training_in_progress_are_followed(runs: Path, tmp_path: Pat
 
 @pytest.mark.parametrize("uri", ["down", "not a database", "no such place", "nonsense"])
 @pytest.mark.slow
-def test_a_broken_tracker_harms_no_trial(uri: str, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_broken_tracker_harms_no_trial(
+    uri: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     (tmp_path / "broken.db").write_text("this is no database" * 100)
     address = {
         "down": f"http://127.0.0.1:{free_port()}",
@@ -141,7 +155,9 @@ def test_a_broken_tracker_harms_no_trial(uri: str, tmp_path: Path, caplog: pytes
     folder = begin_trial(values, address)
     with following(options(address), folder):
         write_trial(folder, values)
-    warnings = [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
+    warnings = [
+        record.getMessage() for record in caplog.records if record.levelno == logging.WARNING
+    ]
     assert any(text.startswith("tracking: ") and "gsbench sync" in text for text in warnings)
     assert all("\n" not in text for text in warnings)
     assert (folder / "results.json").exists()
@@ -156,8 +172,11 @@ def test_a_slow_tracker_is_not_waited_for(tmp_path: Path, caplog: pytest.LogCapt
         with following(slow, folder):
             write_trial(folder, values)
             mine = threading.active_count() - threads - tracker.threads
-    assert [record.getMessage().split(";")[0] for record in caplog.records] == ["tracking: MLflow is slow"]
-    assert mine <= 0  # no thread that the end of the interpreter could hit; one of before may have ended
+    assert [record.getMessage().split(";")[0] for record in caplog.records] == [
+        "tracking: MLflow is slow"
+    ]
+    # no thread that the end of the interpreter could hit; one of before may have ended
+    assert mine <= 0
     assert set(psutil.Process().children()) <= set(others)
 
 
@@ -173,7 +192,9 @@ def test_one_process_mirrors_all_trials_of_a_sweep(runs: Path) -> None:
                 with hold(folder / ".lock", "a trial"):
                     write_trial(folder, values)
             assert len(set(psutil.Process().children()) - others) == 1
-    shown = {run.data.tags["seed"]: run.info.status for run in found_runs(connect(None, runs), "tracked")}
+    shown = {
+        run.data.tags["seed"]: run.info.status for run in found_runs(connect(None, runs), "tracked")
+    }
     assert (shown["9"], shown["10"], shown["11"]) == ("FINISHED", "FINISHED", "KILLED")
 
 
@@ -189,7 +210,9 @@ def test_a_mirror_that_crashes_is_said_and_the_next_trial_has_another(
             if seed == 6:
                 for child in psutil.Process().children():
                     child.kill()
-    (said,) = [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
+    (said,) = [
+        record.getMessage() for record in caplog.records if record.levelno == logging.WARNING
+    ]
     assert "the mirror crashed (SIGKILL" in said
     assert "gsbench sync" in said
     run = run_of(connect(None, runs), 7)
@@ -204,11 +227,16 @@ def test_the_trials_process_loads_no_mlflow(runs: Path) -> None:
     code = (
         "import json, sys\nfrom pathlib import Path\nfrom gsbench.tracking import Mirror\n"
         "options, folder = json.loads(sys.argv[1])\n"
-        "with Mirror() as mirror: mirror.follow(Path(folder), options)\nsys.exit('mlflow' in sys.modules)"
+        "with Mirror() as mirror: mirror.follow(Path(folder), options)\nsys.exit('mlflow' in "
+        "sys.modules)"
     )
     words = json.dumps([options(), str(folder)])
     done = subprocess.run(
-        [sys.executable, "-c", code, words], env=child_environment(), capture_output=True, text=True, check=False
+        [sys.executable, "-c", code, words],
+        env=child_environment(),
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert (done.returncode, done.stderr) == (0, "")
 
@@ -217,10 +245,12 @@ def test_the_trials_process_loads_no_mlflow(runs: Path) -> None:
 def test_a_database_is_whole_or_absent(tmp_path: Path) -> None:
     """Killed while it makes the tables, a process leaves nothing that stops the next one."""
     code = (
-        "import sys; from pathlib import Path; from gsbench.tracking import connect; connect(None, Path(sys.argv[1]))"
+        "import sys; from pathlib import Path; from gsbench.tracking import connect; "
+        "connect(None, Path(sys.argv[1]))"
     )
     process = subprocess.Popen([sys.executable, "-c", code, str(tmp_path)], env=child_environment())
-    while bytes_written(tmp_path, ".mlflow.db.tmp-*[0-9]") == 0:  # not its journal, which comes and goes
+    # not its journal, which comes and goes
+    while bytes_written(tmp_path, ".mlflow.db.tmp-*[0-9]") == 0:
         assert process.poll() is None
         time.sleep(0.001)
     process.kill()
@@ -237,7 +267,10 @@ def test_switched_off_means_no_mlflow(tmp_path: Path) -> None:
         "with Mirror() as mirror: mirror.follow(Path('.'), o)\nsys.exit('mlflow' in sys.modules)"
     )
     assert (
-        subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=child_environment(), check=False).returncode == 0
+        subprocess.run(
+            [sys.executable, "-c", code], cwd=tmp_path, env=child_environment(), check=False
+        ).returncode
+        == 0
     )
 
 

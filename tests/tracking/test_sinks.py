@@ -50,7 +50,9 @@ def finished_trial(runs: Path, seed: int) -> tuple[Path, dict[str, Any]]:
     return folder, values
 
 
-def test_mlflow_shows_a_curve_of_the_final_metrics_and_a_grid_of_the_test_pictures(runs: Path) -> None:
+def test_mlflow_shows_a_curve_of_the_final_metrics_and_a_grid_of_the_test_pictures(
+    runs: Path,
+) -> None:
     folder, values = finished_trial(runs, seed=1)
     mirror_trial(options(), folder, values)
     client = connect(None, runs)
@@ -58,11 +60,18 @@ def test_mlflow_shows_a_curve_of_the_final_metrics_and_a_grid_of_the_test_pictur
     assert run.info.run_name == "a_densify · a_scene · s1"
     assert history(client, run.info.run_id, "eval/psnr_dB") == [(50, 15.0), (RECORDS, 20.0)]
     assert run.data.metrics["eval/psnr_dB"] == 20.0  # what the tables show is the last
-    assert run.data.tags["mlflow.loggedImages"] == "True"  # by which the page knows that it has a grid to show
+    # by which the page knows that it has a grid to show
+    assert run.data.tags["mlflow.loggedImages"] == "True"
     names = [Path(item.path).name for item in client.list_artifacts(run.info.run_id, "images")]
     for kind in ("1 render", "2 photograph", "3 error"):
-        assert [n for n in names if n.startswith(f"view 1_~{kind}+step+{RECORDS}+") and n.endswith(".png")], names
-    assert run.data.tags["mlflow.note.content"].startswith("PSNR (dB) 20, 11 Gaussians after 150 iterations.")
+        assert [
+            n
+            for n in names
+            if n.startswith(f"view 1_~{kind}+step+{RECORDS}+") and n.endswith(".png")
+        ], names
+    assert run.data.tags["mlflow.note.content"].startswith(
+        "PSNR (dB) 20, 11 Gaussians after 150 iterations."
+    )
 
 
 def test_the_summary_of_a_trial(tmp_path: Path) -> None:
@@ -76,19 +85,28 @@ def test_the_summary_of_a_trial(tmp_path: Path) -> None:
     assert found["eval/psnr_dB", 50].seconds == pytest.approx(2.0 * 50 / RECORDS)
     assert found["eval/psnr_dB", RECORDS].seconds == 2.0
     assert {key: scalar.value for (key, step), scalar in found.items() if step == RECORDS} == {
-        "eval/psnr_dB": 20.0, "eval/gaussians": 13.0, "eval/init_points": 5.0, "eval/peak_memory_MB": 1.5,
+        "eval/psnr_dB": 20.0,
+        "eval/gaussians": 13.0,
+        "eval/init_points": 5.0,
+        "eval/peak_memory_MB": 1.5,
         "eval/minutes": pytest.approx(2 / 60),
-    }  # fmt: skip
+    }
     assert summary.tags["hash_config"] == "abc"
     assert list(summary.pictures) == ["view 1_/1 render", "view 1_/2 photograph", "view 1_/3 error"]
     assert (summary.pictures["view 1_/3 error"] == 150).all()
     again = summary.note.splitlines()[-1].removeprefix("Again: ")
     assert again == "`gsbench densify=a_densify 'scene.path=/my photos'`"
     assert trial.summary(results, images=0, with_model=False).pictures == {}
-    assert {path.name for _, path in summary.files} == {"config.yaml", "results.json", "events.jsonl"}
+    assert {path.name for _, path in summary.files} == {
+        "config.yaml",
+        "results.json",
+        "events.jsonl",
+    }
 
 
-def test_weights_and_biases_gets_all_of_a_trial_in_one_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_weights_and_biases_gets_all_of_a_trial_in_one_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """With a stand-in for its client, which notes what it is told."""
     wandb = MagicMock()
     monkeypatch.setitem(sys.modules, "wandb", wandb)
@@ -108,11 +126,15 @@ def test_weights_and_biases_gets_all_of_a_trial_in_one_run(tmp_path: Path, monke
     assert {"iteration": 50, "eval/psnr_dB": 15.0} in logged
     assert [row["iteration"] for row in logged if "view 1_/1 render" in row] == [RECORDS]
     assert run.summary.update.call_args.args[0]["eval/psnr_dB"] == 20.0
-    assert {Path(call.args[0]).name for call in run.save.call_args_list} >= {"config.yaml", "results.json"}
+    assert {Path(call.args[0]).name for call in run.save.call_args_list} >= {
+        "config.yaml",
+        "results.json",
+    }
     run.finish.assert_called_once_with(0)
     write_trial(folder, values, psnr=33.0)
     assert mirror_trial(sink, folder, values)
-    assert wandb.init.call_args.kwargs["id"] != asked["id"]  # the run with earlier results stays beside it
+    # the run with earlier results stays beside it
+    assert wandb.init.call_args.kwargs["id"] != asked["id"]
     (folder / "results.json").unlink()
     (folder / "failed.json").write_text(json.dumps({"message": "the loss became nan"}))
     assert mirror_trial(sink, folder, values)
@@ -123,18 +145,28 @@ def test_weights_and_biases_gets_all_of_a_trial_in_one_run(tmp_path: Path, monke
 def test_experiments_open_as_machine_learning(runs: Path) -> None:
     client = connect(None, runs)
     tag = "mlflow.experimentKind"
-    assert client.get_experiment(ensure_experiment(client, "kind", runs)).tags[tag] == "custom_model_development"
-    plain, chosen = client.create_experiment("plain"), client.create_experiment("chosen", tags={tag: "regression"})
+    assert (
+        client.get_experiment(ensure_experiment(client, "kind", runs)).tags[tag]
+        == "custom_model_development"
+    )
+    plain, chosen = (
+        client.create_experiment("plain"),
+        client.create_experiment("chosen", tags={tag: "regression"}),
+    )
     assert ensure_experiment(client, "plain", runs) == plain
     assert client.get_experiment(plain).tags[tag] == "custom_model_development"
     ensure_experiment(client, "chosen", runs)
     assert client.get_experiment(chosen).tags[tag] == "regression"  # what somebody chose stays
 
 
-def test_a_tracker_whose_package_is_missing_is_refused_before_any_work(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_tracker_whose_package_is_missing_is_refused_before_any_work(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setitem(sys.modules, "wandb", None)
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    with pytest.raises(InputError, match=r"tracking.sink=wandb needs a package: pip install .*\[wandb\]"):
+    with pytest.raises(
+        InputError, match=r"tracking.sink=wandb needs a package: pip install .*\[wandb\]"
+    ):
         check_trackers([compose_one(["tracking=wandb"])])
     check_trackers([compose_one(["tracking=none"])])
 
@@ -157,14 +189,19 @@ def test_tensorboard_shows_the_same_numbers_once(tmp_path: Path) -> None:
         assert len(list(there.iterdir())) == 1
         losses = [(event.step, event.value) for event in shown().Scalars("train/loss")]
         assert losses == [(i, pytest.approx(1 / i)) for i in range(1, RECORDS + 1)]
-        assert [(event.step, event.value) for event in shown().Scalars("eval/psnr_dB")] == [(50, 15.0), (RECORDS, 20.0)]
+        assert [(event.step, event.value) for event in shown().Scalars("eval/psnr_dB")] == [
+            (50, 15.0),
+            (RECORDS, 20.0),
+        ]
         assert [event.step for event in shown().Images("view 1_/1 render")] == [RECORDS]
         state = json.loads((folder / "tensorboard.json").read_text())
         (folder / "tensorboard.json").write_text(json.dumps(state | {"complete": None}))
     assert not (folder / STATE).exists()
 
 
-def test_weights_and_biases_takes_a_trial_without_a_network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_weights_and_biases_takes_a_trial_without_a_network(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     pytest.importorskip("wandb", reason="needs wandb")
     monkeypatch.setenv("WANDB_MODE", "offline")
     folder, values = finished_trial(tmp_path, seed=1)

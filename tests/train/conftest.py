@@ -23,7 +23,9 @@ def orbit_camera(angle: float, width: int = 40, height: int = 32) -> Camera:
 
 @pytest.fixture(scope="session")
 def truth() -> Gaussians:
-    gaussians = random_gaussians(80, seed=2, dtype=torch.float32, log_scale=(-2.5, -1.0), depth=(3.0, 5.0))
+    gaussians = random_gaussians(
+        80, seed=2, dtype=torch.float32, log_scale=(-2.5, -1.0), depth=(3.0, 5.0)
+    )
     gaussians.opacity_logits += 2
     return gaussians
 
@@ -36,7 +38,9 @@ def tiny_scene(truth: Gaussians) -> Scene:
         camera = orbit_camera(float(angle))
         with torch.no_grad():
             image = ReferenceRasterizer().render(truth, camera, 0, torch.zeros(3)).image
-        views.append(View(f"{i:02d}.png", camera, (image.clamp(0, 1) * 255).round().to(torch.uint8).numpy()))
+        views.append(
+            View(f"{i:02d}.png", camera, (image.clamp(0, 1) * 255).round().to(torch.uint8).numpy())
+        )
     test = {0, 8}
     return Scene(
         "tiny",

@@ -32,7 +32,8 @@ DENSIFIERS = {
 
 def main(raster: str) -> None:
     Readback.arrived = property(lambda self: False)  # type: ignore[assignment, method-assign]
-    staged._check_background = lambda background: None  # on a GPU its values are not looked at there
+    # on a GPU its values are not looked at there
+    staged._check_background = lambda background: None
     gaussians, scene = make_scene("trained", 20, 20, 12)
     for name, densifier in DENSIFIERS.items():
         rasterizer = create_rasterizer(raster, torch.device("cpu"))

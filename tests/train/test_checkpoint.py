@@ -36,7 +36,9 @@ def equal(first: object, second: object) -> bool:
     if isinstance(first, torch.Tensor):
         return torch.equal(first, second)  # type: ignore[arg-type]
     if isinstance(first, dict):
-        return first.keys() == second.keys() and all(equal(first[key], second[key]) for key in first)  # type: ignore
+        return first.keys() == second.keys() and all(
+            equal(first[key], second[key]) for key in first
+        )  # type: ignore
     return first == second
 
 
@@ -44,12 +46,17 @@ def test_newest_is_loaded_and_two_are_kept(tmp_path: Path) -> None:
     assert load_checkpoint(tmp_path) is None
     for step in (10, 20, 30):
         save_checkpoint(tmp_path, step, state(step))
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["checkpoint-00000020.pt", "checkpoint-00000030.pt"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "checkpoint-00000020.pt",
+        "checkpoint-00000030.pt",
+    ]
     loaded = load_checkpoint(tmp_path)
     assert equal(loaded, state(30))
 
 
-def test_the_folder_is_synced_and_the_thread_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_folder_is_synced_and_the_thread_ends(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     synced = []
     monkeypatch.setattr(checkpoint, "sync_to_disk", synced.append)
     writer = CheckpointWriter(tmp_path, background=True)
@@ -103,7 +110,9 @@ def test_nothing_in_a_checkpoint_is_run_as_code(tmp_path: Path) -> None:
     assert not (tmp_path / "hacked").exists()
 
 
-def test_failed_write_leaves_the_old_one_and_no_temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failed_write_leaves_the_old_one_and_no_temporary(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     save_checkpoint(tmp_path, 10, state(10))
 
     def full(*arguments: object) -> None:
@@ -118,14 +127,21 @@ def test_failed_write_leaves_the_old_one_and_no_temporary(tmp_path: Path, monkey
 def test_in_the_background_the_state_is_that_of_the_moment(tmp_path: Path) -> None:
     """The training goes on, in place, while the thread writes."""
     writer = CheckpointWriter(tmp_path, background=True)
-    live = {"step": 0, "nested": [{"tensor": torch.zeros(2_000_000)}], "view": torch.arange(6).view(2, 3)[:, 1]}
+    live = {
+        "step": 0,
+        "nested": [{"tensor": torch.zeros(2_000_000)}],
+        "view": torch.arange(6).view(2, 3)[:, 1],
+    }
     for step in (1, 2, 3):
         live["step"] = step
         live["nested"][0]["tensor"].fill_(step)  # type: ignore[index]
         writer.save(step, live)
         live["nested"][0]["tensor"].fill_(-1)  # type: ignore[index]
     writer.close()
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["checkpoint-00000002.pt", "checkpoint-00000003.pt"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "checkpoint-00000002.pt",
+        "checkpoint-00000003.pt",
+    ]
     loaded = load_checkpoint(tmp_path)
     assert loaded is not None
     assert loaded["step"] == 3
@@ -133,27 +149,39 @@ def test_in_the_background_the_state_is_that_of_the_moment(tmp_path: Path) -> No
     assert torch.equal(loaded["view"], live["view"])  # type: ignore[arg-type]
 
 
-def test_an_error_in_the_background_is_raised_and_not_lost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_error_in_the_background_is_raised_and_not_lost(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     writer = CheckpointWriter(tmp_path, background=True)
     writer.save(10, state(10))
     writer.finish()
     with monkeypatch.context() as patch:
-        patch.setattr(torch, "save", lambda *arguments: (_ for _ in ()).throw(OSError(28, "No space left on device")))
+        patch.setattr(
+            torch,
+            "save",
+            lambda *arguments: (_ for _ in ()).throw(OSError(28, "No space left on device")),
+        )
         writer.save(20, state(20))
         with pytest.raises(OSError, match="No space left"):
             writer.save(30, state(30))
     writer.save(40, state(40))
     writer.close()
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["checkpoint-00000010.pt", "checkpoint-00000040.pt"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "checkpoint-00000010.pt",
+        "checkpoint-00000040.pt",
+    ]
 
 
 def test_a_state_goes_to_another_device_whole() -> None:
-    """Nothing of a checkpoint stays on the CPU that the model's device needs, and the other way round."""
+    """Nothing of a checkpoint stays on the CPU that the model's device needs, and the other way
+    round."""
     rates = LearningRates()
     gaussians = TrainableGaussians(random_gaussians(5, seed=0, dtype=torch.float32), rates, 1.0)
     gaussians.values.means.square().sum().backward()
     gaussians.optimizer_step()
-    moved = TrainableGaussians.load(to_host(gaussians.state_dict()), rates, 1.0, torch.device("meta"))
+    moved = TrainableGaussians.load(
+        to_host(gaussians.state_dict()), rates, 1.0, torch.device("meta")
+    )
     assert {tensor.device.type for tensor in moved.values.tensors().values()} == {"meta"}
     moments = moved.adam["means"]
     assert {moments.first.device.type, moments.second.device.type} == {"meta"}
@@ -162,7 +190,8 @@ def test_a_state_goes_to_another_device_whole() -> None:
 @pytest.mark.parametrize("background", [False, True])
 def test_killed_while_writing_leaves_a_readable_one(background: bool, tmp_path: Path) -> None:
     code = (
-        "import sys, torch; from pathlib import Path; from gsbench.train.checkpoint import CheckpointWriter\n"
+        "import sys, torch; from pathlib import Path; from gsbench.train.checkpoint import "
+        "CheckpointWriter\n"
         f"writer = CheckpointWriter(Path(sys.argv[1]), {background})\n"
         "for step in range(1, 10**6):\n"
         "    writer.save(step, {'step': step, 'tensor': torch.full((200_000,), float(step))})\n"
@@ -172,7 +201,9 @@ def test_killed_while_writing_leaves_a_readable_one(background: bool, tmp_path: 
     deadline = time.monotonic() + 60
     while last < 3 and time.monotonic() < deadline:
         time.sleep(0.05)
-        last = max((int(path.stem.split("-")[1]) for path in tmp_path.glob("checkpoint-*.pt")), default=0)
+        last = max(
+            (int(path.stem.split("-")[1]) for path in tmp_path.glob("checkpoint-*.pt")), default=0
+        )
     time.sleep(0.037)
     process.send_signal(signal.SIGKILL)
     process.wait()

@@ -1,4 +1,5 @@
-"""Arms under the governor, in whole trainings: one count at the end, equal numbers of rounds, thresholds on record."""
+"""Arms under the governor, in whole trainings: one count at the end, equal numbers of rounds,
+thresholds on record."""
 
 from __future__ import annotations
 
@@ -24,7 +25,10 @@ ARMS: dict[str, tuple[type[Budgeted], dict[str, object]]] = {
     "adc, a loose threshold": (ADC, {"gradient_threshold": 2e-5}),
     "absgrad": (ADC, {"gradient": "absolute", "gradient_threshold": 8e-4}),
     "volumetric": (Volumetric, {"volume_threshold": 0.003}),
-    "volumetric, not the round": (Volumetric, {"volume_threshold": 0.003, "split_isotropic": False}),
+    "volumetric, not the round": (
+        Volumetric,
+        {"volume_threshold": 0.003, "split_isotropic": False},
+    ),
     "volumetric, its tail": (Volumetric, {"threshold_mode": "quantile", "volume_quantile": 0.9}),
     "pixelgs": (PixelGS, {}),
     "mcmc": (MCMC, {}),
@@ -40,9 +44,13 @@ def test_arms_end_within_two_percent_of_one_count(
     if kind is not MCMC:
         own = own | {"opacity_reset_interval": 120}  # in the middle of the window
     densifier = kind(**(WINDOW | own))  # type: ignore[arg-type]
-    initial = gaussians_from_cloud(truth.means.double().numpy(), torch.full((len(truth), 3), 127).byte().numpy())
+    initial = gaussians_from_cloud(
+        truth.means.double().numpy(), torch.full((len(truth), 3), 127).byte().numpy()
+    )
     rasterizer = create_rasterizer("cpu", torch.device("cpu"), threads=1)
-    trained = Trainer(tiny_scene, initial, densifier, rasterizer, options(iterations=260), 0).run(tmp_path)
+    trained = Trainer(tiny_scene, initial, densifier, rasterizer, options(iterations=260), 0).run(
+        tmp_path
+    )
     assert len(trained) == pytest.approx(LIMIT, rel=0.02)
     events = [json.loads(line) for line in (tmp_path / "events.jsonl").read_text().splitlines()]
     rounds = [event for event in events if "target" in event]
@@ -53,9 +61,13 @@ def test_arms_end_within_two_percent_of_one_count(
     assert all(1e-3 <= factor <= 1e3 for factor in strictness)
 
 
-def trained(densifier: Budgeted, scene: Scene, truth: Gaussians, folder: Path) -> list[dict[str, float]]:
+def trained(
+    densifier: Budgeted, scene: Scene, truth: Gaussians, folder: Path
+) -> list[dict[str, float]]:
     """The rounds of a training of 260 iterations."""
-    initial = gaussians_from_cloud(truth.means.double().numpy(), torch.full((len(truth), 3), 127).byte().numpy())
+    initial = gaussians_from_cloud(
+        truth.means.double().numpy(), torch.full((len(truth), 3), 127).byte().numpy()
+    )
     rasterizer = create_rasterizer("cpu", torch.device("cpu"), threads=1)
     Trainer(scene, initial, densifier, rasterizer, options(iterations=260), 0).run(folder)
     events = [json.loads(line) for line in (folder / "events.jsonl").read_text().splitlines()]
@@ -65,8 +77,14 @@ def trained(densifier: Budgeted, scene: Scene, truth: Gaussians, folder: Path) -
 def test_where_the_strictest_growth_is_too_much_the_faint_are_culled(
     tiny_scene: Scene, truth: Gaussians, tmp_path: Path
 ) -> None:
-    """A threshold in other units than the scene's: a thousandth of it and a thousand times it select everybody."""
-    own = {"volume_threshold": 1e-24, "prune_opacity": 0.03, "opacity_reset_interval": 1000, "max_gaussians": 120}
+    """A threshold in other units than the scene's: a thousandth of it and a thousand times it
+    select everybody."""
+    own = {
+        "volume_threshold": 1e-24,
+        "prune_opacity": 0.03,
+        "opacity_reset_interval": 1000,
+        "max_gaussians": 120,
+    }
     rounds = trained(Volumetric(**(WINDOW | own)), tiny_scene, truth, tmp_path)  # type: ignore[arg-type]
     culled = [event for event in rounds if event["cull"] > 1]
     assert culled
@@ -74,17 +92,31 @@ def test_where_the_strictest_growth_is_too_much_the_faint_are_culled(
         assert event["strictness"] == pytest.approx(1e3)
         assert event["cull"] <= 10
         assert event["pruned_opacity"] > 0
-        assert event["after"] == event["before"] + event["split_volume"] + event["split_gradient"] + event["cloned"] - (
-            event["pruned_opacity"] + event["pruned_size"]
-        )
+        assert event["after"] == event["before"] + event["split_volume"] + event[
+            "split_gradient"
+        ] + event["cloned"] - (event["pruned_opacity"] + event["pruned_size"])
 
 
-def test_a_frozen_training_changes_nothing_more(tiny_scene: Scene, truth: Gaussians, tmp_path: Path) -> None:
-    """The first round beyond the limit is the last that does anything, and the later ones say what they would add."""
-    own = {"cap": "freeze", "max_gaussians": 100, "gradient_threshold": 1e-6, "opacity_reset_interval": 1000}
+def test_a_frozen_training_changes_nothing_more(
+    tiny_scene: Scene, truth: Gaussians, tmp_path: Path
+) -> None:
+    """The first round beyond the limit is the last that does anything, and the later ones say what
+    they would add."""
+    own = {
+        "cap": "freeze",
+        "max_gaussians": 100,
+        "gradient_threshold": 1e-6,
+        "opacity_reset_interval": 1000,
+    }
     rounds = trained(ADC(**(WINDOW | own)), tiny_scene, truth, tmp_path)  # type: ignore[arg-type]
     beyond = [event for event in rounds if event["before"] > 100]
     assert len(beyond) > 3
-    assert {event["before"] for event in beyond} == {event["after"] for event in beyond} == {rounds[0]["after"]}
+    assert (
+        {event["before"] for event in beyond}
+        == {event["after"] for event in beyond}
+        == {rounds[0]["after"]}
+    )
     assert all(event["blocked_by_cap"] > 0 for event in beyond)
-    assert not any(event["pruned_opacity"] + event["cloned"] + event["split_gradient"] for event in beyond)
+    assert not any(
+        event["pruned_opacity"] + event["cloned"] + event["split_gradient"] for event in beyond
+    )

@@ -1,4 +1,5 @@
-"""Losses from a device that is behind are the same losses, one that is not finite passes no checkpoint; and volumes."""
+"""Losses from a device that is behind are the same losses, one that is not finite passes no
+checkpoint; and volumes."""
 
 from __future__ import annotations
 
@@ -68,7 +69,9 @@ def test_readers_see_a_record_at_once(tmp_path: Path) -> None:
 
 def test_volumes_are_counted_by_quarter_decades() -> None:
     """One by one; what is beyond the ends counts in the outermost bins."""
-    log_scales = torch.randn(500, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64) * 4 - 4
+    log_scales = (
+        torch.randn(500, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64) * 4 - 4
+    )
     log_scales[0], log_scales[1] = -50.0, 50.0
     counts = [0] * 84
     for scales in log_scales.exp().tolist():

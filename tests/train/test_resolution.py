@@ -1,4 +1,5 @@
-"""The schedule of sizes against a restatement of the rule; small pictures, the count that follows, and resuming."""
+"""The schedule of sizes against a restatement of the rule; small pictures, the count that follows,
+and resuming."""
 
 from __future__ import annotations
 
@@ -13,7 +14,18 @@ import torch
 from numpy.typing import NDArray
 
 from gsbench.analysis.differences import ingredients
-from gsbench.densify import ADC, GNS, MCMC, MRNF, Densifier, DensifyContext, EdgeAware, FastGS, Refinement, SteepGS
+from gsbench.densify import (
+    ADC,
+    GNS,
+    MCMC,
+    MRNF,
+    Densifier,
+    DensifyContext,
+    EdgeAware,
+    FastGS,
+    Refinement,
+    SteepGS,
+)
 from gsbench.events import RefineEvent
 from gsbench.gaussians.model import Gaussians
 from gsbench.raster import create_rasterizer
@@ -21,7 +33,13 @@ from gsbench.raster.base import Rasterizer
 from gsbench.runs.keys import config_hash
 from gsbench.scene.types import Scene, View
 from gsbench.train.options import TrainConfig
-from gsbench.train.resolution import Resolution, ScaledViews, ScaleSchedule, _window_energies, scale_schedule
+from gsbench.train.resolution import (
+    Resolution,
+    ScaledViews,
+    ScaleSchedule,
+    _window_energies,
+    scale_schedule,
+)
 from gsbench.train.trainer import Status, Trainer
 from gsbench.train.views import Targets
 from tests.config.test_schema import composed
@@ -35,10 +53,14 @@ SHORT = {"densify_start": 20, "densify_stop": 100, "densify_interval": 20}
 def soft_pictures(count: int, height: int, width: int, seed: int) -> list[NDArray[np.uint8]]:
     """Noise whose amplitude falls with the frequency, as that of photographs does."""
     rng = np.random.default_rng(seed)
-    frequency = np.hypot(np.fft.fftfreq(height)[:, None] * height, np.fft.fftfreq(width)[None] * width) + 1
+    frequency = (
+        np.hypot(np.fft.fftfreq(height)[:, None] * height, np.fft.fftfreq(width)[None] * width) + 1
+    )
     pictures = []
     for k in range(count):
-        noise = np.fft.fft2(rng.normal(size=(height, width, 3)), axes=(0, 1)) / frequency[..., None] ** (1.3 + 0.1 * k)
+        noise = np.fft.fft2(rng.normal(size=(height, width, 3)), axes=(0, 1)) / frequency[
+            ..., None
+        ] ** (1.3 + 0.1 * k)
         wave = np.fft.ifft2(noise, axes=(0, 1)).real
         pictures.append((255 * (wave - wave.min()) / np.ptp(wave)).astype(np.uint8))
     return pictures
@@ -50,7 +72,11 @@ def stated_again(pictures: list[NDArray[np.uint8]], until: int) -> list[int]:
 
     def window(spectrum: NDArray[np.float64], scale: float) -> float:
         tall, wide = int(height / scale) // 2, int(width / scale) // 2
-        return float(spectrum[height // 2 - tall : height // 2 + tall, width // 2 - wide : width // 2 + wide].sum())
+        return float(
+            spectrum[
+                height // 2 - tall : height // 2 + tall, width // 2 - wide : width // 2 + wide
+            ].sum()
+        )
 
     def solve(spectrum: NDArray[np.float64], share: float) -> float:
         low, high = 0.0, 1.0
@@ -68,16 +94,22 @@ def stated_again(pictures: list[NDArray[np.uint8]], until: int) -> list[int]:
     first, whole = window(mean, largest), float(mean.sum())
     shares = [first + (whole - first) * i / 31 for i in range(32)]
     scales = [largest, *(solve(mean, share) for share in shares[1:-1]), 1.0]
-    begins = [int(until * math.log(share / first) / math.log(whole / first)) for share in shares[:-1]] + [until]
+    begins = [
+        int(until * math.log(share / first) / math.log(whole / first)) for share in shares[:-1]
+    ] + [until]
     answers = []
     for step in range(until):
         i = max(k for k in range(32) if begins[k] <= step)
         way = (step - begins[i]) / (begins[i + 1] - begins[i])
-        answers.append(int((scales[i] ** -2 + way * (scales[i + 1] ** -2 - scales[i] ** -2)) ** -0.5 + 1e-9))
+        answers.append(
+            int((scales[i] ** -2 + way * (scales[i + 1] ** -2 - scales[i] ** -2)) ** -0.5 + 1e-9)
+        )
     return [*answers, 1]
 
 
-@pytest.mark.parametrize(("height", "width", "until"), [(48, 64, 1000), (90, 60, 15_000), (40, 40, 300)])
+@pytest.mark.parametrize(
+    ("height", "width", "until"), [(48, 64, 1000), (90, 60, 15_000), (40, 40, 300)]
+)
 def test_the_schedule_of_sizes(height: int, width: int, until: int) -> None:
     pictures = soft_pictures(3, height, width, height)
     found = scale_schedule(pictures, until)
@@ -96,7 +128,8 @@ def test_pictures_of_several_shapes_and_without_content() -> None:
     assert list(found.scales) == sorted(found.scales, reverse=True)
     black = scale_schedule([*mixed, np.zeros((8, 8, 3), np.uint8)], 500)
     assert {black.at(step) for step in range(501)} == {1}
-    grey = scale_schedule([np.full((8, 8, 3), 99, np.uint8)], 500)  # all is the mean: any size shows it
+    # all is the mean: any size shows it
+    grey = scale_schedule([np.full((8, 8, 3), 99, np.uint8)], 500)
     assert grey.at(500) == 1
 
 
@@ -109,7 +142,9 @@ def weights(size: int, smaller: int) -> NDArray[np.float64]:
 
 
 @pytest.mark.parametrize(("scale", "height", "width"), [(2, 16, 20), (3, 10, 13), (8, 4, 5)])
-def test_a_small_picture_is_the_filtered_one_from_the_same_place(scale: int, height: int, width: int) -> None:
+def test_a_small_picture_is_the_filtered_one_from_the_same_place(
+    scale: int, height: int, width: int
+) -> None:
     camera = orbit_camera(0.3)
     (image,) = soft_pictures(1, camera.height, camera.width, 5)
     view = View("a.png", camera, image)
@@ -120,21 +155,28 @@ def test_a_small_picture_is_the_filtered_one_from_the_same_place(scale: int, hei
     expected = np.einsum("ih,hwc,jw->ijc", rows, image / 1.0, columns)
     assert np.abs(targets.get(0).numpy() - expected).max() <= 0.5 + 1e-4
     x, y, z = camera.rotation @ np.array([0.1, -0.2, 0.3]) + camera.translation
-    across, down = (camera.fx * x / z + camera.cx) / camera.width, (camera.fy * y / z + camera.cy) / camera.height
+    across, down = (
+        (camera.fx * x / z + camera.cx) / camera.width,
+        (camera.fy * y / z + camera.cy) / camera.height,
+    )
     assert (small.fx * x / z + small.cx) / width == pytest.approx(across)
     assert (small.fy * y / z + small.cy) / height == pytest.approx(down)
 
 
 @pytest.mark.parametrize(("height", "width"), [(7, 5), (8, 5), (6, 4)])
 def test_the_energy_within_a_window(height: int, width: int) -> None:
-    """A window has as many pixels on either side of frequency zero; the last is the whole spectrum."""
+    """A window has as many pixels on either side of frequency zero; the last is the whole
+    spectrum."""
     (picture,) = soft_pictures(1, height, width, 3)
     spectrum = sum(np.abs(np.fft.fftshift(np.fft.fft2(picture[..., c] / 255.0))) for c in range(3))
     fractions = np.array([0.0, 0.4, 0.8, 1.0])
     found = _window_energies(picture, fractions)
     for fraction, energy in zip(fractions[:-1], found, strict=False):
         tall, wide = int(height * fraction / 2), int(width * fraction / 2)
-        rows, columns = (slice(side // 2 - half, side // 2 + half) for side, half in ((height, tall), (width, wide)))
+        rows, columns = (
+            slice(side // 2 - half, side // 2 + half)
+            for side, half in ((height, tall), (width, wide))
+        )
         assert energy == pytest.approx(float(spectrum[rows, columns].sum()))
     assert found[-1] == pytest.approx(float(spectrum.sum()))
 
@@ -190,7 +232,9 @@ def test_the_count_that_a_round_may_reach(tiny_scene: Scene) -> None:
     assert limit(60, 10_000, most=4100) == 100 + int(4000 / 3 ** (2 - 0.6))
     assert limit(80, 10_000, most=4100) == 4100  # the last round
     assert limit(80, 1000, most=4100) == 1200
-    resolution.observe(RefineEvent(step=40, before=0, cloned=2, split_gradient=3, split_volume=4, blocked_by_cap=5))
+    resolution.observe(
+        RefineEvent(step=40, before=0, cloned=2, split_gradient=3, split_volume=4, blocked_by_cap=5)
+    )
     assert resolution.momentum == int(0.98 * 500 + 14)
     resolution.momentum = 50_000_000
     resolution.observe(RefineEvent(step=40, before=0, cloned=5_000_000))
@@ -207,7 +251,12 @@ def test_caps_of_a_curve_of_their_own_keep_it() -> None:
         limits.append(most)
         return 7
 
-    for cap, allowed, asked in (("soft", 2, [None]), ("hard", 2, [9]), ("curve", 0, []), ("governor", None, [])):
+    for cap, allowed, asked in (
+        ("soft", 2, [None]),
+        ("hard", 2, [9]),
+        ("curve", 0, []),
+        ("governor", None, []),
+    ):
         densifier = ADC(max_gaussians=9, cap=cap)  # type: ignore[arg-type]
         gaussians = random_gaussians(5, 0)
         densifier.begin(gaussians, DensifyContext(1.0, limit=limit))
@@ -231,7 +280,9 @@ def rasterizer() -> Rasterizer:
         lambda: small(EdgeAware, max_gaussians=200, cap="root"),
         lambda: MCMC(start=20, stop=110, interval=20),
         lambda: MRNF(start=0, stop=110, interval=20, decay_until=120),
-        lambda: GNS(start=20, stop=60, interval=20, max_gaussians=90, pressure_length=1.0, overgrowth=2.0),
+        lambda: GNS(
+            start=20, stop=60, interval=20, max_gaussians=90, pressure_length=1.0, overgrowth=2.0
+        ),
     ],
     ids=["adc", "fastgs", "steepgs", "edgeaware", "mcmc", "mrnf", "gns"],
 )
@@ -269,7 +320,8 @@ def test_interrupted_in_the_middle_it_ends_in_the_same_bits(
 def test_masks_are_as_small_as_their_pictures(
     tiny_scene: Scene, truth: Gaussians, rasterizer: Rasterizer, tmp_path: Path
 ) -> None:
-    """What a mask ignores has no part in a small picture either: whatever stands there, the training is the same."""
+    """What a mask ignores has no part in a small picture either: whatever stands there, the
+    training is the same."""
     trained = []
     for value in (0, 255):
         views = []
@@ -282,7 +334,9 @@ def test_masks_are_as_small_as_their_pictures(
         scene = replace(tiny_scene, train=tuple(views))
         folder = tmp_path / str(value)
         folder.mkdir()
-        settings = options(resolution_schedule="pictures", iterations=30, position_steps=30, **SHORT)
+        settings = options(
+            resolution_schedule="pictures", iterations=30, position_steps=30, **SHORT
+        )
         trainer = Trainer(scene, cloud(truth), small(), rasterizer, settings, 0)
         trainer.resolution.schedule = ScaleSchedule((0, 100), (2.0, 1.0))  # type: ignore[union-attr]
         assert trainer.scaled_views.at(2)[1].mask(0).shape == (16, 20, 1)  # type: ignore[union-attr]
@@ -299,7 +353,9 @@ def test_pictures_alone_leave_the_count_to_the_densifier(
         folder.mkdir()
         settings = options(resolution_schedule=kind, **SHORT)
         Trainer(tiny_scene, cloud(truth), small(), rasterizer, settings, 0).run(folder)
-        counts[kind] = [json.loads(line) for line in (folder / "events.jsonl").read_text().splitlines()]
+        counts[kind] = [
+            json.loads(line) for line in (folder / "events.jsonl").read_text().splitlines()
+        ]
     assert any(event["blocked_by_cap"] for event in counts["pictures_and_count"])
     assert not any(event["blocked_by_cap"] for event in counts["pictures"] + counts["none"])
     for event in counts["pictures_and_count"]:
@@ -311,19 +367,29 @@ def test_it_is_an_ingredient_of_its_own_and_in_the_hash() -> None:
     without, with_it = composed(), composed("train.resolution_schedule=pictures")
     assert config_hash(without) != config_hash(with_it)
     plain = {"densify._target_": "gsbench.densify.ADC", "train.resolution_schedule": "none"}
-    assert ingredients(plain, plain | {"train.resolution_schedule": "pictures"}) == ("resolution schedule",)
+    assert ingredients(plain, plain | {"train.resolution_schedule": "pictures"}) == (
+        "resolution schedule",
+    )
 
 
 def test_a_name_that_is_none_is_refused() -> None:
     with pytest.raises(
-        ValueError, match=r"train\.resolution_schedule must be 'none', 'pictures' or 'pictures_and_count'"
+        ValueError,
+        match=r"train\.resolution_schedule must be 'none', 'pictures' or 'pictures_and_count'",
     ):
         TrainConfig(name="x", resolution_schedule="spectrum")  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
     ("scales", "full"),
-    [((8.0, 4.0, 2.0, 1.0), 200), ((8.0, 2.5, 1.9, 1.0), 100), ((1.9, 1.5, 1.2, 1.0), 0), ((3.0, 1.0, 1.0, 1.0), 0)],
+    [
+        ((8.0, 4.0, 2.0, 1.0), 200),
+        ((8.0, 2.5, 1.9, 1.0), 100),
+        ((1.9, 1.5, 1.2, 1.0), 0),
+        ((3.0, 1.0, 1.0, 1.0), 0),
+    ],
 )
-def test_full_pictures_begin_where_the_last_scale_of_two_or_more_ends(scales: tuple[float, ...], full: int) -> None:
+def test_full_pictures_begin_where_the_last_scale_of_two_or_more_ends(
+    scales: tuple[float, ...], full: int
+) -> None:
     assert ScaleSchedule((0, 100, 200, 300), scales).full_from == full

@@ -1,4 +1,5 @@
-"""What is said of initial points before a training, for a scene whose points and colours are known."""
+"""What is said of initial points before a training, for a scene whose points and colours are
+known."""
 
 from __future__ import annotations
 
@@ -33,12 +34,15 @@ def scene() -> Scene:
         camera = orbit_camera(float(angle))
         rows, columns = np.mgrid[: camera.height, : camera.width] + 0.5
         rays = np.stack(
-            [(columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy, np.ones_like(rows)], axis=-1
+            [(columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy, np.ones_like(rows)],
+            axis=-1,
         )
         rays = rays @ camera.rotation  # [H, W, 3] in world axes
         depth = (WALL_Z - camera.center[2]) / rays[..., 2]
         hits = (camera.center + depth[..., None] * rays).reshape(-1, 3)
-        views.append(View(f"{index}.png", camera, wall_color(hits).reshape(camera.height, camera.width, 3)))
+        views.append(
+            View(f"{index}.png", camera, wall_color(hits).reshape(camera.height, camera.width, 3))
+        )
     return Scene("wall", tuple(views[1:]), tuple(views[:1]))
 
 
@@ -72,9 +76,15 @@ def test_a_sound_cloud_is_seen_agrees_and_raises_no_doubt(
     ],
 )
 def test_intrinsics_that_no_lens_has_are_named_once(
-    scene: Scene, cloud: tuple[np.ndarray, np.ndarray], change, said: str, caplog: pytest.LogCaptureFixture
+    scene: Scene,
+    cloud: tuple[np.ndarray, np.ndarray],
+    change,
+    said: str,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
-    train = tuple(replace(view, camera=replace(view.camera, **change(view.camera))) for view in scene.train)
+    train = tuple(
+        replace(view, camera=replace(view.camera, **change(view.camera))) for view in scene.train
+    )
     changed = replace(scene, train=train)
     lines = odd_lenses(changed)
     assert len(lines) == bool(said)
@@ -88,7 +98,9 @@ def test_intrinsics_that_no_lens_has_are_named_once(
 
 
 @pytest.mark.parametrize("level", [0, 1, 128, 255])
-def test_a_cloud_without_colours_is_warned_of(scene: Scene, cloud: tuple[np.ndarray, np.ndarray], level: int) -> None:
+def test_a_cloud_without_colours_is_warned_of(
+    scene: Scene, cloud: tuple[np.ndarray, np.ndarray], level: int
+) -> None:
     points, colors = cloud
     plain = np.full_like(colors, level)
     assert check_start(points, plain, scene, random_points=True).warnings == []
@@ -106,7 +118,10 @@ def seen_by_brute_force(points: np.ndarray, scene: Scene) -> float:
         for view in scene.train:
             x, y, z = view.camera.rotation @ point + view.camera.translation
             if z > 0.2:
-                column, row = view.camera.fx * x / z + view.camera.cx, view.camera.fy * y / z + view.camera.cy
+                column, row = (
+                    view.camera.fx * x / z + view.camera.cx,
+                    view.camera.fy * y / z + view.camera.cy,
+                )
                 seen += 0 <= column < view.camera.width and 0 <= row < view.camera.height
         shares.append(seen >= 2)
     return float(np.mean(shares))
@@ -115,7 +130,9 @@ def seen_by_brute_force(points: np.ndarray, scene: Scene) -> float:
 def test_the_share_in_view_is_that_of_a_loop_over_points_and_views(scene: Scene) -> None:
     points = np.random.default_rng(1).uniform(-4, 8, (300, 3))
     colors = np.random.default_rng(2).integers(0, 256, points.shape, dtype=np.uint8)
-    assert check_start(points, colors, scene, random_points=True).seen == seen_by_brute_force(points, scene)
+    assert check_start(points, colors, scene, random_points=True).seen == seen_by_brute_force(
+        points, scene
+    )
 
 
 @pytest.mark.parametrize(
@@ -126,12 +143,22 @@ def test_the_share_in_view_is_that_of_a_loop_over_points_and_views(scene: Scene)
         (lambda points: points / 100 + [0, 0, 3.96], "half of the initial points lie within"),
         (lambda points: points / 100 + [0, 0, 3.96], "hardly agree"),
         (lambda points: points * [8, 8, 1], "in view of two training views"),
-        (lambda points: np.where(np.arange(600)[:, None] < 400, points[:1], points), "share their place"),
-        (lambda points: np.where(np.arange(600)[:, None] < 2, points * 1e5, points), "2 initial points more than"),
+        (
+            lambda points: np.where(np.arange(600)[:, None] < 400, points[:1], points),
+            "share their place",
+        ),
+        (
+            lambda points: np.where(np.arange(600)[:, None] < 2, points * 1e5, points),
+            "2 initial points more than",
+        ),
     ],
 )
 def test_a_wrong_cloud_is_doubted_and_random_ones_are_not_doubted_for_their_colours(
-    scene: Scene, cloud: tuple[np.ndarray, np.ndarray], caplog: pytest.LogCaptureFixture, change, doubt: str
+    scene: Scene,
+    cloud: tuple[np.ndarray, np.ndarray],
+    caplog: pytest.LogCaptureFixture,
+    change,
+    doubt: str,
 ) -> None:
     points, colors = cloud
     facts = check_start(change(points), colors, scene)
@@ -145,7 +172,8 @@ def test_agreement_is_that_of_all_pairs(scene: Scene, cloud: tuple[np.ndarray, n
     points, colors = cloud
     swapped = colors[:, ::-1]
     facts, right = check_start(points, swapped, scene), check_start(points, colors, scene)
-    # The photographs show a point's own colour up to half a pixel, so these differences are near the exact ones.
+    # The photographs show a point's own colour up to half a pixel, so these differences are near
+    # the exact ones.
     own = np.abs(swapped.astype(int) - colors).mean()
     pairs = np.abs(swapped[:, None].astype(int) - colors[None]).mean()
     assert facts.color_agreement == pytest.approx(1 - own / pairs, abs=0.05)
@@ -156,8 +184,14 @@ def test_agreement_is_that_of_all_pairs(scene: Scene, cloud: tuple[np.ndarray, n
     ("points", "error"),
     [
         (np.array([[0, 0, 4.0]] * 9), r"all at one place, \(0, 0, 4\)"),
-        (np.array([[0, 0, 4.0], [1, 1, 4], [0, 1, 4], [1e30, 1e30, 1e30]]), r"initial point 3 of 4 .* \(1e\+30"),
-        (np.array([[k, 0, 1000.0] for k in range(9)]) * [1, 1, -1], "other coordinates than the cameras"),
+        (
+            np.array([[0, 0, 4.0], [1, 1, 4], [0, 1, 4], [1e30, 1e30, 1e30]]),
+            r"initial point 3 of 4 .* \(1e\+30",
+        ),
+        (
+            np.array([[k, 0, 1000.0] for k in range(9)]) * [1, 1, -1],
+            "other coordinates than the cameras",
+        ),
     ],
 )
 def test_a_start_that_cannot_be_learnt_from_is_refused_in_one_line(
@@ -188,12 +222,16 @@ def test_cameras_at_one_place_are_refused_and_one_far_off_is_named(
     assert "sets the scene extent to" in line
 
 
-def test_pixels_that_a_mask_ignores_show_no_colour(scene: Scene, cloud: tuple[np.ndarray, np.ndarray]) -> None:
+def test_pixels_that_a_mask_ignores_show_no_colour(
+    scene: Scene, cloud: tuple[np.ndarray, np.ndarray]
+) -> None:
     noise = np.random.default_rng(3).integers(0, 256, scene.train[0].image.shape, dtype=np.uint8)
     right = np.arange(noise.shape[1]) >= 20
     masked = [
         replace(
-            view, image=np.where(right[None, :, None], view.image, noise), mask=np.broadcast_to(right, noise.shape[:2])
+            view,
+            image=np.where(right[None, :, None], view.image, noise),
+            mask=np.broadcast_to(right, noise.shape[:2]),
         )
         for view in scene.train
     ]

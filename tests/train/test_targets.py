@@ -1,4 +1,5 @@
-"""Training images stay on the device where there is room, and are the same images where there is none."""
+"""Training images stay on the device where there is room, and are the same images where there is
+none."""
 
 from __future__ import annotations
 
@@ -28,7 +29,8 @@ def test_what_fits_is_resident(views: list[View]) -> None:
         targets = Targets(views, CPU, budget)
         assert targets.resident
         assert targets.bytes == size
-        assert targets.get(0).data_ptr() == views[0].image.ctypes.data  # on the CPU nothing is copied
+        # on the CPU nothing is copied
+        assert targets.get(0).data_ptr() == views[0].image.ctypes.data
     assert not Targets(views, CPU, size - 1).resident
 
 

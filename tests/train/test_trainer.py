@@ -1,4 +1,5 @@
-"""The training loop: it learns, it follows the schedule, it is repeatable, and it goes on where it was stopped."""
+"""The training loop: it learns, it follows the schedule, it is repeatable, and it goes on where it
+was stopped."""
 
 from __future__ import annotations
 
@@ -13,7 +14,18 @@ import numpy as np
 import pytest
 import torch
 
-from gsbench.densify import ADC, GNS, MCMC, MRNF, Densifier, FastGS, NoDensifier, ResGS, SteepGS, Volumetric
+from gsbench.densify import (
+    ADC,
+    GNS,
+    MCMC,
+    MRNF,
+    Densifier,
+    FastGS,
+    NoDensifier,
+    ResGS,
+    SteepGS,
+    Volumetric,
+)
 from gsbench.errors import TrainingError
 from gsbench.gaussians.initial import gaussians_from_cloud
 from gsbench.gaussians.model import Gaussians
@@ -80,20 +92,33 @@ def records(path: Path) -> list[dict[str, float]]:
     return [json.loads(line) for line in path.read_text().splitlines()]
 
 
-def test_training_learns_the_scene(tiny_scene: Scene, truth: Gaussians, rasterizer: Rasterizer, tmp_path: Path) -> None:
-    train(tiny_scene, truth, rasterizer, tmp_path, NoDensifier(), iterations=500, position_steps=500)
+def test_training_learns_the_scene(
+    tiny_scene: Scene, truth: Gaussians, rasterizer: Rasterizer, tmp_path: Path
+) -> None:
+    train(
+        tiny_scene, truth, rasterizer, tmp_path, NoDensifier(), iterations=500, position_steps=500
+    )
     metrics = records(tmp_path / "metrics.jsonl")
     first = sum(r["l1"] for r in metrics[:3]) / 3
     last = sum(r["l1"] for r in metrics[-3:]) / 3
     assert last < 0.5 * first
     assert metrics[-1]["step"] == 500
-    assert [r["sh_degree"] for r in metrics if r["step"] in (30, 40, 80, 120, 500)] == [0, 1, 2, 3, 3]
+    assert [r["sh_degree"] for r in metrics if r["step"] in (30, 40, 80, 120, 500)] == [
+        0,
+        1,
+        2,
+        3,
+        3,
+    ]
 
 
 def test_same_seed_same_bits_other_seed_not(
     tiny_scene: Scene, truth: Gaussians, rasterizer: Rasterizer, tmp_path: Path
 ) -> None:
-    runs = [train(tiny_scene, truth, rasterizer, tmp_path / str(i), small(), seed=i // 2) for i in range(3)]
+    runs = [
+        train(tiny_scene, truth, rasterizer, tmp_path / str(i), small(), seed=i // 2)
+        for i in range(3)
+    ]
     assert same(runs[0], runs[1])
     assert not same(runs[0], runs[2])
 
@@ -105,7 +130,9 @@ def test_same_seed_same_bits_other_seed_not(
         lambda: small(Volumetric, volume_threshold=0.01),
         lambda: MCMC(start=20, stop=110, interval=20),
         lambda: MRNF(start=0, stop=110, interval=20, decay_until=120),
-        lambda: GNS(start=20, stop=60, interval=20, max_gaussians=90, pressure_length=1.0, overgrowth=2.0),
+        lambda: GNS(
+            start=20, stop=60, interval=20, max_gaussians=90, pressure_length=1.0, overgrowth=2.0
+        ),
         lambda: small(ResGS, phase_ends=[0.3, 0.6], fade_interval=15, fade_stop=100),
         lambda: small(FastGS, error_threshold=0.05, least_count=0.0, max_gaussians=200),
         lambda: small(SteepGS),
@@ -134,7 +161,10 @@ def test_interrupted_training_ends_in_the_same_bits(
         assert (broken / name).read_text() == (tmp_path / "whole" / name).read_text()
     steps = [r["step"] for r in records(broken / "metrics.jsonl")]
     assert steps == list(range(10, 121, 10))
-    assert sorted(path.name for path in broken.glob("*.pt")) == ["checkpoint-00000050.pt", "checkpoint-00000100.pt"]
+    assert sorted(path.name for path in broken.glob("*.pt")) == [
+        "checkpoint-00000050.pt",
+        "checkpoint-00000100.pt",
+    ]
 
 
 def test_events_add_up_to_the_gaussians(
@@ -171,7 +201,9 @@ def test_time_budget_ends_a_training(
     assert last["step"] < 10**6
 
 
-def test_visible_adam_trains_too(tiny_scene: Scene, truth: Gaussians, rasterizer: Rasterizer, tmp_path: Path) -> None:
+def test_visible_adam_trains_too(
+    tiny_scene: Scene, truth: Gaussians, rasterizer: Rasterizer, tmp_path: Path
+) -> None:
     train(tiny_scene, truth, rasterizer, tmp_path, small(), visible_adam=True)
     metrics = records(tmp_path / "metrics.jsonl")
     assert metrics[-1]["l1"] < metrics[0]["l1"]
@@ -191,7 +223,11 @@ def test_non_finite_loss_names_the_iteration(
 
 
 def test_no_checkpoint_holds_a_state_after_a_loss_that_was_not_finite(
-    tiny_scene: Scene, truth: Gaussians, rasterizer: Rasterizer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tiny_scene: Scene,
+    truth: Gaussians,
+    rasterizer: Rasterizer,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """On a device that is behind, a loss arrives only when it is waited for."""
 
@@ -212,11 +248,15 @@ def test_a_full_device_names_the_last_checkpoint_and_what_to_lower(
     class Full(NoDensifier):
         def observe(self, step: int, render: RenderOutput) -> None:
             if step == 57:
-                raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2 GiB\nand more")
+                raise torch.OutOfMemoryError(
+                    "CUDA out of memory. Tried to allocate 2 GiB\nand more"
+                )
 
     with pytest.raises(TrainingError) as caught:
         train(tiny_scene, truth, rasterizer, tmp_path, Full())
-    assert str(caught.value).startswith(f"iteration 57: cpu has no memory left at {len(truth)} Gaussians; ")
+    assert str(caught.value).startswith(
+        f"iteration 57: cpu has no memory left at {len(truth)} Gaussians; "
+    )
     assert "\n" not in str(caught.value)
     assert f"newest checkpoint in {tmp_path}; lower densify.max_gaussians" in str(caught.value)
     assert (tmp_path / "checkpoint-00000050.pt").exists()
@@ -231,7 +271,8 @@ def test_as_on_a_device_that_is_behind(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Losses that arrive late, images without room, checkpoints written by a thread: the same bits, stopped or not."""
+    """Losses that arrive late, images without room, checkpoints written by a thread: the same bits,
+    stopped or not."""
 
     def make() -> Densifier:
         return small() if kind == "adc" else MCMC(start=20, stop=110, interval=20)
@@ -243,14 +284,20 @@ def test_as_on_a_device_that_is_behind(
     whole = train(tiny_scene, truth, rasterizer, tmp_path / "whole", make())
     monkeypatch.setattr(Readback, "arrived", property(lambda self: False))
     monkeypatch.setattr(trainer, "free_bytes", lambda _: 0)
-    monkeypatch.setattr(trainer, "CheckpointWriter", lambda folder, background: CheckpointWriter(folder, True))
+    monkeypatch.setattr(
+        trainer, "CheckpointWriter", lambda folder, background: CheckpointWriter(folder, True)
+    )
     broken = tmp_path / "broken"
     broken.mkdir()
     with pytest.raises(KeyboardInterrupt):
         Trainer(tiny_scene, cloud(truth), make(), rasterizer, options(), 0).run(broken, stop_at_70)
-    assert sorted(path.name for path in broken.iterdir() if path.suffix == ".pt") == ["checkpoint-00000050.pt"]
+    assert sorted(path.name for path in broken.iterdir() if path.suffix == ".pt") == [
+        "checkpoint-00000050.pt"
+    ]
     assert same(whole, train(tiny_scene, truth, rasterizer, broken, make()))
-    assert (broken / "events.jsonl").read_text() == (tmp_path / "whole" / "events.jsonl").read_text()
+    assert (broken / "events.jsonl").read_text() == (
+        tmp_path / "whole" / "events.jsonl"
+    ).read_text()
 
 
 def test_every_view_is_used_once_before_any_is_used_again() -> None:
@@ -287,7 +334,9 @@ def test_a_snapshot_is_the_model_of_a_training_that_ends_there(
 ) -> None:
     """Iteration 60 is due for a refinement and an opacity reset: 3DGS saves before both."""
     (tmp_path / "long").mkdir()
-    Trainer(tiny_scene, cloud(truth), small(), rasterizer, options(), 0, snapshot_at=[60]).run(tmp_path / "long")
+    Trainer(tiny_scene, cloud(truth), small(), rasterizer, options(), 0, snapshot_at=[60]).run(
+        tmp_path / "long"
+    )
     short = train(tiny_scene, truth, rasterizer, tmp_path / "short", small(), iterations=60)
     assert same(read_ply(tmp_path / "long" / snapshot_file(60)), short)
 
@@ -315,7 +364,9 @@ def test_defaults_are_those_of_3dgs() -> None:
     assert {name: getattr(defaults, name) for name in published} == published
 
 
-def new(scene: Scene, truth: Gaussians, rasterizer: Rasterizer, densifier: Densifier, **changes: object) -> Trainer:
+def new(
+    scene: Scene, truth: Gaussians, rasterizer: Rasterizer, densifier: Densifier, **changes: object
+) -> Trainer:
     return Trainer(scene, cloud(truth), densifier, rasterizer, options(**changes), 0)
 
 
@@ -347,7 +398,9 @@ def test_the_optimiser_steps_after_or_before_a_refinement(
 def test_only_visible_gaussians_are_updated_if_asked(
     visible_adam: bool, tiny_scene: Scene, truth: Gaussians, rasterizer: Rasterizer, tmp_path: Path
 ) -> None:
-    training = new(tiny_scene, truth, rasterizer, NoDensifier(), visible_adam=visible_adam, sh_interval=1)
+    training = new(
+        tiny_scene, truth, rasterizer, NoDensifier(), visible_adam=visible_adam, sh_interval=1
+    )
     given = []
     training.gaussians.optimizer_step = lambda *arguments: given.append(arguments)  # type: ignore[method-assign]
     training.iterate(tmp_path)
@@ -356,9 +409,15 @@ def test_only_visible_gaussians_are_updated_if_asked(
     assert (visible is not None) is visible_adam
 
 
-@pytest.mark.parametrize(("background", "white"), [([1.0, 1.0, 1.0], True), ([1.0, 1.0, 0.9], False)])
+@pytest.mark.parametrize(
+    ("background", "white"), [([1.0, 1.0, 1.0], True), ([1.0, 1.0, 0.9], False)]
+)
 def test_a_densifier_is_told_of_a_white_background(
-    background: list[float], white: bool, tiny_scene: Scene, truth: Gaussians, rasterizer: Rasterizer
+    background: list[float],
+    white: bool,
+    tiny_scene: Scene,
+    truth: Gaussians,
+    rasterizer: Rasterizer,
 ) -> None:
     context = new(tiny_scene, truth, rasterizer, NoDensifier(), background=background).context
     assert context.white_background is white
@@ -383,11 +442,19 @@ def test_images_may_take_half_of_the_free_memory(
 def clocked(monkeypatch: pytest.MonkeyPatch) -> None:
     """A clock that goes on by a second each time the trainer looks at it."""
     seconds = itertools.count(0.0, 1.00004)  # the last digit is not written
-    monkeypatch.setattr(trainer, "time", SimpleNamespace(perf_counter=lambda: next(seconds), monotonic=time.monotonic))
+    monkeypatch.setattr(
+        trainer,
+        "time",
+        SimpleNamespace(perf_counter=lambda: next(seconds), monotonic=time.monotonic),
+    )
 
 
 def test_seconds_and_rates_go_on_from_a_checkpoint(
-    tiny_scene: Scene, truth: Gaussians, rasterizer: Rasterizer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tiny_scene: Scene,
+    truth: Gaussians,
+    rasterizer: Rasterizer,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The trainer looks at the clock twice in an iteration that is logged."""
     settings, shown = {"iterations": 5, "log_every": 1, "checkpoint_every": 2}, []
@@ -403,14 +470,21 @@ def test_seconds_and_rates_go_on_from_a_checkpoint(
     clocked(monkeypatch)
     new(tiny_scene, truth, rasterizer, NoDensifier(), **settings).run(tmp_path, look)
     metrics = records(tmp_path / "metrics.jsonl")
-    assert [(r["step"], r["seconds"], r["num_gaussians"]) for r in metrics] == [(k, 2 * k, 80) for k in range(1, 6)]
+    assert [(r["step"], r["seconds"], r["num_gaussians"]) for r in metrics] == [
+        (k, 2 * k, 80) for k in range(1, 6)
+    ]
     assert shown == [(k, 80, pytest.approx(0.5, rel=1e-3)) for k in (1, 2, 3, 3, 4, 5)]
 
 
 def test_checkpoints_come_so_many_minutes_after_the_last(
-    tiny_scene: Scene, truth: Gaussians, rasterizer: Rasterizer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tiny_scene: Scene,
+    truth: Gaussians,
+    rasterizer: Rasterizer,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A clock that goes on by half a minute each time: at the start, in each iteration, and after each checkpoint."""
+    """A clock that goes on by half a minute each time: at the start, in each iteration, and after
+    each checkpoint."""
     looks, clock = itertools.count(), SimpleNamespace(perf_counter=time.perf_counter)
     clock.monotonic = lambda: 30.0 * next(looks)
     monkeypatch.setattr(trainer, "time", clock)
@@ -421,7 +495,11 @@ def test_checkpoints_come_so_many_minutes_after_the_last(
 
 
 def test_a_time_budget_ends_with_the_iteration_that_reaches_it_and_logs_it(
-    tiny_scene: Scene, truth: Gaussians, rasterizer: Rasterizer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tiny_scene: Scene,
+    truth: Gaussians,
+    rasterizer: Rasterizer,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     clocked(monkeypatch)
     train(tiny_scene, truth, rasterizer, tmp_path, NoDensifier(), max_seconds=3.0, log_every=100)
@@ -429,7 +507,11 @@ def test_a_time_budget_ends_with_the_iteration_that_reaches_it_and_logs_it(
 
 
 def test_on_a_cpu_checkpoints_are_written_without_a_thread(
-    tiny_scene: Scene, truth: Gaussians, rasterizer: Rasterizer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tiny_scene: Scene,
+    truth: Gaussians,
+    rasterizer: Rasterizer,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     calls: list[object] = []
 
@@ -461,7 +543,9 @@ def test_a_model_without_gaussians_or_out_of_range_ends_the_training(
         left = 0
 
         def rules(self, refinement: object) -> list:
-            return [lambda refinement: self.remove(refinement, torch.arange(len(truth)) >= self.left)]
+            return [
+                lambda refinement: self.remove(refinement, torch.arange(len(truth)) >= self.left)
+            ]
 
     last = Emptying()
     last.left = 1
@@ -470,7 +554,9 @@ def test_a_model_without_gaussians_or_out_of_range_ends_the_training(
         new(tiny_scene, truth, rasterizer, Emptying()).iterate(tmp_path)
     broken = new(tiny_scene, truth, rasterizer, NoDensifier())
     broken.gaussians.values.log_scales.data[0] = math.inf
-    with pytest.raises(TrainingError, match=r"^iteration 1: .*; the last good state is the newest checkpoint in "):
+    with pytest.raises(
+        TrainingError, match=r"^iteration 1: .*; the last good state is the newest checkpoint in "
+    ):
         broken.iterate(tmp_path)
 
 

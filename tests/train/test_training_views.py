@@ -15,7 +15,9 @@ from gsbench.train.trainer import Trainer
 from tests.train.test_trainer import cloud, options
 
 
-def test_views_are_rendered_and_measured_as_in_training(tiny_scene: Scene, truth: Gaussians) -> None:
+def test_views_are_rendered_and_measured_as_in_training(
+    tiny_scene: Scene, truth: Gaussians
+) -> None:
     settings = options(background=[0.2, 0.4, 0.6])
     trainer = Trainer(tiny_scene, cloud(truth), NoDensifier(), ReferenceRasterizer(), settings, 0)
     views, gaussians = trainer.context.training_views, trainer.gaussians.values
@@ -25,14 +27,18 @@ def test_views_are_rendered_and_measured_as_in_training(tiny_scene: Scene, truth
         assert torch.equal(views.image(index), torch.from_numpy(view.image))
         for step, degree in ((39, 0), (40, 1), (120, 3), (400, 3)):  # a degree every 40 iterations
             image = views.render(index, gaussians, step).image
-            own = trainer.rasterizer.render(gaussians, view.camera, degree, torch.tensor([0.2, 0.4, 0.6])).image
+            own = trainer.rasterizer.render(
+                gaussians, view.camera, degree, torch.tensor([0.2, 0.4, 0.6])
+            ).image
             assert torch.equal(image, own)
         expected, _, _ = photometric_loss(own.detach(), torch.from_numpy(view.image))
         assert views.loss(index, own) == expected
         assert not views.loss(index, own).requires_grad
         photograph = torch.from_numpy(view.image) / 255
         dissimilar = views.dissimilarity(index, own.detach())
-        torch.testing.assert_close(dissimilar, (1 - ssim_map(own.detach(), photograph).mean(0)).clamp_min(0))
+        torch.testing.assert_close(
+            dissimilar, (1 - ssim_map(own.detach(), photograph).mean(0)).clamp_min(0)
+        )
         assert dissimilar.shape == view.image.shape[:2]
         assert float(views.dissimilarity(index, photograph).abs().max()) < 1e-6
 
@@ -43,5 +49,6 @@ def test_looking_at_a_view_leaves_no_gradient(tiny_scene: Scene, truth: Gaussian
     with torch.no_grad():
         sums, render = blended_sums(views, 0, gaussians, 100, torch.ones(*views.image(0).shape))
     assert torch.equal(sums[:, 0], sums[:, 2])
-    torch.testing.assert_close(sums[:, 0].sum(), render.alpha.sum())  # light that is blended anywhere
+    # light that is blended anywhere
+    torch.testing.assert_close(sums[:, 0].sum(), render.alpha.sum())
     assert all(tensor.grad is None for tensor in gaussians.tensors().values())

@@ -23,12 +23,24 @@ def steps() -> list[dict[str, Any]]:
 
 
 def ended(tmp_path: Path, code: int, **inputs: str) -> tuple[int, list[str]]:
-    """The exit code of the script where gsbench ends with ``code``, and the words that gsbench was given."""
+    """The exit code of the script where gsbench ends with ``code``, and the words that gsbench was
+    given."""
     program = tmp_path / "gsbench"
-    program.write_text(f'#!/bin/sh\nprintf "%s\\n" "$@" > {tmp_path / "words"}\necho passed\nexit {code}\n')
+    program.write_text(
+        f'#!/bin/sh\nprintf "%s\\n" "$@" > {tmp_path / "words"}\necho passed\nexit {code}\n'
+    )
     program.chmod(0o755)
-    given = {"ARCHIVE": "a b.zip", "SETTINGS": "x=1 y=$(id) z=*", "METRIC": "psnr", "LEAST": "", "SEEDS": ""}
-    environment = {"PATH": f"{tmp_path}{os.pathsep}{os.environ['PATH']}", "GITHUB_STEP_SUMMARY": str(tmp_path / "s.md")}
+    given = {
+        "ARCHIVE": "a b.zip",
+        "SETTINGS": "x=1 y=$(id) z=*",
+        "METRIC": "psnr",
+        "LEAST": "",
+        "SEEDS": "",
+    }
+    environment = {
+        "PATH": f"{tmp_path}{os.pathsep}{os.environ['PATH']}",
+        "GITHUB_STEP_SUMMARY": str(tmp_path / "s.md"),
+    }
     done = subprocess.run(
         ["bash", "-e", "-o", "pipefail", "-c", steps()[-1]["run"]],
         cwd=tmp_path,
@@ -42,14 +54,18 @@ ENDS = [(0, "fail", 0), (1, "pass", 1), (2, "pass", 2), (3, "fail", 3), (3, "pas
 
 
 @pytest.mark.parametrize(("code", "undecided", "expected"), ENDS)
-def test_the_step_ends_as_the_gate_does(tmp_path: Path, code: int, undecided: str, expected: int) -> None:
+def test_the_step_ends_as_the_gate_does(
+    tmp_path: Path, code: int, undecided: str, expected: int
+) -> None:
     found, words = ended(tmp_path, code, UNDECIDED=undecided)
     assert found == expected
     assert words == ["gate", "a b.zip", "x=1", "y=$(id)", "z=*", "--metric", "psnr"]
     assert "    passed" in (tmp_path / "s.md").read_text()
 
 
-def test_options_are_given_where_they_are_set_and_inputs_are_no_part_of_a_script(tmp_path: Path) -> None:
+def test_options_are_given_where_they_are_set_and_inputs_are_no_part_of_a_script(
+    tmp_path: Path,
+) -> None:
     _, words = ended(tmp_path, 0, LEAST="10%", SEEDS="4")
     assert words[-4:] == ["--least", "10%", "--seeds", "4"]
     assert not [step for step in steps() if "${{" in step["run"]]

@@ -11,7 +11,9 @@ from gsbench.verbs.results import explain, explain_cell
 from tests.analysis.synthetic import Plan, write_runs
 
 
-def test_a_cell_names_its_trials_hashes_and_versions(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_cell_names_its_trials_hashes_and_versions(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     paths = write_runs(tmp_path, Plan(experiment="table1", inits=("dim",), scenes=("garden",)))
     assert explain(["table1:garden:lpips:volumetric"], tmp_path) == 0
     text = capsys.readouterr().out
@@ -35,7 +37,9 @@ def test_what_is_missing_is_said(tmp_path: Path) -> None:
     text = explain_cell("exp:garden:psnr:adc", tmp_path)
     assert "over 2 of 3 trials" in text
     assert "Left out\n  exp/garden/sfm-adc/c0ffee00-seed0: unfinished" in text
-    assert "not available: weights file alexnet.pth not found" in explain_cell("exp:garden:lpips_alex:adc", tmp_path)
+    assert "not available: weights file alexnet.pth not found" in explain_cell(
+        "exp:garden:lpips_alex:adc", tmp_path
+    )
 
 
 @pytest.mark.parametrize(
@@ -44,7 +48,10 @@ def test_what_is_missing_is_said(tmp_path: Path) -> None:
         ("exp:garden:psnr", "is not EXPERIMENT:SCENE:METRIC:ARM"),
         ("nope:garden:psnr:adc", "no experiment 'nope'"),
         ("exp:kitchen:psnr:adc", "has no scene 'kitchen'; it has garden"),
-        ("exp:garden:psnr:mcmc", "names 0 arms of garden; choose one of dim-adc, dim-volumetric, sfm-adc"),
+        (
+            "exp:garden:psnr:mcmc",
+            "names 0 arms of garden; choose one of dim-adc, dim-volumetric, sfm-adc",
+        ),
         ("exp:garden:psnr:adc", "names 2 arms"),
         ("exp:garden:quality:sfm-adc", "unknown metric 'quality'"),
     ],

@@ -1,4 +1,5 @@
-"""``gsbench doctor`` on machines that this one is not: with GPUs, without compilers, with folders that are shut."""
+"""``gsbench doctor`` on machines that this one is not: with GPUs, without compilers, with folders
+that are shut."""
 
 from __future__ import annotations
 
@@ -47,7 +48,9 @@ def gpus(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_gpus_with_their_memory(gpus: None, monkeypatch: pytest.MonkeyPatch) -> None:
     assert said(of_devices("gpu")) == [("ok", f"GPU {name}, 20 GB of 24 GB free") for name in "AB"]
     monkeypatch.setattr(torch.version, "hip", "7.0")
-    assert all(verdict == "note" and "never tested" in text for verdict, text in said(of_devices("gpu")))
+    assert all(
+        verdict == "note" and "never tested" in text for verdict, text in said(of_devices("gpu"))
+    )
 
 
 def test_every_extra_is_known() -> None:
@@ -57,7 +60,9 @@ def test_every_extra_is_known() -> None:
 
 
 def test_no_gpu_and_why(no_gpu: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert said(of_devices("gpu")) == [("note", "none (this torch is a build for CPUs): raster=auto uses the CPU")]
+    assert said(of_devices("gpu")) == [
+        ("note", "none (this torch is a build for CPUs): raster=auto uses the CPU")
+    ]
     monkeypatch.setattr(machine, "installed_gpus", lambda: ["0"])
     ((verdict, text),) = said(of_devices("gpu"))
     assert verdict == "note"
@@ -76,7 +81,9 @@ def test_rasterizers(no_gpu: None, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_rasterizers_on_a_gpu(gpus: None, monkeypatch: pytest.MonkeyPatch) -> None:
     from gsbench.raster import executors
 
-    monkeypatch.setattr(executors.importlib.util, "find_spec", lambda name: None if name == "gsplat" else object())
+    monkeypatch.setattr(
+        executors.importlib.util, "find_spec", lambda name: None if name == "gsplat" else object()
+    )
     texts = dict(text.split(" ", 1) for _, text in said(of_devices("rasterizer")))
     assert texts["raster=auto"] == "is cpu on cpu and triton on cuda"
     assert texts["raster=triton"].startswith("on cuda: ")
@@ -84,7 +91,9 @@ def test_rasterizers_on_a_gpu(gpus: None, monkeypatch: pytest.MonkeyPatch) -> No
     assert texts["raster=gsplat"].startswith("needs gsplat: ")
 
 
-def test_the_whole_of_it_on_this_machine(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_whole_of_it_on_this_machine(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     machine.doctor([], tmp_path / "runs")
     lines = capsys.readouterr().out.splitlines()
     topics = {line.split()[1] for line in lines}

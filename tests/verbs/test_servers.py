@@ -1,4 +1,5 @@
-"""Verbs that serve pages: what ends them ends all of them, and the current folder is no place of modules."""
+"""Verbs that serve pages: what ends them ends all of them, and the current folder is no place of
+modules."""
 
 from __future__ import annotations
 
@@ -22,7 +23,9 @@ SECONDS = 120
 
 
 @pytest.mark.parametrize("signum", [signal.SIGTERM, signal.SIGINT])
-def test_the_dashboard_ends_whole_and_runs_no_module_of_the_current_folder(tmp_path: Path, signum: int) -> None:
+def test_the_dashboard_ends_whole_and_runs_no_module_of_the_current_folder(
+    tmp_path: Path, signum: int
+) -> None:
     (tmp_path / "runs").mkdir()
     connect(None, tmp_path / "runs")
     (tmp_path / "yaml.py").write_text(f"open({str(tmp_path / 'exploded')!r}, 'w')\n")
@@ -31,10 +34,15 @@ def test_the_dashboard_ends_whole_and_runs_no_module_of_the_current_folder(tmp_p
         port = probe.getsockname()[1]
     environment = os.environ | {"GSBENCH_RUNS": str(tmp_path / "runs")}
     command = [sys.executable, "-P", "-m", "gsbench.cli", "ui", "--port", str(port)]
-    with subprocess.Popen(command, cwd=tmp_path, env=environment, stdout=subprocess.DEVNULL) as process:
+    with subprocess.Popen(
+        command, cwd=tmp_path, env=environment, stdout=subprocess.DEVNULL
+    ) as process:
         deadline = time.monotonic() + SECONDS
         while time.monotonic() < deadline:
-            with suppress(OSError), urllib.request.urlopen(f"http://127.0.0.1:{port}/", timeout=5) as answer:
+            with (
+                suppress(OSError),
+                urllib.request.urlopen(f"http://127.0.0.1:{port}/", timeout=5) as answer,
+            ):
                 assert answer.status == 200
                 break
             time.sleep(0.2)
@@ -42,5 +50,7 @@ def test_the_dashboard_ends_whole_and_runs_no_module_of_the_current_folder(tmp_p
         assert len(family) >= 2
         process.send_signal(signum)
         assert process.wait(timeout=30) == 0
-    assert not [child for child in family if child.is_running() and child.status() != psutil.STATUS_ZOMBIE]
+    assert not [
+        child for child in family if child.is_running() and child.status() != psutil.STATUS_ZOMBIE
+    ]
     assert not (tmp_path / "exploded").exists()

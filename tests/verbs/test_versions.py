@@ -16,19 +16,29 @@ from gsbench.verbs import versions
 from gsbench.verbs.versions import CommitSearch
 from tests.analysis.synthetic import Plan, trial_data, write_trial
 
-COMMITS = [(letter * 40, f"2026-01-0{day}", f"change {letter}") for day, letter in enumerate("abc", 1)]
+COMMITS = [
+    (letter * 40, f"2026-01-0{day}", f"change {letter}") for day, letter in enumerate("abc", 1)
+]
 QUALITY = {"a": 26.0, "b": 26.001, "c": 25.0}  # PSNR, dB
 
 
 class Trainings:
-    """Writes a commit's results where its training would; ``fails`` names a commit that does not train."""
+    """Writes a commit's results where its training would; ``fails`` names a commit that does not
+    train."""
 
     def __init__(self, fails: str = "") -> None:
         self.fails = fails
         self.done: list[tuple[str, str]] = []
         self.environments: list[Mapping[str, str]] = []
 
-    def __call__(self, command: Sequence[str], log: Path, folder: Path, environment: Mapping[str, str], _: Any) -> None:
+    def __call__(
+        self,
+        command: Sequence[str],
+        log: Path,
+        folder: Path,
+        environment: Mapping[str, str],
+        _: Any,
+    ) -> None:
         commit = folder.parent.name[0]
         if commit == self.fails:
             raise TrainingError("it broke")
@@ -53,11 +63,18 @@ def begun(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, trainings: Trainings)
     (tmp_path / COMMITS[1][0] / "src" / "gsbench" / "__init__.py").touch()
     trees: Any = SimpleNamespace(tree=lambda commit: tmp_path / commit, prefix="sub")
     return CommitSearch(
-        tmp_path / "runs" / "search", ["scene=courtyard"], frozenset({"courtyard"}), declaration, trees, COMMITS
+        tmp_path / "runs" / "search",
+        ["scene=courtyard"],
+        frozenset({"courtyard"}),
+        declaration,
+        trees,
+        COMMITS,
     )
 
 
-def test_the_commit_is_found_and_nothing_is_trained_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_commit_is_found_and_nothing_is_trained_twice(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     trainings = Trainings()
     search = begun(tmp_path, monkeypatch, trainings)
     found = first_worse(2, search.result)
@@ -72,10 +89,14 @@ def test_the_commit_is_found_and_nothing_is_trained_twice(tmp_path: Path, monkey
     assert "worse in PSNR" in newest
     assert "passed" in middle
     assert oldest.endswith("the good one")
-    assert versions._conclusion(found, search) == [f"It became worse with {'c' * 10} (2026-01-03): change c"]
+    assert versions._conclusion(found, search) == [
+        f"It became worse with {'c' * 10} (2026-01-03): change c"
+    ]
     between = f"It became worse with one of 2 commits, from {'b' * 10} to {'c' * 10}."
     assert versions._conclusion((0, 2), search) == [between]
-    assert versions._conclusion(None, search)[0].startswith("The last commit is not shown to be worse")
+    assert versions._conclusion(None, search)[0].startswith(
+        "The last commit is not shown to be worse"
+    )
 
 
 def test_a_commit_that_does_not_train_is_passed_over_but_not_the_last(

@@ -1,7 +1,7 @@
 """A headless Chromium, steered by its DevTools protocol, in real time.
 
-Chromium's own ``--screenshot`` waits in virtual time, which runs ahead while nothing but a web socket is open: on a
-busy machine the picture was taken before the server had drawn.
+Chromium's own ``--screenshot`` waits in virtual time, which runs ahead while nothing but a web
+socket is open: on a busy machine the picture was taken before the server had drawn.
 """
 
 from __future__ import annotations
@@ -41,10 +41,16 @@ class Browser:
     """A window of ``size`` on the page ``url``; the test is skipped where there is no Chromium."""
 
     def __init__(self, url: str, profile: Path, size: tuple[int, int] = (1200, 600)) -> None:
-        chromium = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+        chromium = (
+            shutil.which("chromium")
+            or shutil.which("chromium-browser")
+            or shutil.which("google-chrome")
+        )
         if chromium is None:
             pytest.skip("needs a headless Chromium")
-        sockets = pytest.importorskip("websockets.sync.client", reason="needs websockets, which viser brings")
+        sockets = pytest.importorskip(
+            "websockets.sync.client", reason="needs websockets, which viser brings"
+        )
         words = [f"--user-data-dir={profile}", f"--window-size={size[0]},{size[1]}", url]
         self._process = subprocess.Popen(
             [chromium, *FLAGS, *words], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
@@ -67,7 +73,9 @@ class Browser:
 
     def wait_until(self, condition: Callable[[np.ndarray], bool], what: str) -> np.ndarray:
         """The first picture of the page, [H, W, 3] in [0, 255], that fulfils ``condition``."""
-        return self.wait_for(lambda: picture if condition(picture := self.picture()) else None, what)
+        return self.wait_for(
+            lambda: picture if condition(picture := self.picture()) else None, what
+        )
 
     def picture(self) -> np.ndarray:
         """What the window shows now, [H, W, 3] in [0, 255]."""

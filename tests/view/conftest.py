@@ -16,9 +16,20 @@ from tests.end_to_end.conftest import SMALL
 def small_runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A runs folder with the experiment ``small``: ADC and volumetric, one seed."""
     runs = tmp_path_factory.mktemp("view-runs")
-    kept = {key: value for key, value in os.environ.items() if not key.startswith(("GSBENCH_", "MLFLOW_"))}
+    kept = {
+        key: value
+        for key, value in os.environ.items()
+        if not key.startswith(("GSBENCH_", "MLFLOW_"))
+    }
     changes = {"GSBENCH_RUNS": str(runs), "TORCH_HOME": str(tmp_path_factory.mktemp("hub"))}
-    arguments = ["-m", *SMALL, "name=small", "densify=adc,volumetric", "tracking=none", "eval.flip=false"]
+    arguments = [
+        "-m",
+        *SMALL,
+        "name=small",
+        "densify=adc,volumetric",
+        "tracking=none",
+        "eval.flip=false",
+    ]
     done = subprocess.run(
         [sys.executable, "-m", "gsbench.cli", *arguments],
         cwd=runs,

@@ -1,4 +1,5 @@
-"""``gsbench export TRIAL --out page.html``: its cameras, and the command to type where npx is missing or fails."""
+"""``gsbench export TRIAL --out page.html``: its cameras, and the command to type where npx is
+missing or fails."""
 
 from __future__ import annotations
 
@@ -34,7 +35,9 @@ def test_the_page_has_every_test_view(
     works: str, small_runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("GSBENCH_RUNS", str(small_runs))
-    monkeypatch.setenv("PATH", f"{stand_in(tmp_path / 'bin', works)}{os.pathsep}{os.environ['PATH']}")
+    monkeypatch.setenv(
+        "PATH", f"{stand_in(tmp_path / 'bin', works)}{os.pathsep}{os.environ['PATH']}"
+    )
     assert run(["export", ADDRESS, "--out", str(tmp_path / "page.html")]) == 0
     settings = json.loads((tmp_path / "page.html").read_text())
     trial = find_trial(ADDRESS, small_runs)
@@ -50,10 +53,16 @@ def test_the_page_has_every_test_view(
         np.testing.assert_allclose(np.array(shown["position"]) * (-1, -1, 1), camera.center)
         assert np.tan(np.radians(shown["fov"] / 2)) * 2 * camera.fx == pytest.approx(camera.width)
     (track,) = settings["animTracks"]
-    assert len(track["keyframes"]["values"]["position"]) == 3 * len(track["keyframes"]["times"]) == 3 * (len(views) + 1)
+    assert (
+        len(track["keyframes"]["values"]["position"])
+        == 3 * len(track["keyframes"]["times"])
+        == 3 * (len(views) + 1)
+    )
 
 
-@pytest.mark.parametrize(("works", "cause"), [("never", r"failed (no device)"), ("", "is not installed")])
+@pytest.mark.parametrize(
+    ("works", "cause"), [("never", r"failed (no device)"), ("", "is not installed")]
+)
 def test_without_npx_the_command_to_type_is_said(
     works: str,
     cause: str,
@@ -63,7 +72,9 @@ def test_without_npx_the_command_to_type_is_said(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setenv("GSBENCH_RUNS", str(small_runs))
-    monkeypatch.setenv("PATH", f"{stand_in(tmp_path / 'bin', works)}:/bin" if works else str(tmp_path))
+    monkeypatch.setenv(
+        "PATH", f"{stand_in(tmp_path / 'bin', works)}:/bin" if works else str(tmp_path)
+    )
     assert run(["export", ADDRESS, "--out", str(tmp_path / "page.html")]) == 1
     said = capsys.readouterr().err
     assert cause in said

@@ -44,7 +44,9 @@ def viewer(painters: list[TrialPainter]) -> Iterator[Viewer]:
     viewer.stop()
 
 
-def test_drawing_a_test_view_gives_the_trials_own_render(small_runs: Path, painters: list[TrialPainter]) -> None:
+def test_drawing_a_test_view_gives_the_trials_own_render(
+    small_runs: Path, painters: list[TrialPainter]
+) -> None:
     for painter, name in zip(painters, ("adc", "volumetric"), strict=True):
         trial = find_trial(f"small:courtyard:{name}", small_runs)
         assert [view.name for view in painter.trial.views] == ["0000.png", "0008.png"]
@@ -72,7 +74,9 @@ def test_the_large_are_shown_in_the_colour_of_their_cause(painters: list[TrialPa
         alpha = painter.rasterizer.render(
             trial.gaussians.select(torch.from_numpy(chosen)), camera, 0, torch.zeros(3)
         ).alpha
-    colors = (picture - 0.35 * (1 - alpha.numpy()[..., None]) * plain) / alpha.clamp_min(1e-6).numpy()[..., None]
+    colors = (picture - 0.35 * (1 - alpha.numpy()[..., None]) * plain) / alpha.clamp_min(
+        1e-6
+    ).numpy()[..., None]
     seen = colors[alpha.numpy() > 0.2]  # mixtures of the causes' colours
     hues = np.array([cause.color for cause in Cause if counts[cause]], float)
     assert len(seen)
@@ -99,14 +103,17 @@ def test_page_answers_until_it_is_stopped(painters: list[TrialPainter]) -> None:
         pytest.fail("the page still answers after stop")
 
 
-def test_two_trials_and_their_photograph_share_one_camera(viewer: Viewer, painters: list[TrialPainter]) -> None:
+def test_two_trials_and_their_photograph_share_one_camera(
+    viewer: Viewer, painters: list[TrialPainter]
+) -> None:
     view = painters[0].trial.views[1]
     picture = viewer.draw(view.camera, viewer.layers(), view)
     height, width = view.image.shape[:2]
     assert picture.shape == (height, 3 * width, 3)
     panes = [view.image, *(painter.draw(view.camera, Layers()) for painter in painters)]
     for place, pane in enumerate(panes):
-        shown = picture[12:, place * width + 2 : (place + 1) * width]  # below the label, right of the dividing line
+        # below the label, right of the dividing line
+        shown = picture[12:, place * width + 2 : (place + 1) * width]
         np.testing.assert_array_equal(shown, pane[12:, 2:])
 
 
@@ -115,7 +122,11 @@ def test_a_page_that_sends_nonsense_ends_no_drawing(viewer: Viewer) -> None:
     page = SimpleNamespace(
         client_id=0,
         camera=SimpleNamespace(
-            on_update=lambda _: None, wxyz=(0, 0, 0, 0), position=(np.nan, 0, 0), fov=0.9, aspect=1e6
+            on_update=lambda _: None,
+            wxyz=(0, 0, 0, 0),
+            position=(np.nan, 0, 0),
+            fov=0.9,
+            aspect=1e6,
         ),
         scene=SimpleNamespace(set_background_image=lambda image, **_: shown.append(image)),
     )

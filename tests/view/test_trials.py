@@ -20,7 +20,14 @@ from gsbench.init.base import PointCloud
 from gsbench.raster import create_rasterizer
 from gsbench.scene.types import Camera, View
 from gsbench.view.server import fitting_fov, level_up, mean_up, page_camera
-from gsbench.view.trials import Layers, TrialPainter, ViewedTrial, photograph_at, read_causes, side_by_side
+from gsbench.view.trials import (
+    Layers,
+    TrialPainter,
+    ViewedTrial,
+    photograph_at,
+    read_causes,
+    side_by_side,
+)
 from tests.gaussians.helpers import random_gaussians
 
 
@@ -44,8 +51,12 @@ def test_photograph_in_its_own_camera_is_itself() -> None:
 def test_photograph_follows_the_focal_length_and_the_principal_point(scale: float) -> None:
     view = make_view()
     width, height = round(80 * scale), round(60 * scale)
-    camera = Camera(width, height, 70 * scale, 70 * scale, 38 * scale, 31 * scale, np.eye(3), np.zeros(3))
-    expected = np.asarray(Image.fromarray(view.image).resize((width, height), Image.Resampling.BILINEAR), int)
+    camera = Camera(
+        width, height, 70 * scale, 70 * scale, 38 * scale, 31 * scale, np.eye(3), np.zeros(3)
+    )
+    expected = np.asarray(
+        Image.fromarray(view.image).resize((width, height), Image.Resampling.BILINEAR), int
+    )
     got = photograph_at(camera, view).astype(int)
     assert np.abs(got - expected)[4:-4, 4:-4].mean() < 3
     assert np.abs(got[:, ::-1] - expected).mean() > 15
@@ -124,18 +135,22 @@ def test_mean_up_points_up() -> None:
         ((1, 0, 0, 0), (0, 0, 0), 0.9, math.nan),
     ],
 )
-def test_what_is_no_camera_is_not_drawn(wxyz: tuple, position: tuple, fov: float, aspect: float) -> None:
+def test_what_is_no_camera_is_not_drawn(
+    wxyz: tuple, position: tuple, fov: float, aspect: float
+) -> None:
     with pytest.raises(ValueError, match=r"no camera|is not drawn"):
         page_camera(np.array(wxyz, float), np.array(position, float), fov, aspect, 540, 1)
 
 
 def painter() -> TrialPainter:
-    """A model of 40 Gaussians in front of `make_view`, nine of them large, and a cloud of four points."""
+    """A model of 40 Gaussians in front of `make_view`, nine of them large, and a cloud of four
+    points."""
     gaussians = random_gaussians(40, seed=1, dtype=torch.float32)
     volumes = np.linspace(-3.0, 0.9, 40)
     causes = np.array([Cause.CLONE, Cause.SPLIT_VOLUME] * 20, np.uint8)
     cloud = PointCloud(
-        np.array([[0.0, 0.0, 4.0], [1.0, 0.0, 4.0], [0.0, 1.0, 4.0], [1.0, 1.0, 4.0]]), np.full((4, 3), 200, np.uint8)
+        np.array([[0.0, 0.0, 4.0], [1.0, 0.0, 4.0], [0.0, 1.0, 4.0], [1.0, 1.0, 4.0]]),
+        np.full((4, 3), 200, np.uint8),
     )
     trial = ViewedTrial("a", gaussians, causes, volumes, cloud, (make_view(),), (0.0, 0.0, 0.0))
     return TrialPainter(trial, create_rasterizer("reference", torch.device("cpu")))
@@ -143,7 +158,9 @@ def painter() -> TrialPainter:
 
 def rendered(painter: TrialPainter, gaussians: Gaussians, degree: int = 3) -> np.ndarray:
     with torch.no_grad():
-        image = painter.rasterizer.render(gaussians, make_view().camera, degree, torch.zeros(3)).image
+        image = painter.rasterizer.render(
+            gaussians, make_view().camera, degree, torch.zeros(3)
+        ).image
     return np.round(255 * image.clamp(0, 1).numpy())
 
 
@@ -152,13 +169,19 @@ def test_layers_choose_what_is_drawn() -> None:
     gaussians = shown.trial.gaussians
     assert rendered(shown, gaussians).max() > 50
     np.testing.assert_allclose(shown.draw(camera, Layers()), rendered(shown, gaussians), atol=1)
-    np.testing.assert_allclose(shown.draw(camera, Layers(sh_degree=0)), rendered(shown, gaussians, 0), atol=1)
+    np.testing.assert_allclose(
+        shown.draw(camera, Layers(sh_degree=0)), rendered(shown, gaussians, 0), atol=1
+    )
     opaque = gaussians.select(torch.topk(gaussians.opacities, 4).indices)
-    np.testing.assert_allclose(shown.draw(camera, Layers(share=10)), rendered(shown, opaque), atol=1)
+    np.testing.assert_allclose(
+        shown.draw(camera, Layers(share=10)), rendered(shown, opaque), atol=1
+    )
     single = gaussians.select(gaussians.opacities.argmax()[None])
     np.testing.assert_allclose(shown.draw(camera, Layers(share=1)), rendered(shown, single), atol=1)
     cloud = gaussians_from_cloud(shown.trial.cloud.points, shown.trial.cloud.colors)
-    np.testing.assert_allclose(shown.draw(camera, Layers(cloud=True, share=1)), rendered(shown, cloud), atol=1)
+    np.testing.assert_allclose(
+        shown.draw(camera, Layers(cloud=True, share=1)), rendered(shown, cloud), atol=1
+    )
     assert list(shown.above(0.05)) == list(range(31, 40))
     counts = shown.counts_above(0.05)
     assert (counts[Cause.CLONE], counts[Cause.SPLIT_VOLUME], sum(counts.values())) == (4, 5, 9)

@@ -1,4 +1,5 @@
-"""Which requests the viewer answers: those of its own page and of programs, and of no other web page."""
+"""Which requests the viewer answers: those of its own page and of programs, and of no other web
+page."""
 
 from __future__ import annotations
 
@@ -24,7 +25,8 @@ UNWELCOME = [
     (["127.0.0.1:8080"], ["http://127.0.0.1:3000"]),  # a page of another program of this machine
     (["127.0.0.1:8080"], ["http://127.0.0.1:8080.strange.example"]),
     (["127.0.0.1:8080"], ["http://strange.example#http://127.0.0.1:8080"]),
-    (["strange.example:8080"], ["http://strange.example:8080"]),  # DNS rebinding: the page's own name leads here
+    # DNS rebinding: the page's own name leads here
+    (["strange.example:8080"], ["http://strange.example:8080"]),
     (["strange.example:8080"], []),
     (["127.0.0.1.strange.example"], []),
     (["localhost.strange.example"], []),
@@ -86,5 +88,8 @@ def test_the_server_itself_answers_so(server: Any, upgrade: bool) -> None:
 
 def test_a_server_that_was_started_otherwise_is_not_trusted() -> None:
     pytest.importorskip("viser", reason="the viewer needs viser (extra view)")
-    with pytest.raises(GsbenchError, match="cannot be kept from strange web pages"), refuse_other_pages():
+    with (
+        pytest.raises(GsbenchError, match="cannot be kept from strange web pages"),
+        refuse_other_pages(),
+    ):
         types.SimpleNamespace()

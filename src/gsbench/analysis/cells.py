@@ -1,4 +1,5 @@
-"""Table cells (a mean with its deviation) and data frames from trials. Unlike trials are never averaged."""
+"""Table cells (a mean with its deviation) and data frames from trials. Unlike trials are never
+averaged."""
 
 from __future__ import annotations
 
@@ -7,7 +8,12 @@ from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from gsbench.analysis.differences import describe_code, differing_code, differing_conditions, differing_settings
+from gsbench.analysis.differences import (
+    describe_code,
+    differing_code,
+    differing_conditions,
+    differing_settings,
+)
 from gsbench.analysis.quantities import Quantity, metric_keys
 from gsbench.analysis.results import Experiment, TrialResult, group_by
 from gsbench.errors import InputError
@@ -18,20 +24,36 @@ if TYPE_CHECKING:
 
 K = TypeVar("K", bound=Hashable)
 
-TRIAL_FIELDS = ("scene", "init", "densify", "seed", "raster", "protocol", "iterations", "experiment")
+TRIAL_FIELDS = (
+    "scene",
+    "init",
+    "densify",
+    "seed",
+    "raster",
+    "protocol",
+    "iterations",
+    "experiment",
+)
 IDENTITY = ("experiment", "scene", "init", "densify", "seed")
 CONDITIONS = ("protocol", "raster", "iterations")
-MEASUREMENTS = ("num_init_points", "num_gaussians", "scene_extent", "peak_memory_mb", "train_views", "test_views")
+MEASUREMENTS = (
+    "num_init_points",
+    "num_gaussians",
+    "scene_extent",
+    "peak_memory_mb",
+    "train_views",
+    "test_views",
+)
 
 
 @dataclass(frozen=True)
 class Cell:
     """The mean of a quantity over the trials of a scene, or the mean of several scenes' means.
 
-    ``std`` is the sample deviation (n - 1) over trials, None for a single trial. Over several scenes, each seed that
-    all scenes have gives one mean over the scenes, and ``std`` is the deviation of these means. ``count`` of
-    ``expected`` trials have a value; over several scenes it is the smallest count. ``reason`` says why the value is
-    missing.
+    ``std`` is the sample deviation (n - 1) over trials, None for a single trial. Over several
+    scenes, each seed that all scenes have gives one mean over the scenes, and ``std`` is the
+    deviation of these means. ``count`` of ``expected`` trials have a value; over several scenes it
+    is the smallest count. ``reason`` says why the value is missing.
     """
 
     mean: float | None
@@ -44,25 +66,31 @@ class Cell:
 
 
 def field_value(trial: TrialResult, name: str) -> str:
-    """A field of a trial, or a dotted key of its configuration, as text; a missing key counts as unset (null)."""
+    """A field of a trial, or a dotted key of its configuration, as text; a missing key counts as
+    unset (null)."""
     if name in TRIAL_FIELDS:
         return str(getattr(trial.record, name))
     return str(_settings_with(trial, name).get(name))
 
 
 def _settings_with(trial: TrialResult, name: str) -> Mapping[str, Any]:
-    """The settings that may contain ``name``; those that change no result are read from the trial's own file."""
+    """The settings that may contain ``name``; those that change no result are read from the trial's
+    own file."""
     is_hashed = name in trial.config or not name.startswith(NOT_HASHED)
     return trial.config if is_hashed else trial.whole_config
 
 
 def check_fields(trials: Iterable[TrialResult], names: Iterable[str]) -> None:
-    """Raise ``InputError`` for the first name that is neither a field nor a setting of any trial."""
+    """Raise ``InputError`` for the first name that is neither a field nor a setting of any
+    trial."""
     trials = list(trials)
     for name in names:
-        if name not in TRIAL_FIELDS and not any(name in _settings_with(trial, name) for trial in trials):
+        if name not in TRIAL_FIELDS and not any(
+            name in _settings_with(trial, name) for trial in trials
+        ):
             raise InputError(
-                f"no trial has a setting {name!r}; use {', '.join(TRIAL_FIELDS)} or a key of a trial's config.yaml"
+                f"no trial has a setting {name!r}; use {', '.join(TRIAL_FIELDS)} or a key of a "
+                "trial's config.yaml"
             )
 
 
@@ -70,30 +98,47 @@ def select_trials(trials: Iterable[TrialResult], where: Mapping[str, str]) -> li
     """The trials whose fields have the given values; raises ``InputError`` if there are none."""
     trials = list(trials)
     check_fields(trials, where)
-    kept = [trial for trial in trials if all(field_value(trial, key) == value for key, value in where.items())]
+    kept = [
+        trial
+        for trial in trials
+        if all(field_value(trial, key) == value for key, value in where.items())
+    ]
     if not kept:
-        raise InputError(f"no trial has {', '.join(f'{key}={value}' for key, value in where.items())}")
+        raise InputError(
+            f"no trial has {', '.join(f'{key}={value}' for key, value in where.items())}"
+        )
     return kept
 
 
 def check_averageable(trials: Sequence[TrialResult], where: str) -> None:
-    """Raise ``InputError`` that names the differing keys, unless each scene's trials repeat one configuration."""
+    """Raise ``InputError`` that names the differing keys, unless each scene's trials repeat one
+    configuration."""
     if code := differing_code(trials):
-        listed, experiment = "; ".join(describe_code(*part) for part in code.items()), trials[0].experiment
+        listed, experiment = (
+            "; ".join(describe_code(*part) for part in code.items()),
+            trials[0].experiment,
+        )
         raise InputError(
-            f"the table cell {where} would average trials made by different versions of {listed}: `gsbench status "
-            f"{experiment}` names the superseded ones, `gsbench status {experiment} --forget-superseded` removes them"
+            f"the table cell {where} would average trials made by different versions of {listed}: "
+            "`gsbench status "
+            f"{experiment}` names the superseded ones, `gsbench status {experiment} "
+            "--forget-superseded` removes them"
         )
     by_scene = group_by(trials, lambda trial: trial.scene)
     for scene, group in by_scene.items():
         keys = differing_conditions(group) or differing_settings(group)
         if keys:
-            raise _refusal(f"{where}, scene {scene}" if "scene=" not in where else where, keys, group)
+            raise _refusal(
+                f"{where}, scene {scene}" if "scene=" not in where else where, keys, group
+            )
         seeds = [trial.seed for trial in group]
         twice = sorted({seed for seed in seeds if seeds.count(seed) > 1})
         if twice:
             paths = ", ".join(trial.label for trial in group if trial.seed == twice[0])
-            raise InputError(f"the table cell {where} has seed {twice[0]} twice: {paths}; remove one of the folders")
+            raise InputError(
+                f"the table cell {where} has seed {twice[0]} twice: {paths}; remove one of the "
+                "folders"
+            )
     across = differing_conditions([group[0] for group in by_scene.values()])
     for key in ("resolution", "data"):  # each scene has its own
         across.pop(key, None)
@@ -102,21 +147,29 @@ def check_averageable(trials: Sequence[TrialResult], where: str) -> None:
 
 
 def swept_settings(trials: Iterable[TrialResult]) -> list[str]:
-    """The settings in which trials of one scene, initialiser and densifier differ, without `IGNORED_SETTINGS`."""
+    """The settings in which trials of one scene, initialiser and densifier differ, without
+    `IGNORED_SETTINGS`."""
     groups = group_by(trials, lambda trial: (trial.scene, trial.init, trial.densify)).values()
     return sorted({key for group in groups for key in differing_settings(group)})
 
 
 def with_variants(trials: Sequence[TrialResult]) -> list[TrialResult]:
-    """The trials, each with its values of the swept settings as ``variant``: different values are different arms."""
+    """The trials, each with its values of the swept settings as ``variant``: different values are
+    different arms."""
     swept = swept_settings(trials)
     if not swept:
         return list(trials)
-    return [replace(trial, variant=tuple((key, str(trial.config.get(key))) for key in swept)) for trial in trials]
+    return [
+        replace(trial, variant=tuple((key, str(trial.config.get(key))) for key in swept))
+        for trial in trials
+    ]
 
 
-def make_cell(trials: Sequence[TrialResult], quantity: Quantity, scenes: Sequence[str], expected: int) -> Cell:
-    """The cell of trials that passed `check_averageable`; each of ``scenes`` should have ``expected`` trials."""
+def make_cell(
+    trials: Sequence[TrialResult], quantity: Quantity, scenes: Sequence[str], expected: int
+) -> Cell:
+    """The cell of trials that passed `check_averageable`; each of ``scenes`` should have
+    ``expected`` trials."""
     values: dict[str, dict[int, float]] = {scene: {} for scene in scenes}
     for trial in trials:
         value = quantity.read(trial)
@@ -124,55 +177,71 @@ def make_cell(trials: Sequence[TrialResult], quantity: Quantity, scenes: Sequenc
             values[trial.scene][trial.seed] = value
     count = min((len(group) for group in values.values()), default=0)
     if count == 0:
-        reasons = [trial.unavailable[quantity.key] for trial in trials if quantity.key in trial.unavailable]
+        reasons = [
+            trial.unavailable[quantity.key] for trial in trials if quantity.key in trial.unavailable
+        ]
         reason = short_reason(reasons[0]) if reasons else "no value" if trials else "no trial"
         return Cell(None, None, 0, expected, len(values), tuple(trials), reason)
     mean = statistics.fmean(statistics.fmean(group.values()) for group in values.values())
     shared_seeds = set.intersection(*(set(group) for group in values.values()))
-    per_seed = [statistics.fmean(group[seed] for group in values.values()) for seed in sorted(shared_seeds)]
+    per_seed = [
+        statistics.fmean(group[seed] for group in values.values()) for seed in sorted(shared_seeds)
+    ]
     std = statistics.stdev(per_seed) if len(per_seed) > 1 else None
     return Cell(mean, std, count, expected, len(values), tuple(trials))
 
 
 def short_reason(reason: str) -> str:
-    """The reason why a metric is missing; missing weights in one line, of which results.json has the full text."""
+    """The reason why a metric is missing; missing weights in one line, of which results.json has
+    the full text."""
     if reason.startswith("weights not found: "):
         return f"{reason.partition(' (')[0]}; gsbench doctor says where they come from"
     return reason
 
 
 def best_cells(cells: Mapping[K, Cell], quantity: Quantity) -> set[K]:
-    """The keys of the best means after rounding to the quantity's decimals; empty if all are equal."""
-    means = {key: round(cell.mean, quantity.decimals) for key, cell in cells.items() if cell.mean is not None}
+    """The keys of the best means after rounding to the quantity's decimals; empty if all are
+    equal."""
+    means = {
+        key: round(cell.mean, quantity.decimals)
+        for key, cell in cells.items()
+        if cell.mean is not None
+    }
     if quantity.cost or quantity.direction == 0 or len(set(means.values())) < 2:
         return set()
     best = max(means.values()) if quantity.direction == 1 else min(means.values())
     return {key for key, mean in means.items() if mean == best}
 
 
-def _refusal(where: str, keys: Mapping[str, Sequence[str]], trials: Sequence[TrialResult]) -> InputError:
+def _refusal(
+    where: str, keys: Mapping[str, Sequence[str]], trials: Sequence[TrialResult]
+) -> InputError:
     listed = "; ".join(f"{key}: {' | '.join(values)}" for key, values in keys.items())
     first = next(iter(keys))
     return InputError(
-        f"the table cell {where} would average trials that differ in {listed} (such as {trials[0].label} and "
+        f"the table cell {where} would average trials that differ in {listed} (such as "
+        f"{trials[0].label} and "
         f"{trials[-1].label}): choose one with --where {first}=…, or show it with --rows …,{first}"
     )
 
 
 def to_frame(trials: Experiment | Sequence[TrialResult]) -> pd.DataFrame:
-    """The complete trials of an experiment, or the given trials, as a data frame with one row per trial.
+    """The complete trials of an experiment, or the given trials, as a data frame with one row per
+    trial.
 
     It has these columns:
 
     - ``experiment``, ``scene``, ``init``, ``densify``, ``seed``: the trial's identity;
-    - every setting in which trials of one scene, initialiser and densifier differ, by its dotted key, such as
-      ``densify.max_gaussians``;
+    - every setting in which trials of one scene, initialiser and densifier differ, by its dotted
+      key, such as ``densify.max_gaussians``;
     - ``protocol``, ``raster``, ``iterations``, and ``width`` and ``height`` of the views in px;
-    - every metric of any trial, as the mean over its test views (``psnr`` in dB; NaN where it could not be computed);
-    - ``num_init_points``, ``num_gaussians``, ``scene_extent`` (world units), ``peak_memory_mb``, ``train_views`` and
-      ``test_views``;
+    - every metric of any trial, as the mean over its test views (``psnr`` in dB; NaN where it could
+      not be computed);
+    - ``num_init_points``, ``num_gaussians``, ``scene_extent`` (world units), ``peak_memory_mb``,
+      ``train_views`` and ``test_views``;
     - ``seconds_init``, ``seconds_train``, ``seconds_evaluate``;
-    - ``event_<cause>``: number of Gaussians that the refinements cloned, split, pruned and so on, by cause;
+    - ``event_<cause>``: number of Gaussians that the refinements cloned, split, pruned and so on,
+      by cause;
     - ``hash_config``, ``hash_data``, ``hash_init`` and so on: hashes of the trial's inputs;
     - ``folder``: the folder of the trial's files.
 
@@ -191,7 +260,11 @@ def to_frame(trials: Experiment | Sequence[TrialResult]) -> pd.DataFrame:
         row |= dict(zip(("width", "height"), record.resolution or (None, None), strict=True))
         row |= {key: trial.metrics.get(key) for key in metrics}
         row |= {name: getattr(record, name) for name in MEASUREMENTS}
-        for prefix, group in (("seconds", record.seconds), ("event", record.events), ("hash", record.hashes)):
+        for prefix, group in (
+            ("seconds", record.seconds),
+            ("event", record.events),
+            ("hash", record.hashes),
+        ):
             row |= {f"{prefix}_{key}": value for key, value in group.items()}
         rows.append(row | {"folder": str(trial.path)})
     return pd.DataFrame(rows).convert_dtypes(convert_string=False, convert_floating=False)

@@ -1,4 +1,5 @@
-"""The declaration that a sweep's verdict follows, with the trials measured before it and those added later."""
+"""The declaration that a sweep's verdict follows, with the trials measured before it and those
+added later."""
 
 import math
 from collections.abc import Sequence
@@ -14,9 +15,10 @@ from gsbench.words import counted
 class ActiveDeclaration:
     """The declaration that holds for a sweep of ``trials`` trials.
 
-    ``declaration`` has the time of the first declaration of the metric, and the trials declared up to the first result.
-    ``seen`` are the trials that were measured before that time; ``added`` are the trials that were not declared before
-    the first result. ``earlier`` are the declarations of other metrics that this one replaced.
+    ``declaration`` has the time of the first declaration of the metric, and the trials declared up
+    to the first result. ``seen`` are the trials that were measured before that time; ``added`` are
+    the trials that were not declared before the first result. ``earlier`` are the declarations of
+    other metrics that this one replaced.
     """
 
     declaration: Declaration
@@ -36,63 +38,80 @@ class ActiveDeclaration:
 
     @property
     def beforehand(self) -> bool:
-        """Return whether metric and trials were fixed before any result: only then the metric is tested alone."""
+        """Return whether metric and trials were fixed before any result: only then the metric is
+        tested alone."""
         return not self.seen and not self.added
 
     def sentences(self, name: str) -> list[str]:
-        """Sentences about the declaration of the metric called ``name``: when it was made, and what it covers."""
+        """Sentences about the declaration of the metric called ``name``: when it was made, and what
+        it covers."""
         when = self.declaration.when
         name += f" at {self.question}" if self.question else ""
         all_trials = counted(self.trials, "trial")
         if self.seen:
             lines = [
-                f"{name} was declared too late (eval.primary, {when}): {len(self.seen)} of the {all_trials} had been "
-                "measured. So it is adjusted together with all other metrics. To test it, run other seeds under "
+                f"{name} was declared too late (eval.primary, {when}): {len(self.seen)} of the "
+                f"{all_trials} had been "
+                "measured. So it is adjusted together with all other metrics. To test it, run "
+                "other seeds under "
                 "another name."
             ]
         elif self.added:
             lines = [
-                f"{name} was declared beforehand (eval.primary, {when}), but {len(self.added)} of the {all_trials} "
-                "were added after the first result. So it is adjusted together with all other metrics: adding trials "
-                "until an effect appears finds effects that do not exist. To test it, run other seeds under another "
+                f"{name} was declared beforehand (eval.primary, {when}), but {len(self.added)} of "
+                f"the {all_trials} "
+                "were added after the first result. So it is adjusted together with all other "
+                "metrics: adding trials "
+                "until an effect appears finds effects that do not exist. To test it, run other "
+                "seeds under another "
                 "name, all by one command."
             ]
         else:
             lines = [
-                f"{name} was declared beforehand (eval.primary, {when}), before any of the {all_trials} was measured."
+                f"{name} was declared beforehand (eval.primary, {when}), before any of the "
+                f"{all_trials} was measured."
             ]
         planned = sum(map(len, self.declaration.planned.values()))
         missing = planned - (self.trials - len(self.added)) if planned else 0
         if self.declaration.looks:
             lines.append(
-                "Seeds come in planned looks (launch.stop_when_decided), and each interval counts all looks; "
+                "Seeds come in planned looks (launch.stop_when_decided), and each interval counts "
+                "all looks; "
                 f"{missing} of the {planned} declared trials are missing."
             )
         elif missing:
             lines.append(
-                f"{missing} of the {planned} declared trials are still missing, so this is an early look. Do not stop "
+                f"{missing} of the {planned} declared trials are still missing, so this is an "
+                "early look. Do not stop "
                 "here because the result pleases: that finds effects that do not exist."
             )
         return lines + [f"Declared before it: {one.primary} ({one.when})." for one in self.earlier]
 
 
 def active_declaration(folder: Path, trials: Sequence[TrialResult]) -> ActiveDeclaration | None:
-    """The latest declaration of the sweep in ``folder`` with these trials; None if nothing was declared.
+    """The latest declaration of the sweep in ``folder`` with these trials; None if nothing was
+    declared.
 
-    Further commands may add trials to it until the first result. A trial that is added later counts as ``added`` as
-    soon as it is measured.
+    Further commands may add trials to it until the first result. A trial that is added later counts
+    as ``added`` as soon as it is measured.
     """
     recorded = read_declarations(folder, (trial.record.declared for trial in trials))
     declared = [one for one in recorded if one.kind == "sweep"]
     if not declared:
         return None
     others = [one for one in declared if one.primary != declared[-1].primary]
-    current = [one for one in declared if not others or one.moment > others[-1].moment or one is declared[-1]]
+    current = [
+        one
+        for one in declared
+        if not others or one.moment > others[-1].moment or one is declared[-1]
+    ]
     first_result = min((trial.measured for trial in trials), default=math.inf)
-    # Each command's record repeats the trials of the records before it, so the last valid record names them all.
+    # Each command's record repeats the trials of the records before it, so the last valid record
+    # names them all.
     complete = current[0]
     for later in current[1:]:
-        if later.moment < first_result:  # times are whole seconds: a declaration of the same second may be later
+        # times are whole seconds: a declaration of the same second may be later
+        if later.moment < first_result:
             complete = later
     declaration = replace(complete, time=current[0].time)
     seen = tuple(trial for trial in trials if trial.measured < declaration.moment)
@@ -100,8 +119,8 @@ def active_declaration(folder: Path, trials: Sequence[TrialResult]) -> ActiveDec
         planned = declaration.planned
         added = tuple(trial for trial in trials if trial.seed not in planned.get(trial.key, ()))
     else:
-        # The record's file may be lost, and the trials' results repeat only its metric and time. Then every trial that
-        # was measured after the next record with trials may have been added.
+        # The record's file may be lost, and the trials' results repeat only its metric and time.
+        # Then every trial that was measured after the next record with trials may have been added.
         next_record = next((one.moment for one in current if one.names_trials), math.inf)
         added = tuple(trial for trial in trials if trial.measured >= next_record)
     return ActiveDeclaration(declaration, seen, added, len(trials), tuple(others))

@@ -1,8 +1,9 @@
-"""Differences between trials and between arms: conditions, settings, versions of the code, and *ingredients*.
+"""Differences between trials and between arms: conditions, settings, versions of the code, and
+*ingredients*.
 
-An ingredient is one difference that may explain a result. Each setting is an ingredient; settings that belong together
-share one name. A densifier class adds the ingredients in which it departs from ADC. All are read from the trials'
-recorded configurations and code.
+An ingredient is one difference that may explain a result. Each setting is an ingredient; settings
+that belong together share one name. A densifier class adds the ingredients in which it departs from
+ADC. All are read from the trials' recorded configurations and code.
 """
 
 import itertools
@@ -26,7 +27,17 @@ Versions = dict[str, list[TrialResult]]  # version -> the trials that it made
 
 # Settings in which trials of one cell may differ: they do not change what is computed.
 IGNORED_SETTINGS = (
-    *("seed", "name", "device", "threads", "tracking.", "launch.", "hydra.", "experiment", "scene.path"),
+    *(
+        "seed",
+        "name",
+        "device",
+        "threads",
+        "tracking.",
+        "launch.",
+        "hydra.",
+        "experiment",
+        "scene.path",
+    ),
     *("eval.primary", "eval.controls", "densify.switches"),
 )
 MAX_NAMED = 6  # a sentence names so many ingredients and counts the rest
@@ -40,22 +51,48 @@ INGREDIENT_NAMES = {
     "densify.gradient_threshold": "threshold",
     "densify.threshold_inclusive": "threshold",
     **{f"densify.{key}": "schedule" for key in ("start", "stop", "interval")},
-    **{f"train.{key}": "schedule" for key in ("densify_start", "densify_stop", "densify_interval", "mcmc_stop")},
-    **{f"densify.{key}": "opacity reset" for key in ("opacity_reset_interval", "opacity_reset_value")},
+    **{
+        f"train.{key}": "schedule"
+        for key in ("densify_start", "densify_stop", "densify_interval", "mcmc_stop")
+    },
+    **{
+        f"densify.{key}": "opacity reset"
+        for key in ("opacity_reset_interval", "opacity_reset_value")
+    },
     "train.opacity_reset_interval": "opacity reset",
     "train.resolution_schedule": "resolution schedule",
     **{f"densify.{key}": "budget" for key in ("max_gaussians", "cap", "governor_dimension")},
-    **{f"densify.{key}": "prunings" for key in ("prune_opacity", "prune_size", "prune_screen_radius")},
+    **{
+        f"densify.{key}": "prunings"
+        for key in ("prune_opacity", "prune_size", "prune_screen_radius")
+    },
     **{f"init.{key}": "cameras" for key in ("poses", "align")},
     **{
         f"train.{key}": "learning rates"
-        for key in ("position_initial", "position_final", "sh_dc", "sh_rest", "opacity", "scale", "rotation")
+        for key in (
+            "position_initial",
+            "position_final",
+            "sh_dc",
+            "sh_rest",
+            "opacity",
+            "scale",
+            "rotation",
+        )
     },
 }
 # Settings that do not change the trained model.
 WITHOUT_EFFECT = (
     *IGNORED_SETTINGS,
-    *("eval.", "scene.name", "init.name", "densify.name", "raster.name", "runs", "allow_targets", "init.device"),
+    *(
+        "eval.",
+        "scene.name",
+        "init.name",
+        "densify.name",
+        "raster.name",
+        "runs",
+        "allow_targets",
+        "init.device",
+    ),
     *("train.name", "train.log_every", "train.checkpoint_", "train.volume_histogram"),
     *("init.weights", "init.download", "init.threads", "densify.time_limit_minutes"),
 )
@@ -68,7 +105,8 @@ FACT = re.compile(rf"^# (?P<key>{'|'.join(FACTS)}): (?P<text>.*(?:\n#   .*)*)$",
 
 
 def differing_conditions(trials: Sequence[TrialResult], code: bool = True) -> dict[str, list[str]]:
-    """The conditions in which trials differ, with their values; with ``code``, versions of the code are conditions.
+    """The conditions in which trials differ, with their values; with ``code``, versions of the code
+    are conditions.
 
     Different budgets count only if a budget limited one of the trials.
     """
@@ -86,7 +124,8 @@ def differing_conditions(trials: Sequence[TrialResult], code: bool = True) -> di
 def differing_settings(trials: Sequence[TrialResult]) -> dict[str, list[str]]:
     """The settings in which trials differ, with their values, without `IGNORED_SETTINGS`.
 
-    A missing key counts as unset (null): trials from before a setting existed equal later ones that leave it unset.
+    A missing key counts as unset (null): trials from before a setting existed equal later ones that
+    leave it unset.
     """
     if len({trial.config_hash for trial in trials}) == 1:
         return {}
@@ -97,7 +136,8 @@ def differing_settings(trials: Sequence[TrialResult]) -> dict[str, list[str]]:
 
 
 def differing_code(trials: Iterable[TrialResult]) -> dict[str, Versions]:
-    """The parts of the code (user's modules, gsbench's stages and rooms) of which trials used several versions.
+    """The parts of the code (user's modules, gsbench's stages and rooms) of which trials used
+    several versions.
 
     Of several such rooms, the first stands for all, under a name that counts the others.
     """
@@ -106,7 +146,9 @@ def differing_code(trials: Iterable[TrialResult]) -> dict[str, Versions]:
     rooms = list(_with_several_versions(trials, lambda trial: trial.rooms).items())
     if rooms:
         part, versions = rooms[0]
-        differing[part if len(rooms) == 1 else f"{part} and {counted(len(rooms) - 1, 'more room')}"] = versions
+        differing[
+            part if len(rooms) == 1 else f"{part} and {counted(len(rooms) - 1, 'more room')}"
+        ] = versions
     return differing
 
 
@@ -121,9 +163,13 @@ def _with_several_versions(
 
 
 def describe_code(part: str, versions: Mapping[str, Sequence[TrialResult]]) -> str:
-    """``mine.Patient: 3fa9c1d2 (garden seeds 0, 1; 2026-11-21 18:40) | …``, the oldest version first."""
+    """``mine.Patient: 3fa9c1d2 (garden seeds 0, 1; 2026-11-21 18:40) | …``, the oldest version
+    first."""
     ordered = sorted(versions.items(), key=lambda item: max(trial.finished for trial in item[1]))
-    texts = [f"{short_version(version)} ({_scenes_and_seeds(own)}; {_when(own)})" for version, own in ordered]
+    texts = [
+        f"{short_version(version)} ({_scenes_and_seeds(own)}; {_when(own)})"
+        for version, own in ordered
+    ]
     return f"{part.removeprefix(CODE)}: {' | '.join(texts)}"
 
 
@@ -139,23 +185,28 @@ def _scenes_and_seeds(trials: Sequence[TrialResult]) -> str:
 
 
 def _when(trials: Sequence[TrialResult]) -> str:
-    """The time at which the trials were finished, to the minute: one time, or the first and the last."""
+    """The time at which the trials were finished, to the minute: one time, or the first and the
+    last."""
     times = sorted(trial.finished for trial in trials)
     minutes = [time.strftime("%Y-%m-%d %H:%M", time.localtime(finished)) for finished in times]
     return minutes[0] if minutes[0] == minutes[-1] else f"{minutes[0]} to {minutes[-1]}"
 
 
 def find_superseded(
-    trials: Sequence[TrialResult], present: Callable[[str, TrialResult], str | None] = lambda module, trial: None
+    trials: Sequence[TrialResult],
+    present: Callable[[str, TrialResult], str | None] = lambda module, trial: None,
 ) -> dict[Path, str]:
     """The folders of trials that older code made, each with the reason.
 
-    ``present(module, trial)`` is the present hash of a user's module, None if it cannot be found. In this case, and for
-    gsbench's own stages and rooms, the version of the trial that finished last counts as the present one.
+    ``present(module, trial)`` is the present hash of a user's module, None if it cannot be found.
+    In this case, and for gsbench's own stages and rooms, the version of the trial that finished
+    last counts as the present one.
     """
     reasons: dict[Path, str] = {}
     ordered = sorted(trials, key=lambda trial: trial.finished)
-    latest = {part: version for trial in ordered for part, version in (trial.code | trial.rooms).items()}
+    latest = {
+        part: version for trial in ordered for part, version in (trial.code | trial.rooms).items()
+    }
     for trial in trials:
         for part, version in (trial.code | trial.rooms).items():
             name = part.removeprefix(CODE)
@@ -168,43 +219,58 @@ def find_superseded(
 
 
 def ingredients(one: Mapping[str, Any], other: Mapping[str, Any]) -> tuple[str, ...]:
-    """The ingredients in which two configurations with dotted keys differ, those of the densifier classes first."""
+    """The ingredients in which two configurations with dotted keys differ, those of the densifier
+    classes first."""
     if not one or not other:
         return (NO_RECORD,)
     of_one_class = {*_class_ingredients(one)} ^ {*_class_ingredients(other)}
-    names = [name for config in (other, one) for name in _class_ingredients(config) if name in of_one_class]
+    names = [
+        name
+        for config in (other, one)
+        for name in _class_ingredients(config)
+        if name in of_one_class
+    ]
     other_init = any(one.get(key) != other.get(key) for key in ("init._target_", "init.name"))
     for key in differing_keys(one, other):
         is_of_one_class = key.startswith("densify.") and ((key in one) != (key in other))
         if key == TARGET or (one.get(TARGET) != other.get(TARGET) and is_of_one_class):
             continue
         is_cloud = other_init and key.startswith("init.") and key not in INGREDIENT_NAMES
-        names.append(INITIAL_CLOUD if is_cloud else INGREDIENT_NAMES.get(key, key.removeprefix("densify.")))
+        names.append(
+            INITIAL_CLOUD if is_cloud else INGREDIENT_NAMES.get(key, key.removeprefix("densify."))
+        )
     return tuple(dict.fromkeys(names))
 
 
 def differing_keys(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[str]:
-    """The settings in which two configurations differ, without those that do not change the trained model."""
+    """The settings in which two configurations differ, without those that do not change the trained
+    model."""
     keys = [key for key in {**one, **other} if not key.startswith(WITHOUT_EFFECT)]
     return [key for key in keys if one.get(key) != other.get(key)]
 
 
 def ingredients_between(trials: Sequence[TrialResult], first: Arm, second: Arm) -> tuple[str, ...]:
-    """The ingredients in which two arms of ``trials`` differ, in their configurations and in versions of the code.
+    """The ingredients in which two arms of ``trials`` differ, in their configurations and in
+    versions of the code.
 
     Only if there is exactly one, a difference of results can be put down to it.
     """
     one, other = representatives(trials, first, second)
     if one.made_elsewhere or other.made_elsewhere:
         return (ELSEWHERE,)
-    return tuple(dict.fromkeys([*ingredients(one.config, other.config), *differing_code((one, other))]))
+    return tuple(
+        dict.fromkeys([*ingredients(one.config, other.config), *differing_code((one, other))])
+    )
 
 
 def ingredients_sentence(names: Sequence[str], first: Arm, second: Arm) -> str:
     """``sfm-longaxis differs from sfm-adc by split, gradient and threshold.``"""
     if not names:
         return f"{second} and {first} differ in no recorded setting."
-    shown = [*names[:MAX_NAMED], *([f"{len(names) - MAX_NAMED} more"] if len(names) > MAX_NAMED else [])]
+    shown = [
+        *names[:MAX_NAMED],
+        *([f"{len(names) - MAX_NAMED} more"] if len(names) > MAX_NAMED else []),
+    ]
     return f"{second} differs from {first} by {listed(shown)}{'' if is_mixed(names) else ' alone'}."
 
 
@@ -214,14 +280,19 @@ def is_mixed(names: Sequence[str]) -> bool:
     return len(names) > 1 or any(name.startswith(bundles) for name in names)
 
 
-def representatives(trials: Iterable[TrialResult], first: Arm, second: Arm) -> tuple[TrialResult, TrialResult]:
-    """One trial of each arm: of the same scene and seed if possible, else of the same scene, else of the same seed.
+def representatives(
+    trials: Iterable[TrialResult], first: Arm, second: Arm
+) -> tuple[TrialResult, TrialResult]:
+    """One trial of each arm: of the same scene and seed if possible, else of the same scene, else
+    of the same seed.
 
     Raises KeyError for an arm without trials.
     """
     by_arm = group_by(trials, lambda trial: trial.arm)
     pairs = itertools.product(by_arm[first], by_arm[second])
-    return max(pairs, key=lambda pair: (pair[0].scene == pair[1].scene, pair[0].seed == pair[1].seed))
+    return max(
+        pairs, key=lambda pair: (pair[0].scene == pair[1].scene, pair[0].seed == pair[1].seed)
+    )
 
 
 def _class_ingredients(config: Mapping[str, Any]) -> tuple[str, ...]:
@@ -264,11 +335,15 @@ def _with_defaults(name: str) -> dict[str, Any]:
     """The settings of an arm, which override those of the arms in its ``defaults``."""
     content = _own_settings(name)
     parents = [parent for parent in content.pop("defaults", []) if parent != "_self_"]
-    return {key: value for parent in parents for key, value in _with_defaults(parent).items()} | content
+    return {
+        key: value for parent in parents for key, value in _with_defaults(parent).items()
+    } | content
 
 
 def _own_settings(name: str) -> dict[str, Any]:
-    settings: dict[str, Any] = yaml.load((_arms_folder() / f"{name}.yaml").read_text(encoding="utf-8"), Loader=LOADER)
+    settings: dict[str, Any] = yaml.load(
+        (_arms_folder() / f"{name}.yaml").read_text(encoding="utf-8"), Loader=LOADER
+    )
     return settings
 
 

@@ -1,6 +1,7 @@
 """The fairness of a comparison: everything in which two arms differ, and how each was tuned.
 
-The sheet and the sentences are made from the trials' records, so they leave out nothing that was recorded.
+The sheet and the sentences are made from the trials' records, so they leave out nothing that was
+recorded.
 """
 
 import statistics
@@ -29,14 +30,19 @@ LONGEST = 60  # shown characters of a value
 UNKNOWN, NONE = "not recorded", "–"
 ALIKE, UNLIKE = "", "≠"
 DIFFERS = "differs"  # heading of the column that marks differing rows
-EQUAL_COUNTS = 0.02  # relative difference up to which counts are equal; densify.cap=governor holds counts closer
+# relative difference up to which counts are equal; densify.cap=governor holds counts closer
+EQUAL_COUNTS = 0.02
 MAX_VALUES = 8  # shown points of a search
-NOTHING = "No tuning is recorded: each arm ran with one choice of settings. What was tried elsewhere is not known."
+NOTHING = (
+    "No tuning is recorded: each arm ran with one choice of settings. What was tried "
+    "elsewhere is not known."
+)
 VIEWS = "validation views"  # every search judges its points on them
 
 
 def caveats(trials: Sequence[TrialResult], first: Arm, second: Arm) -> str:
-    """Sentences on unequal counts, on more than one differing ingredient, and on unequal tuning; "" if none applies."""
+    """Sentences on unequal counts, on more than one differing ingredient, and on unequal tuning; ""
+    if none applies."""
     names = ingredients_between(trials, first, second)
     mixed = ingredients_sentence(names, first, second) if is_mixed(names) else ""
     counts = counts_sentence(trials, first, second)
@@ -44,7 +50,8 @@ def caveats(trials: Sequence[TrialResult], first: Arm, second: Arm) -> str:
 
 
 def counts_sentence(trials: Sequence[TrialResult], first: Arm, second: Arm) -> str:
-    """Say how many more Gaussians the second arm has, over the scenes that both have; "" if counts are equal."""
+    """Say how many more Gaussians the second arm has, over the scenes that both have; "" if counts
+    are equal."""
     baseline, other = ([trial for trial in trials if trial.arm == arm] for arm in (first, second))
     change = relative_change(baseline, other, COSTS["gaussians"][1])
     if change is None or abs(change.of_totals) <= EQUAL_COUNTS:
@@ -59,8 +66,9 @@ def counts_sentence(trials: Sequence[TrialResult], first: Arm, second: Arm) -> s
 def fairness_table(trials: Sequence[TrialResult], first: Arm, second: Arm) -> Table:
     """The fairness sheet of two arms as a table with notes.
 
-    ``trials`` are all trials of the experiment, each with its variant. Measured rows cover the paired trials: one
-    value, or the smallest, the largest and the mean. Raises KeyError for an arm without trials.
+    ``trials`` are all trials of the experiment, each with its variant. Measured rows cover the
+    paired trials: one value, or the smallest, the largest and the mean. Raises KeyError for an arm
+    without trials.
     """
     pairs = pair_trials(trials, first, second)
     one, other = pairs[0] if pairs else representatives(trials, first, second)
@@ -68,7 +76,9 @@ def fairness_table(trials: Sequence[TrialResult], first: Arm, second: Arm) -> Ta
     groups = [[trial for trial in compared if trial.arm == arm] for arm in (first, second)]
     rows = [_row(what, [show(group) for group in groups]) for what, show in MEASURED.items()]
     for index, key in enumerate(differing_keys(one.config, other.config)):
-        values = [_shown(trial.config[key]) if key in trial.config else NONE for trial in (one, other)]
+        values = [
+            _shown(trial.config[key]) if key in trial.config else NONE for trial in (one, other)
+        ]
         rows.append(_row(key, values, rule_above=index == 0))
     notes = [ingredients_sentence(ingredients_between(trials, first, second), first, second)]
     notes += [f"Compared: {counted(len(pairs), 'pair')} of trials of one scene and seed."]
@@ -90,7 +100,8 @@ def _shown(value: Any) -> str:
 
 
 def _span(read: Reader) -> Callable[[Sequence[TrialResult]], str]:
-    """A function that shows a number over trials: one value, or the smallest, the largest and the mean."""
+    """A function that shows a number over trials: one value, or the smallest, the largest and the
+    mean."""
 
     def show(trials: Sequence[TrialResult]) -> str:
         values = [value for trial in trials if (value := read(trial)) is not None]
@@ -119,20 +130,29 @@ def _start(trial: TrialResult, fact: str, form: str) -> str | None:
 
 
 def budget_words(trial: TrialResult) -> str | None:
-    """``15,000 Gaussians (governor), 600 s``; "none" without limits, None if the budget is not recorded."""
+    """``15,000 Gaussians (governor), 600 s``; "none" without limits, None if the budget is not
+    recorded."""
     budget = trial.record.budget
     if budget is None:
         return None
     count, seconds = budget.max_gaussians, budget.seconds
-    parts = [f"{count:,} Gaussians ({budget.cap})" if count else "", f"{seconds:g} s" if seconds else ""]
+    parts = [
+        f"{count:,} Gaussians ({budget.cap})" if count else "",
+        f"{seconds:g} s" if seconds else "",
+    ]
     return ", ".join(filter(None, parts)) or "none"
 
 
 def _code(trial: TrialResult) -> str | None:
-    parts = [f"{part.removeprefix(CODE)} {short_version(version)}" for part, version in sorted(trial.code.items())]
+    parts = [
+        f"{part.removeprefix(CODE)} {short_version(version)}"
+        for part, version in sorted(trial.code.items())
+    ]
     release = trial.record.versions.get("gsbench")
     program = f"{trial.program} {trial.trainer_version}".strip()
-    return ", ".join(filter(None, [program, f"gsbench {release}" if release else "", *parts])) or None
+    return (
+        ", ".join(filter(None, [program, f"gsbench {release}" if release else "", *parts])) or None
+    )
 
 
 # Rows that every sheet has, with the function that shows an arm's trials.
@@ -147,7 +167,9 @@ MEASURED: dict[str, Callable[[Sequence[TrialResult]], str]] = {
     ),
     "initial points": _span(lambda trial: trial.record.num_init_points),
     "initial points in two training views": _distinct(lambda trial: _start(trial, "seen", ".1%")),
-    "agreement of their colours with photographs": _distinct(lambda trial: _start(trial, "color_agreement", ".2f")),
+    "agreement of their colours with photographs": _distinct(
+        lambda trial: _start(trial, "color_agreement", ".2f")
+    ),
     "initial cloud (hash)": _distinct(lambda trial: trial.cloud[:12]),
     "iterations": _span(lambda trial: trial.record.iterations),
     "rounds of the densifier": _span(lambda trial: len(trial.folder.curves(EVENTS)) or None),
@@ -163,9 +185,11 @@ MEASURED: dict[str, Callable[[Sequence[TrialResult]], str]] = {
 
 
 def tuning_lines(trials: Sequence[TrialResult], pair: Sequence[Arm]) -> list[str]:
-    """List, for each arm of a pair, the searches for its settings, and the settings that these trials vary.
+    """List, for each arm of a pair, the searches for its settings, and the settings that these
+    trials vary.
 
-    These trials are measured on the test views, so varying settings among them is tuning on the verdict's own views.
+    These trials are measured on the test views, so varying settings among them is tuning on the
+    verdict's own views.
     """
     lines = [sentence] if (sentence := tuning_sentence(trials, pair)) else []
     for arm in pair:
@@ -176,10 +200,12 @@ def tuning_lines(trials: Sequence[TrialResult], pair: Sequence[Arm]) -> list[str
 
 
 def tuning_sentence(trials: Sequence[TrialResult], pair: Sequence[Arm]) -> str:
-    """``They were not tuned alike: sfm-adc none, sfm-volumetric 6 points of 1 seed on validation views.``
+    """``They were not tuned alike: sfm-adc none, sfm-volumetric 6 points of 1 seed on validation
+    views.``
 
-    "" if both arms had the same tuning budget. A search counts if its best point has exactly the arm's settings.
-    Settings that were all run as arms are no search, since each has its own verdict.
+    "" if both arms had the same tuning budget. A search counts if its best point has exactly the
+    arm's settings. Settings that were all run as arms are no search, since each has its own
+    verdict.
     """
     budgets = [_tuning_budget(next(trial for trial in trials if trial.arm == arm)) for arm in pair]
     if len(set(budgets)) < 2:
@@ -189,17 +215,21 @@ def tuning_sentence(trials: Sequence[TrialResult], pair: Sequence[Arm]) -> str:
 
 
 def _tuning_budget(trial: TrialResult) -> str:
-    """``6 points of 2 seeds on validation views``: the largest search whose best point the trial has; or ``none``."""
+    """``6 points of 2 seeds on validation views``: the largest search whose best point the trial
+    has; or ``none``."""
     searches = [search for search in _searches(trial).values() if _has_settings(trial, search.best)]
     if not searches:
         return "none"
     largest = max(searches, key=lambda search: len(search.points) * len(search.seeds))
-    return f"{counted(len(largest.points), 'point')} of {counted(len(largest.seeds), 'seed')} on {VIEWS}"
+    return (
+        f"{counted(len(largest.points), 'point')} of {counted(len(largest.seeds), 'seed')} on "
+        f"{VIEWS}"
+    )
 
 
 def _searches(trial: TrialResult) -> dict[str, TuningRecord]:
-    """The searches of a trial's arm in its runs folder, by experiment: those for its own sweep, and those that tried
-    exactly the trial's settings.
+    """The searches of a trial's arm in its runs folder, by experiment: those for its own sweep, and
+    those that tried exactly the trial's settings.
     """
     arm, sweep = f"{trial.init}-{trial.densify}", trial.path.parents[2].name
     searches = {}
@@ -213,19 +243,23 @@ def _searches(trial: TrialResult) -> dict[str, TuningRecord]:
 
 
 def _search_line(own: Sequence[TrialResult], experiment: str, search: TuningRecord) -> str:
-    """Say what a search tried and chose for an arm, and whether the arm's trials ``own`` came later and use it."""
+    """Say what a search tried and chose for an arm, and whether the arm's trials ``own`` came later
+    and use it."""
     best = search.best
     if best is None:
         return f"{search.arm}: the search {experiment} found nothing."
     chosen = listed([f"{key.lstrip('+~')}={value}" for key, value in sorted(best.settings.items())])
     tried = [
-        f"{', '.join(map(str, point.settings.values()))} ({'failed' if point.value is None else f'{point.value:.4g}'})"
+        f"{', '.join(map(str, point.settings.values()))} "
+        f"({'failed' if point.value is None else f'{point.value:.4g}'})"
         for point in search.points[:MAX_VALUES]
     ]
     more = len(search.points) - MAX_VALUES
     line = (
-        f"{search.arm}: {chosen} is the best of {counted(len(search.points), 'point')} by {search.metric} of {VIEWS} "
-        f"({listed(search.scenes)}; seed {', '.join(map(str, search.seeds))}; the search {experiment}), "
+        f"{search.arm}: {chosen} is the best of {counted(len(search.points), 'point')} by "
+        f"{search.metric} of {VIEWS} "
+        f"({listed(search.scenes)}; seed {', '.join(map(str, search.seeds))}; the search "
+        f"{experiment}), "
         f"{_when(own, experiment)}. "
         f"Tried: {', '.join(tried)}{f' and {more} more' if more > 0 else ''}."
     )
@@ -233,24 +267,37 @@ def _search_line(own: Sequence[TrialResult], experiment: str, search: TuningReco
 
 
 def _when(own: Sequence[TrialResult], experiment: str) -> str:
-    """Say whether the search ended before these trials: a search that ends later may be guided by their results."""
-    times = [trial.measured for trial in read_experiment(own[0].path.parents[3] / experiment).trials]
+    """Say whether the search ended before these trials: a search that ends later may be guided by
+    their results."""
+    times = [
+        trial.measured for trial in read_experiment(own[0].path.parents[3] / experiment).trials
+    ]
     if not times:
         return "whose own trials are missing"
     later = sum(trial.measured < max(times) for trial in own)
-    return f"ended when {later} of these {len(own)} trials had been measured" if later else "before any of these trials"
+    return (
+        f"ended when {later} of these {len(own)} trials had been measured"
+        if later
+        else "before any of these trials"
+    )
 
 
 def _varied_settings(trials: Sequence[TrialResult], own: TrialResult) -> list[str]:
-    """Name the settings that were varied among the experiment's arms with one initialiser and densifier class."""
+    """Name the settings that were varied among the experiment's arms with one initialiser and
+    densifier class."""
     target = own.config.get("densify._target_")
-    same_class = [t for t in trials if t.init == own.init and t.config and t.config.get("densify._target_") == target]
+    same_class = [
+        t
+        for t in trials
+        if t.init == own.init and t.config and t.config.get("densify._target_") == target
+    ]
     choices = [group[0] for group in group_by(same_class, lambda trial: trial.arm).values()]
     keys = sorted({key for other in choices for key in differing_keys(own.config, other.config)})
     if len(choices) < 2 or not keys:
         return []
     return [
-        f"{own.arm}: {counted(len(choices), 'choice')} of its settings were run here. They differ in {listed(keys)}, "
+        f"{own.arm}: {counted(len(choices), 'choice')} of its settings were run here. They differ "
+        f"in {listed(keys)}, "
         "and all were measured on the test views that the verdict uses."
     ]
 
@@ -259,5 +306,6 @@ def _has_settings(trial: TrialResult, point: SearchPoint | None) -> bool:
     """Return whether a trial has exactly the settings of a search point."""
     if point is None or not point.settings:
         return False
-    settings = {key.lstrip("+~"): value for key, value in point.settings.items()}  # without Hydra's override prefixes
+    # without Hydra's override prefixes
+    settings = {key.lstrip("+~"): value for key, value in point.settings.items()}
     return all(trial.config.get(key) == value for key, value in settings.items())

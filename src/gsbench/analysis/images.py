@@ -28,7 +28,8 @@ Pixels = NDArray[np.uint8]  # [H, W, 3]
 
 
 def texture_energy(image: Pixels) -> Array:
-    """Local mean of the squared luminance gradient (8-bit levels squared), [H, W], of an image [H, W, 3] uint8."""
+    """Local mean of the squared luminance gradient (8-bit levels squared), [H, W], of an image [H,
+    W, 3] uint8."""
     from skimage.filters import gaussian  # here, since it is slow to import
 
     luminance = image.astype(np.float64) @ np.array(LUMINANCE)  # [H, W]
@@ -37,7 +38,8 @@ def texture_energy(image: Pixels) -> Array:
 
 
 def read_counted(trial: TrialResult, view: str, shape: tuple[int, int]) -> NDArray[np.bool_]:
-    """The pixels [H, W] of a test view that count: all of the ``shape``, unless a mask ignores some."""
+    """The pixels [H, W] of a test view that count: all of the ``shape``, unless a mask ignores
+    some."""
     path = trial.path / MASKS / f"{view}.png"
     return read_mask(path) if path.is_file() else np.ones(shape, dtype=bool)
 
@@ -55,10 +57,11 @@ class PixelMeasures(Record):
 
 
 def textured_error(trial: TrialResult) -> float:
-    """Mean absolute error (8-bit levels) over the most textured fifth of each test photograph, mean over views.
+    """Mean absolute error (8-bit levels) over the most textured fifth of each test photograph, mean
+    over views.
 
-    This fifth shows grass, foliage, fabric or gravel. Raises InputError if neither renders nor their stored measure
-    exist.
+    This fifth shows grass, foliage, fabric or gravel. Raises InputError if neither renders nor
+    their stored measure exist.
     """
     stored = read_if_sound(trial.path / FROM_PIXELS, PixelMeasures)
     if stored is not None:
@@ -69,7 +72,13 @@ def textured_error(trial: TrialResult) -> float:
         texture = texture_energy(truth)  # [H, W]
         counted = read_counted(trial, view, texture.shape)
         inside = counted & (texture >= np.quantile(texture[counted], 1 - TEXTURED_SHARE))
-        errors.append(float(absolute_error(read_image(trial.path / RENDERS / f"{view}.png"), truth)[inside].mean()))
+        errors.append(
+            float(
+                absolute_error(read_image(trial.path / RENDERS / f"{view}.png"), truth)[
+                    inside
+                ].mean()
+            )
+        )
     return float(np.mean(errors))
 
 
@@ -84,9 +93,11 @@ def view_names(trial: TrialResult) -> list[str]:
 
 @dataclass(frozen=True)
 class ViewComparison:
-    """One test view of two arms: data URIs of photograph, renders and difference, and the mean errors (8-bit levels).
+    """One test view of two arms: data URIs of photograph, renders and difference, and the mean
+    errors (8-bit levels).
 
-    The difference is blue where the second arm is nearer to the photograph, red where the first arm is.
+    The difference is blue where the second arm is nearer to the photograph, red where the first arm
+    is.
     """
 
     which: str  # such as "the view with the least gain"
@@ -102,10 +113,11 @@ class ViewComparison:
 
 
 def choose_views(pairs: Sequence[TrialPair]) -> tuple[list[ViewComparison], list[str]]:
-    """The views with the least, the median and the largest gain, and messages on what could not be read.
+    """The views with the least, the median and the largest gain, and messages on what could not be
+    read.
 
-    A view's gain is the first arm's mean error minus the second arm's. Of each scene, one seed is used: the first whose
-    pictures can be read.
+    A view's gain is the first arm's mean error minus the second arm's. Of each scene, one seed is
+    used: the first whose pictures can be read.
     """
     views: list[tuple[float, TrialPair, str]] = []
     faults: dict[str, str] = {}  # by scene
@@ -116,31 +128,46 @@ def choose_views(pairs: Sequence[TrialPair]) -> tuple[list[ViewComparison], list
         try:
             for view in view_names(one):
                 first, second, truth = read_compared(one, other, view)
-                gain = absolute_error(first, truth=truth).mean() - absolute_error(second, truth=truth).mean()
+                gain = (
+                    absolute_error(first, truth=truth).mean()
+                    - absolute_error(second, truth=truth).mean()
+                )
                 views.append((float(gain), (one, other), view))
             scenes_read.add(one.scene)
         except InputError as error:
             faults.setdefault(one.scene, str(error))
-    return [compare_view(which, pair, view) for which, pair, view in _worst_median_best(views)], list(faults.values())
+    return [
+        compare_view(which, pair, view) for which, pair, view in _worst_median_best(views)
+    ], list(faults.values())
 
 
-def _worst_median_best(views: Sequence[tuple[float, TrialPair, str]]) -> list[tuple[str, TrialPair, str]]:
-    """From (gain, pair, view), the views with the least, the median and the largest gain, each once."""
+def _worst_median_best(
+    views: Sequence[tuple[float, TrialPair, str]],
+) -> list[tuple[str, TrialPair, str]]:
+    """From (gain, pair, view), the views with the least, the median and the largest gain, each
+    once."""
     ordered = sorted(views, key=lambda view: (view[0], view[1][0].label, view[2]))
     if len(ordered) < 2:
         return [("the only view", pair, view) for _, pair, view in ordered]
     places = {"least": 0, "median": len(ordered) // 2, "largest": -1}
     if len(ordered) == 2:
         del places["median"]
-    return [(f"the view with the {word} gain", *ordered[place][1:]) for word, place in places.items()]
+    return [
+        (f"the view with the {word} gain", *ordered[place][1:]) for word, place in places.items()
+    ]
 
 
 def compare_view(which: str, pair: TrialPair, view: str) -> ViewComparison:
-    """A test view of a pair of trials as the report shows it; raises InputError if its pictures differ in size."""
+    """A test view of a pair of trials as the report shows it; raises InputError if its pictures
+    differ in size."""
     first, second, truth = read_compared(*pair, view)
     errors = [absolute_error(image, truth=truth) for image in (first, second)]  # [H, W] each
-    gain = np.clip((errors[0] - errors[1]) / FULL_COLOUR, -1, 1)[..., None]  # [H, W, 1], 1 where the second is nearer
-    white, blue, red = (np.array(colour) for colour in ((255, 255, 255), (33, 102, 172), (178, 24, 43)))
+    gain = np.clip((errors[0] - errors[1]) / FULL_COLOUR, -1, 1)[
+        ..., None
+    ]  # [H, W, 1], 1 where the second is nearer
+    white, blue, red = (
+        np.array(colour) for colour in ((255, 255, 255), (33, 102, 172), (178, 24, 43))
+    )
     colours = white + np.abs(gain) * (np.where(gain > 0.0, blue, red) - white)
     return ViewComparison(
         which,
@@ -175,7 +202,8 @@ def _data_uri(picture: Image.Image, kind: str, **options: Any) -> str:
 
 
 def read_compared(one: TrialResult, other: TrialResult, view: str) -> list[Pixels]:
-    """Both renders and the photograph, with stripes over ignored pixels: equal stripes show no error."""
+    """Both renders and the photograph, with stripes over ignored pixels: equal stripes show no
+    error."""
     first = read_image(one.path / RENDERS / f"{view}.png")
     second = read_image(other.path / RENDERS / f"{view}.png")
     truth = read_image(one.path / GROUND_TRUTH / f"{view}.png")
@@ -183,5 +211,9 @@ def read_compared(one: TrialResult, other: TrialResult, view: str) -> list[Pixel
         raise InputError(f"{one.label} and {other.label}: {view} has different sizes")
     counted = read_counted(one, view, truth.shape[:2])
     rows, columns = np.indices(counted.shape)
-    stripes = np.where((rows + columns) % (2 * STRIPE) < STRIPE, *STRIPES).astype(np.uint8)  # [H, W]
-    return [np.where(counted[..., None], image, stripes[..., None]) for image in (first, second, truth)]
+    stripes = np.where((rows + columns) % (2 * STRIPE) < STRIPE, *STRIPES).astype(
+        np.uint8
+    )  # [H, W]
+    return [
+        np.where(counted[..., None], image, stripes[..., None]) for image in (first, second, truth)
+    ]

@@ -1,7 +1,7 @@
 """The verdicts on the questions of a declaration. `judge` is the only code that decides them.
 
-It serves reports, tables, checks of claims, sweeps that stop when decided and ablations, and gets its pairs of trials
-from `gsbench.analysis.pairing.pair`.
+It serves reports, tables, checks of claims, sweeps that stop when decided and ablations, and gets
+its pairs of trials from `gsbench.analysis.pairing.pair`.
 """
 
 import math
@@ -28,14 +28,17 @@ from gsbench.analysis.statistics import (
 from gsbench.runs.experiments import Declaration, Question
 from gsbench.words import counted, signed
 
-OUTLYING = 5.0  # deviations from the other trials of its scene and arm, beyond which a trial is outlying
+# deviations from the other trials of its scene and arm, beyond which a trial is outlying
+OUTLYING = 5.0
 LEAST_OTHERS = 2  # other trials that this needs
-FEW = 1.2  # corrects the median sample deviation of three trials, which is too small: 1 / sqrt(ln 2)
+# corrects the median sample deviation of three trials, which is too small: 1 / sqrt(ln 2)
+FEW = 1.2
 
 
 @dataclass(frozen=True)
 class SceneVerdict:
-    """One scene of a verdict: its mean paired difference, with a test adjusted for all scenes of all questions."""
+    """One scene of a verdict: its mean paired difference, with a test adjusted for all scenes of
+    all questions."""
 
     scene: str
     mean: float
@@ -48,13 +51,14 @@ class SceneVerdict:
 class Verdict:
     """The answer to a question from ``pairs`` of trials.
 
-    ``answer`` is about these scenes, None if no trials could be paired; ``like_these`` is about scenes like these.
-    ``untestable`` says why such trials can never answer the question. ``final`` is False while further planned seeds
-    may decide. ``outlying`` trials lie far outside the others of their scene and arm; ``outcome_without`` is the
-    outcome without them. If the mean of the other trials contradicts the outcome, the verdict
-    ``rests_on_outlying`` trials and is undecided. ``late`` is the number of trials that were measured before the
-    question was asked. If there are any, each metric could have been chosen by its result, and the error rate is
-    divided by the number of metrics.
+    ``answer`` is about these scenes, None if no trials could be paired; ``like_these`` is about
+    scenes like these. ``untestable`` says why such trials can never answer the question. ``final``
+    is False while further planned seeds may decide. ``outlying`` trials lie far outside the others
+    of their scene and arm; ``outcome_without`` is the outcome without them. If the mean of the
+    other trials contradicts the outcome, the verdict ``rests_on_outlying`` trials and is undecided.
+    ``late`` is the number of trials that were measured before the question was asked. If there are
+    any, each metric could have been chosen by its result, and the error rate is divided by the
+    number of metrics.
     """
 
     question: Question
@@ -75,7 +79,8 @@ class Verdict:
 
     @property
     def least(self) -> float | None:
-        """The least difference that matters; for a relative question in logarithms, in which it is tested."""
+        """The least difference that matters; for a relative question in logarithms, in which it is
+        tested."""
         least = self.question.least
         return math.log1p(least) if self.question.relative and least is not None else least
 
@@ -123,13 +128,17 @@ class Verdict:
 
 
 def judge(trials: Sequence[TrialResult], declaration: Declaration) -> list[Verdict]:
-    """The verdicts on the questions of ``declaration`` from ``trials``, in the order of the questions.
+    """The verdicts on the questions of ``declaration`` from ``trials``, in the order of the
+    questions.
 
-    Questions share the error rate. If seeds come in looks, each question gets an equal share and is answered at the
-    first look that decides it; otherwise Holm's method adjusts them as one family. Secondary questions have an error
-    rate of their own.
+    Questions share the error rate. If seeds come in looks, each question gets an equal share and is
+    answered at the first look that decides it; otherwise Holm's method adjusts them as one family.
+    Secondary questions have an error rate of their own.
     """
-    by_arm, by_folder = group_by(trials, lambda trial: trial.arm), group_by(trials, lambda trial: trial.key)
+    by_arm, by_folder = (
+        group_by(trials, lambda trial: trial.arm),
+        group_by(trials, lambda trial: trial.key),
+    )
 
     def trials_of(question: Question) -> list[TrialResult]:
         # Grouped once above: searching all trials for each of many questions is slow.
@@ -138,12 +147,16 @@ def judge(trials: Sequence[TrialResult], declaration: Declaration) -> list[Verdi
             return [trial for key in keys for trial in by_folder.get(key, [])]
         return [trial for arm in (question.baseline, question.arm) for trial in by_arm.get(arm, [])]  # type: ignore[arg-type]
 
-    unjudged = [_with_pairs(trials_of(question), question, declaration) for question in declaration.questions]
+    unjudged = [
+        _with_pairs(trials_of(question), question, declaration)
+        for question in declaration.questions
+    ]
     judged = list(unjudged)
     testable = [k for k, one in enumerate(unjudged) if one.pairs.rows and not one.untestable]
     for secondary in (False, True):
         family = [k for k in testable if unjudged[k].question.secondary == secondary]
-        # With looks, the shares of the error rate were fixed beforehand: questions without pairs keep theirs.
+        # With looks, the shares of the error rate were fixed beforehand: questions without pairs
+        # keep theirs.
         sharing = sum(question.secondary == secondary for question in declaration.questions)
         if declaration.looks:
             for k in family:
@@ -158,21 +171,31 @@ def judge(trials: Sequence[TrialResult], declaration: Declaration) -> list[Verdi
     return _with_scenes(judged, declaration.error_rate)
 
 
-def _with_pairs(trials: Sequence[TrialResult], question: Question, declaration: Declaration) -> Verdict:
+def _with_pairs(
+    trials: Sequence[TrialResult], question: Question, declaration: Declaration
+) -> Verdict:
     """The question with its pairs of trials, not judged yet."""
     pairs = pair(trials, question)
-    new = pairs.trials[1::2] if question.versions else pairs.trials  # an earlier baseline alone shows no difference
+    # an earlier baseline alone shows no difference
+    new = pairs.trials[1::2] if question.versions else pairs.trials
     late = sum(trial.measured < declaration.moment for trial in new)
     quantity = asked_quantity(question.metric, trials)
-    verdict = Verdict(question, quantity, pairs, notes=pairs.left_out, late=late, final=not declaration.looks)
+    verdict = Verdict(
+        question, quantity, pairs, notes=pairs.left_out, late=late, final=not declaration.looks
+    )
     if not pairs.rows and pairs.left_out and question.scenes:
         return replace(verdict, untestable=pairs.left_out[0], notes=pairs.left_out[1:], final=True)
     if question.scenes and len(pairs.rows) < len(question.scenes):  # a look waits for every scene
         return replace(verdict, pairs=replace(pairs, rows=()))
-    if pairs.rows and question.scenes and all(are_equal(*both) for row in pairs.rows for both in row.trials):
+    if (
+        pairs.rows
+        and question.scenes
+        and all(are_equal(*both) for row in pairs.rows for both in row.trials)
+    ):
         count = sum(len(row.trials) for row in pairs.rows)
         reason = (
-            f"both arms of {counted(count, 'pair')} of trials are equal to the last bit: the settings that differ had "
+            f"both arms of {counted(count, 'pair')} of trials are equal to the last bit: the "
+            "settings that differ had "
             "no effect at this size"
         )
         return replace(verdict, untestable=reason, final=True)
@@ -180,10 +203,14 @@ def _with_pairs(trials: Sequence[TrialResult], question: Question, declaration: 
 
 
 def _candidate_metrics(verdict: Verdict) -> int:
-    """The number of metrics that could have been chosen by their results: 1 if the question was asked beforehand."""
+    """The number of metrics that could have been chosen by their results: 1 if the question was
+    asked beforehand."""
     if not verdict.late:
         return 1
-    return len({name for trial in verdict.pairs.trials for name in trial.metrics} | {verdict.question.metric})
+    return len(
+        {name for trial in verdict.pairs.trials for name in trial.metrics}
+        | {verdict.question.metric}
+    )
 
 
 def _at_looks(asked: Verdict, looks: tuple[int, ...], rate: float) -> Verdict:
@@ -214,7 +241,9 @@ def _decide(verdict: Verdict, answer: Answer) -> Verdict:
         answer_without = replace(answer, test=t_test(rest.differences) if rest.rows else None)
         outcome_without = answer_without.outcome(question.sign, least)
         if rest.rows:
-            rests_on_outlying = _contradicts(float(rest.differences.mean()), answer.mean, outcome, least)
+            rests_on_outlying = _contradicts(
+                float(rest.differences.mean()), answer.mean, outcome, least
+            )
     return replace(
         verdict,
         answer=answer,
@@ -227,7 +256,8 @@ def _decide(verdict: Verdict, answer: Answer) -> Verdict:
 
 
 def _contradicts(rest: float, mean: float, outcome: Outcome, least: float | None) -> bool:
-    """Return whether ``rest``, the mean without outlying trials, contradicts the outcome that ``mean`` led to.
+    """Return whether ``rest``, the mean without outlying trials, contradicts the outcome that
+    ``mean`` led to.
 
     It does if it is not too small although the outcome says so, or if it has the other sign.
     """
@@ -237,10 +267,12 @@ def _contradicts(rest: float, mean: float, outcome: Outcome, least: float | None
 
 
 def find_outlying(pairs: Pairs) -> list[TrialResult]:
-    """The trials that lie more than `OUTLYING` deviations from the mean of the other trials of their scene and arm.
+    """The trials that lie more than `OUTLYING` deviations from the mean of the other trials of
+    their scene and arm.
 
-    The deviation of two or three trials is often small by chance. So the largest of three counts: the other trials'
-    deviation, that of the scene's other arm, and the typical deviation over all scenes and arms.
+    The deviation of two or three trials is often small by chance. So the largest of three counts:
+    the other trials' deviation, that of the scene's other arm, and the typical deviation over all
+    scenes and arms.
     """
     rows = [row for row in pairs.rows if len(row.seeds) > LEAST_OTHERS]
     deviations = [(float(row.baseline.std(ddof=1)), float(row.arm.std(ddof=1))) for row in rows]
@@ -260,16 +292,29 @@ def find_outlying(pairs: Pairs) -> list[TrialResult]:
 def _with_scenes(verdicts: Sequence[Verdict], level: float) -> list[Verdict]:
     """The verdicts with a `SceneVerdict` for each scene.
 
-    All scenes of all questions are one family. If a question has one scene, that scene has the question's own answer.
+    All scenes of all questions are one family. If a question has one scene, that scene has the
+    question's own answer.
     """
-    several = [one.pairs.differences for one in verdicts if one.answer is not None and len(one.pairs.rows) > 1]
-    answers = iter(answer_family([row[None] for differences in several for row in differences], level))
+    several = [
+        one.pairs.differences
+        for one in verdicts
+        if one.answer is not None and len(one.pairs.rows) > 1
+    ]
+    answers = iter(
+        answer_family([row[None] for differences in several for row in differences], level)
+    )
     completed = []
     for verdict in verdicts:
         scenes = []
         for row in verdict.pairs.rows:
-            answer = next(answers) if verdict.answer and len(verdict.pairs.rows) > 1 else verdict.answer
+            answer = (
+                next(answers) if verdict.answer and len(verdict.pairs.rows) > 1 else verdict.answer
+            )
             if answer is not None:
-                scenes.append(SceneVerdict(row.scene, answer.mean, verdict.pairs.seeds, answer.interval, answer.p))
+                scenes.append(
+                    SceneVerdict(
+                        row.scene, answer.mean, verdict.pairs.seeds, answer.interval, answer.p
+                    )
+                )
         completed.append(replace(verdict, scenes=tuple(scenes)))
     return completed

@@ -31,7 +31,8 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class ScenePairs:
-    """The pairs of trials of one scene, one per seed in the order of adding seeds, with both arms' values [K]."""
+    """The pairs of trials of one scene, one per seed in the order of adding seeds, with both arms'
+    values [K]."""
 
     scene: str
     seeds: tuple[int, ...]
@@ -52,7 +53,8 @@ class ScenePairs:
 
 @dataclass(frozen=True)
 class Pairs:
-    """The pairs of trials of a question by scene, and a line on each thing that could not be paired."""
+    """The pairs of trials of a question by scene, and a line on each thing that could not be
+    paired."""
 
     rows: tuple[ScenePairs, ...]
     left_out: tuple[str, ...] = ()
@@ -69,8 +71,12 @@ class Pairs:
 
     @cached_property
     def differences(self) -> Array:
-        """Arm minus baseline [S, K]. Seeds that some scenes lack are dropped, so that all scenes weigh the same."""
-        changes = [np.log(row.arm / row.baseline) if self.relative else row.arm - row.baseline for row in self.rows]
+        """Arm minus baseline [S, K]. Seeds that some scenes lack are dropped, so that all scenes
+        weigh the same."""
+        changes = [
+            np.log(row.arm / row.baseline) if self.relative else row.arm - row.baseline
+            for row in self.rows
+        ]
         return np.array([change[: self.seeds] for change in changes])
 
     @property
@@ -81,28 +87,36 @@ class Pairs:
     @property
     def trials(self) -> tuple[TrialResult, ...]:
         """The trials that count, pair by pair."""
-        return tuple(trial for row in self.rows for pair in row.trials[: self.seeds] for trial in pair)
+        return tuple(
+            trial for row in self.rows for pair in row.trials[: self.seeds] for trial in pair
+        )
 
     def first(self, seeds: int) -> Pairs:
         """The pairs of the first ``seeds`` seeds of every scene."""
-        return replace(self, rows=tuple(row.subset(range(min(seeds, len(row.seeds)))) for row in self.rows))
+        return replace(
+            self, rows=tuple(row.subset(range(min(seeds, len(row.seeds)))) for row in self.rows)
+        )
 
     def without(self, outlying: Sequence[TrialResult]) -> Pairs:
         """The pairs without those of an ``outlying`` trial; a scene without pairs is left out."""
         paths = {trial.path for trial in outlying}
         rows = [
-            row.subset([k for k, pair in enumerate(row.trials) if not paths & {one.path for one in pair}])
+            row.subset(
+                [k for k, pair in enumerate(row.trials) if not paths & {one.path for one in pair}]
+            )
             for row in self.rows
         ]
         return replace(self, rows=tuple(row for row in rows if row.seeds))
 
 
 def pair(trials: Sequence[TrialResult], question: Question) -> Pairs:
-    """Pair the trials of a question by scene and seed, and say which have no partner or cannot be compared.
+    """Pair the trials of a question by scene and seed, and say which have no partner or cannot be
+    compared.
 
-    Trials are compared only under equal conditions. Budgets may differ if the question names its trials itself, since a
-    claim may be about arms with different budgets. Of seeds in planned order, those after the first missing seed do not
-    count: a seed that comes late cannot change what an earlier look saw.
+    Trials are compared only under equal conditions. Budgets may differ if the question names its
+    trials itself, since a claim may be about arms with different budgets. Of seeds in planned
+    order, those after the first missing seed do not count: a seed that comes late cannot change
+    what an earlier look saw.
     """
     rows, left_out = [], list[str]()
     for scene, sides in _sides(trials, question).items():
@@ -113,24 +127,33 @@ def pair(trials: Sequence[TrialResult], question: Question) -> Pairs:
             continue
         left_out += faults
         rows += [row] if row.seeds else []
-    if uneven := {len(row.seeds) for row in rows if len(row.seeds) > min(len(row.seeds) for row in rows)}:
+    if uneven := {
+        len(row.seeds) for row in rows if len(row.seeds) > min(len(row.seeds) for row in rows)
+    }:
         least = min(len(row.seeds) for row in rows)
         few = some_of([row.scene for row in rows if len(row.seeds) == least])
         left_out.append(
-            f"{counted(least, 'seed')} of each scene count, since {few} has no more (others up to {max(uneven)})"
+            f"{counted(least, 'seed')} of each scene count, since {few} has no more (others up to "
+            f"{max(uneven)})"
         )
     return Pairs(tuple(rows), tuple(left_out), question.relative)
 
 
-def _sides(trials: Sequence[TrialResult], question: Question) -> dict[str, tuple[list[TrialResult], list[TrialResult]]]:
+def _sides(
+    trials: Sequence[TrialResult], question: Question
+) -> dict[str, tuple[list[TrialResult], list[TrialResult]]]:
     """The trials of the baseline and of the arm, by scene."""
     if question.scenes:
         by_folder = group_by(trials, lambda trial: trial.key)
         return {
-            scene: (by_folder.get(one, []), by_folder.get(other, [])) for scene, (one, other) in question.scenes.items()
+            scene: (by_folder.get(one, []), by_folder.get(other, []))
+            for scene, (one, other) in question.scenes.items()
         }
     return {
-        scene: ([t for t in own if t.arm == question.baseline], [t for t in own if t.arm == question.arm])
+        scene: (
+            [t for t in own if t.arm == question.baseline],
+            [t for t in own if t.arm == question.arm],
+        )
         for scene, own in group_by(trials, lambda trial: trial.scene).items()
     }
 
@@ -148,14 +171,17 @@ def pair_trials(trials: Sequence[TrialResult], baseline: Arm, arm: Arm) -> list[
 def _match_seeds(
     scene: str, baseline: Sequence[TrialResult], arm: Sequence[TrialResult], question: Question
 ) -> tuple[dict[int, TrialPair], list[str]]:
-    """The pairs of one scene by seed, in the planned order, and a line for each seed without a partner.
+    """The pairs of one scene by seed, in the planned order, and a line for each seed without a
+    partner.
 
     Raises InputError if trials of one arm cannot be averaged, or if the arms' conditions differ.
     """
     for own in (baseline, arm):
         if own:
             check_averageable(own, f"scene={scene} {own[0].arm}")
-    baseline_by_seed, arm_by_seed = ({trial.seed: trial for trial in own} for own in (baseline, arm))
+    baseline_by_seed, arm_by_seed = (
+        {trial.seed: trial for trial in own} for own in (baseline, arm)
+    )
     wanted = question.seeds or sorted(baseline_by_seed.keys() | arm_by_seed.keys())
     shared = baseline_by_seed.keys() & arm_by_seed.keys()
     pairs = {seed: (baseline_by_seed[seed], arm_by_seed[seed]) for seed in wanted if seed in shared}
@@ -164,7 +190,9 @@ def _match_seeds(
         if question.scenes:
             differing.pop("budget", None)
         if differing:
-            raise InputError(f"{scene}: the arms differ in {', '.join(differing)}, so they are not compared")
+            raise InputError(
+                f"{scene}: the arms differ in {', '.join(differing)}, so they are not compared"
+            )
     unpaired = () if question.seeds else tuple(seed for seed in wanted if seed not in pairs)
     return pairs, [f"{scene}: seed {seed} has no partner" for seed in unpaired]
 
@@ -172,7 +200,8 @@ def _match_seeds(
 def _pair_scene(
     scene: str, baseline: Sequence[TrialResult], arm: Sequence[TrialResult], question: Question
 ) -> tuple[ScenePairs, list[str]]:
-    """The pairs of one scene that have values, and a line on each thing that could not be paired."""
+    """The pairs of one scene that have values, and a line on each thing that could not be
+    paired."""
     pairs, faults = _match_seeds(scene, baseline, arm, question)
     values: dict[int, tuple[float, float]] = {}
     reasons: dict[str, list[str]] = {}
@@ -182,8 +211,12 @@ def _pair_scene(
         except InputError as error:
             reasons.setdefault(str(error), []).append(f"{scene} seed {seed}")
     faults += [f"{some_of(seeds)}: {reason}" for reason, seeds in reasons.items()]
-    counted_seeds = list(takewhile(values.__contains__, question.seeds)) if question.seeds else list(values)
-    of_baseline, of_arm = (np.array([values[seed][side] for seed in counted_seeds]) for side in (0, 1))
+    counted_seeds = (
+        list(takewhile(values.__contains__, question.seeds)) if question.seeds else list(values)
+    )
+    of_baseline, of_arm = (
+        np.array([values[seed][side] for seed in counted_seeds]) for side in (0, 1)
+    )
     chosen = tuple(pairs[seed] for seed in counted_seeds)
     return ScenePairs(scene, tuple(counted_seeds), chosen, of_baseline, of_arm), faults
 
@@ -203,20 +236,31 @@ def are_equal(one: TrialResult, other: TrialResult) -> bool:
 
 
 def choose_pairs(
-    arms: Sequence[Arm], baseline: str = BASELINE, controls: Mapping[str, str] = MappingProxyType({})
+    arms: Sequence[Arm],
+    baseline: str = BASELINE,
+    controls: Mapping[str, str] = MappingProxyType({}),
 ) -> list[tuple[Arm, Arm]]:
-    """The pairs (baseline, arm) of arms to compare: first those with the baseline, then those with controls.
+    """The pairs (baseline, arm) of arms to compare: first those with the baseline, then those with
+    controls.
 
-    An arm is compared with the baseline densifier of the same initialiser, with the same swept settings if such an arm
-    exists. If no arm has the baseline, all are compared with the first of ``arms``. ``controls`` maps a densifier to a
-    further one that it is compared with (`controls_of`).
+    An arm is compared with the baseline densifier of the same initialiser, with the same swept
+    settings if such an arm exists. If no arm has the baseline, all are compared with the first of
+    ``arms``. ``controls`` maps a densifier to a further one that it is compared with
+    (`controls_of`).
     """
 
     def partner(arm: Arm, densify: str) -> Arm | None:
         same_settings = replace(arm, densify=densify)
-        return next((one for one in (same_settings, replace(same_settings, variant=())) if one in arms), None)
+        return next(
+            (one for one in (same_settings, replace(same_settings, variant=())) if one in arms),
+            None,
+        )
 
-    pairs = [(found, arm) for arm in arms if arm.densify != baseline and (found := partner(arm, baseline))]
+    pairs = [
+        (found, arm)
+        for arm in arms
+        if arm.densify != baseline and (found := partner(arm, baseline))
+    ]
     pairs = pairs or [(arms[0], arm) for arm in arms[1:]]
     for arm in arms:
         control = controls.get(arm.densify, arm.densify)
@@ -227,7 +271,8 @@ def choose_pairs(
 
 
 def controls_of(trials: Sequence[TrialResult]) -> dict[str, str]:
-    """The control of each densifier, another densifier that the trials' settings name (``eval.controls``)."""
+    """The control of each densifier, another densifier that the trials' settings name
+    (``eval.controls``)."""
     firsts = [group[0] for group in group_by(trials, lambda trial: trial.arm).values()]
     return {
         key.removeprefix(CONTROLS): str(value)

@@ -1,4 +1,5 @@
-"""Printed numbers of papers, Tables 1 and 2 of the method's paper from measured trials, and the differences."""
+"""Printed numbers of papers, Tables 1 and 2 of the method's paper from measured trials, and the
+differences."""
 
 import math
 from collections import Counter
@@ -18,7 +19,8 @@ from gsbench.analysis.tables import build_table
 from gsbench.errors import InputError
 from gsbench.words import did_you_mean, signed
 
-OWN = "_own"  # suffix of an experiment that repeats a table with each initialiser's own poses and gauge
+# suffix of an experiment that repeats a table with each initialiser's own poses and gauge
+OWN = "_own"
 STAND_FOR = {"dim_paper": "dim"}  # our initialiser -> the paper's initialiser that it repeats
 CONFIDENCE = 0.95
 PAPER_TABLES = ("table1", "table2")
@@ -31,7 +33,8 @@ ARMS = {
     "table2": (("sfm", "adc"), ("dim", "adc"), ("sfm", "volumetric"), ("dim", "volumetric")),
 }
 PRINTED_NAMES = {"adc": "3DGS", "volumetric": "Ours", "sfm": "SfM", "dim": "DIM"}
-ROUNDING, INTERVAL, DIFFERS = "=", "≈", "≠"  # marks of measured cells beside printed numbers (`agreement`)
+# marks of measured cells beside printed numbers (`agreement`)
+ROUNDING, INTERVAL, DIFFERS = "=", "≈", "≠"
 
 Key = tuple[str, str, str, str]  # scene, init, densify, quantity
 FindPrinted = Callable[[str, Arm, str], "PrintedNumber | None"]  # by scene, arm and quantity
@@ -39,7 +42,8 @@ FindPrinted = Callable[[str, Arm, str], "PrintedNumber | None"]  # by scene, arm
 
 @dataclass(frozen=True)
 class PrintedNumber:
-    """A printed number; it stands for the ``range`` of values within half a unit of its last digit."""
+    """A printed number; it stands for the ``range`` of values within half a unit of its last
+    digit."""
 
     text: str
 
@@ -59,8 +63,8 @@ class PrintedNumber:
 
 @dataclass(frozen=True)
 class Paper:
-    """The paper of the method: its ``tables`` by name, where it contradicts itself (one sentence each), and what it
-    says on settings (``setup``, by topic).
+    """The paper of the method: its ``tables`` by name, where it contradicts itself (one sentence
+    each), and what it says on settings (``setup``, by topic).
     """
 
     tables: Mapping[str, Mapping[Key, PrintedNumber]]
@@ -74,7 +78,8 @@ class Paper:
 
 @dataclass(frozen=True)
 class Published:
-    """Another paper's numbers; ``scenes`` has the printed text of each of ``quantities`` for its method."""
+    """Another paper's numbers; ``scenes`` has the printed text of each of ``quantities`` for its
+    method."""
 
     title: str
     source: str  # where the numbers were read
@@ -87,7 +92,10 @@ class Published:
     @property
     def printed(self) -> dict[tuple[str, str], PrintedNumber]:
         """The printed numbers by scene and quantity."""
-        rows = ((scene, zip(self.quantities, texts, strict=True)) for scene, texts in self.scenes.items())
+        rows = (
+            (scene, zip(self.quantities, texts, strict=True))
+            for scene, texts in self.scenes.items()
+        )
         return {(scene, key): PrintedNumber(text) for scene, row in rows for key, text in row}
 
 
@@ -110,15 +118,21 @@ def load_paper() -> Paper:
 def published_names() -> list[str]:
     """The names of the other papers whose numbers ship with gsbench."""
     folder = files("gsbench.analysis").joinpath("published")
-    return sorted(file.name.removesuffix(".yaml") for file in folder.iterdir() if file.name.endswith(".yaml"))
+    return sorted(
+        file.name.removesuffix(".yaml") for file in folder.iterdir() if file.name.endswith(".yaml")
+    )
 
 
 @cache
 def load_published(name: str) -> Published:
-    """The numbers of the paper ``name``; for an unknown name raises InputError that lists the known ones."""
+    """The numbers of the paper ``name``; for an unknown name raises InputError that lists the known
+    ones."""
     names = published_names()
     if name not in names:
-        raise InputError(f"no published numbers {name!r}{did_you_mean(name, names)} (there are: {', '.join(names)})")
+        raise InputError(
+            f"no published numbers {name!r}{did_you_mean(name, names)} (there are: "
+            f"{', '.join(names)})"
+        )
     return Published(**_read(f"published/{name}.yaml"))
 
 
@@ -127,33 +141,43 @@ def _read(name: str) -> Any:
 
 
 def layout_of(name: str) -> str | None:
-    """The paper's table that the experiment ``name`` repeats, or None: ``table1`` for ``table1`` and ``table1_own``."""
+    """The paper's table that the experiment ``name`` repeats, or None: ``table1`` for ``table1``
+    and ``table1_own``."""
     table = name.removesuffix(OWN)
     return table if table in PAPER_TABLES else None
 
 
 def paper_tables(
-    experiment: Experiment, name: str, trials: Sequence[TrialResult] | None = None, metrics: Sequence[str] | None = None
+    experiment: Experiment,
+    name: str,
+    trials: Sequence[TrialResult] | None = None,
+    metrics: Sequence[str] | None = None,
 ) -> list[Table]:
-    """The measured table in the paper's layout, and the table of differences from the printed numbers.
+    """The measured table in the paper's layout, and the table of differences from the printed
+    numbers.
 
-    ``name`` is ``table1`` or ``table2``. If only one initialiser was run and it is not DIM, it replaces DIM in Table 1.
+    ``name`` is ``table1`` or ``table2``. If only one initialiser was run and it is not DIM, it
+    replaces DIM in Table 1.
     """
     paper, arms = load_paper(), ARMS[name]
     trials = list(experiment.trials if trials is None else trials)
     inits = {trial.init for trial in trials}
-    run_as = {of_paper: _run_as(of_paper, inits) for of_paper, _ in arms}  # the paper's initialiser -> ours
+    # the paper's initialiser -> ours
+    run_as = {of_paper: _run_as(of_paper, inits) for of_paper, _ in arms}
     notes = []
     if name == "table1" and run_as["dim"] not in inits and len(inits) == 1:
         (run_as["dim"],) = inits
         notes = [
-            f"Initial clouds from {run_as['dim']} replace the paper's DIM: the columns do not repeat its experiment."
+            f"Initial clouds from {run_as['dim']} replace the paper's DIM: the columns do not "
+            "repeat its experiment."
         ]
     shown = [(run_as[init], densify) for init, densify in arms]
     trials = [trial for trial in trials if (trial.init, trial.densify) in shown]
     if not trials:
         needed = ", ".join(f"init={init} densify={densify}" for init, densify in shown)
-        raise InputError(f"experiment {experiment.name!r} has no trial for {name} ({needed}); use --layout plain")
+        raise InputError(
+            f"experiment {experiment.name!r} has no trial for {name} ({needed}); use --layout plain"
+        )
     scenes = paper.scenes(name)
     scenes += sorted({trial.scene for trial in trials} - set(scenes))
     columns = ("densify",) if name == "table1" else ("init", "densify")
@@ -167,7 +191,8 @@ def paper_tables(
         metrics=metrics,
         title=f"{title}, measured (experiment {experiment.name})",
         order=([(scene,) for scene in scenes], [arm[-len(columns) :] for arm in shown]),
-        names=PRINTED_NAMES | {own: PRINTED_NAMES[of_paper] for of_paper, own in run_as.items() if own in STAND_FOR},
+        names=PRINTED_NAMES
+        | {own: PRINTED_NAMES[of_paper] for of_paper, own in run_as.items() if own in STAND_FOR},
     )
     papers_init = {own: init for init, own in run_as.items()}
     keys = [one.key for one in choose_quantities(trials, metrics)]
@@ -179,33 +204,50 @@ def paper_tables(
         return paper.tables[name].get((scene, papers_init[arm.init], arm.densify, key))
 
     title = f"{title}, difference from the printed values"
-    return [measured, _differences(title, "paper", trials, scenes, compared, find, notes, paper.setup)]
+    return [
+        measured,
+        _differences(title, "paper", trials, scenes, compared, find, notes, paper.setup),
+    ]
 
 
 def _run_as(init: str, inits: set[str]) -> str:
-    """Our initialiser for the paper's ``init``: the one of this name, or if it was not run, one that repeats it."""
+    """Our initialiser for the paper's ``init``: the one of this name, or if it was not run, one
+    that repeats it."""
     if init in inits:
         return init
     return next((own for own in sorted(inits) if STAND_FOR.get(own) == init), init)
 
 
 def published_table(trials: Sequence[TrialResult], name: str) -> Table:
-    """The measured arms on the scenes of the paper ``name``, its printed numbers, and the differences.
+    """The measured arms on the scenes of the paper ``name``, its printed numbers, and the
+    differences.
 
-    Raises InputError if no trial is of a scene of the paper, or if a cell would average unlike trials.
+    Raises InputError if no trial is of a scene of the paper, or if a cell would average unlike
+    trials.
     """
     paper = load_published(name)
     scenes, printed = list(paper.scenes), paper.printed
     own = [trial for trial in trials if trial.scene in scenes]
     if not own:
-        raise InputError(f"{name} has the scenes {', '.join(scenes)}, and no trial here is of one of them")
-    method = f"The printed numbers are of densify={paper.densify}; other arms are shown for orientation."
-    notes = [f"{paper.title}.", f"Read from {paper.source}.", f"Conventions: {paper.conventions}.", method]
+        raise InputError(
+            f"{name} has the scenes {', '.join(scenes)}, and no trial here is of one of them"
+        )
+    method = (
+        f"The printed numbers are of densify={paper.densify}; other arms are shown for orientation."
+    )
+    notes = [
+        f"{paper.title}.",
+        f"Read from {paper.source}.",
+        f"Conventions: {paper.conventions}.",
+        method,
+    ]
 
     def find(scene: str, arm: Arm, key: str) -> PrintedNumber | None:
         return printed.get((scene, key))
 
-    return _differences(f"Difference from {name}", name, own, scenes, paper.quantities, find, notes, paper.setup)
+    return _differences(
+        f"Difference from {name}", name, own, scenes, paper.quantities, find, notes, paper.setup
+    )
 
 
 def _differences(
@@ -218,7 +260,8 @@ def _differences(
     notes: Sequence[str],
     setup: Mapping[str, str],
 ) -> Table:
-    """A table with a row per scene and arm: what the ``paper`` printed, and the measured minus the printed value."""
+    """A table with a row per scene and arm: what the ``paper`` printed, and the measured minus the
+    printed value."""
     shown = [quantity(key, trials) for key in keys]
     expected = len({trial.seed for trial in trials})
     marks: Counter[str] = Counter()
@@ -229,23 +272,33 @@ def _differences(
         entries: list[TableEntry] = []
         for one in shown:
             cell, printed = make_cell(group, one, [scene], expected), find(scene, arm, one.key)
-            entries += [TableEntry(printed.text if printed else ""), _difference(cell, printed, one, marks)]
+            entries += [
+                TableEntry(printed.text if printed else ""),
+                _difference(cell, printed, one, marks),
+            ]
         rows.append(Row((scene, arm.init, str(replace(arm, init=""))), tuple(entries)))
     columns = [
-        Column(one.name, *heads) for one in shown for heads in ((paper, (one.key, paper)), ("Δ", (one.key, "delta")))
+        Column(one.name, *heads)
+        for one in shown
+        for heads in ((paper, (one.key, paper)), ("Δ", (one.key, "delta")))
     ]
     setup_notes = [f"The paper on {topic}: it {words}." for topic, words in setup.items()]
     legend = (
-        f"Δ is measured minus printed. Of {marks.total()} cells {marks[ROUNDING]} are within rounding ({ROUNDING}), "
-        f"{marks[INTERVAL]} within our {CONFIDENCE:.0%} t interval of the mean ({INTERVAL}), {marks[DIFFERS]} differ "
-        f"({DIFFERS}). The paper prints no deviation, so the spread of its own trials is not taken into account; a "
+        f"Δ is measured minus printed. Of {marks.total()} cells {marks[ROUNDING]} are within "
+        f"rounding ({ROUNDING}), "
+        f"{marks[INTERVAL]} within our {CONFIDENCE:.0%} t interval of the mean ({INTERVAL}), "
+        f"{marks[DIFFERS]} differ "
+        f"({DIFFERS}). The paper prints no deviation, so the spread of its own trials is not "
+        "taken into account; a "
         "single trial has no interval."
     )
     headings = ("scene", "init", "densify")
     return Table(title, headings, tuple(columns), tuple(rows), (legend, *notes, *setup_notes))
 
 
-def _difference(cell: Cell, printed: PrintedNumber | None, shown: Quantity, marks: Counter[str]) -> TableEntry:
+def _difference(
+    cell: Cell, printed: PrintedNumber | None, shown: Quantity, marks: Counter[str]
+) -> TableEntry:
     """The measured minus the printed value with its mark; the mark is counted in ``marks``."""
     if printed is None or cell.mean is None:
         return TableEntry("—")
@@ -256,8 +309,8 @@ def _difference(cell: Cell, printed: PrintedNumber | None, shown: Quantity, mark
 
 
 def agreement(cell: Cell, printed: PrintedNumber) -> str:
-    """The mark of a measured cell: ``=`` if its mean is in the printed number's range, ``≈`` if its interval overlaps
-    the range, else ``≠``. A single trial has no interval.
+    """The mark of a measured cell: ``=`` if its mean is in the printed number's range, ``≈`` if its
+    interval overlaps the range, else ``≠``. A single trial has no interval.
     """
     from gsbench.analysis.statistics import StudentT  # here, since SciPy is slow to import
 
@@ -267,5 +320,7 @@ def agreement(cell: Cell, printed: PrintedNumber) -> str:
         return ROUNDING
     if cell.std is None:
         return DIFFERS
-    own = StudentT(cell.mean, cell.std / math.sqrt(cell.count), cell.count - 1).interval(1 - CONFIDENCE)
+    own = StudentT(cell.mean, cell.std / math.sqrt(cell.count), cell.count - 1).interval(
+        1 - CONFIDENCE
+    )
     return INTERVAL if own.low <= high and own.high >= low else DIFFERS

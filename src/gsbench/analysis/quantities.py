@@ -1,7 +1,7 @@
 """Quantities of a trial: metrics, counts and costs, with their names, directions and formats.
 
-Tables show counts and times in a unit that suits the trials (`quantity`). Questions compare them in their own unit
-(`asked_quantity`).
+Tables show counts and times in a unit that suits the trials (`quantity`). Questions compare them in
+their own unit (`asked_quantity`).
 """
 
 from collections.abc import Callable, Container, Iterable, Sequence
@@ -24,9 +24,9 @@ Reader = Callable[[TrialResult], float | None]
 class Quantity:
     """A number that every trial may have.
 
-    ``direction`` is +1 if more is better, -1 if less is better, 0 if that is not known. A ``cost`` is never printed in
-    bold: fewer Gaussians or seconds are no aim in themselves. ``worthwhile`` is the smallest difference worth
-    resolving, in the quantity's unit.
+    ``direction`` is +1 if more is better, -1 if less is better, 0 if that is not known. A ``cost``
+    is never printed in bold: fewer Gaussians or seconds are no aim in themselves. ``worthwhile`` is
+    the smallest difference worth resolving, in the quantity's unit.
     """
 
     key: str
@@ -46,7 +46,8 @@ class Quantity:
 
 
 def _textured(trial: TrialResult) -> float:
-    from gsbench.analysis.images import textured_error  # here, since only claims about this error read pictures
+    # here, since only claims about this error read pictures
+    from gsbench.analysis.images import textured_error
 
     return textured_error(trial)
 
@@ -55,7 +56,10 @@ COSTS: dict[str, tuple[str, Reader]] = {  # name, and value in its own unit (one
     "gaussians": ("Gaussians", lambda trial: trial.record.num_gaussians),
     "train_time": ("training time", lambda trial: trial.record.seconds.get("train")),
     "init_points": ("initial points", lambda trial: trial.record.num_init_points),
-    "total_time": ("total time", lambda trial: None if trial.made_elsewhere else sum(trial.record.seconds.values())),
+    "total_time": (
+        "total time",
+        lambda trial: None if trial.made_elsewhere else sum(trial.record.seconds.values()),
+    ),
     "peak_memory_mb": ("peak memory", lambda trial: trial.record.peak_memory_mb),
 }
 COUNTS = ("gaussians", "init_points")
@@ -72,7 +76,8 @@ AT = "@"  # psnr@7000 is the PSNR at iteration 7000 (eval.at)
 
 @dataclass(frozen=True)
 class Change:
-    """The relative change of a cost over ``scenes`` scenes: as a ratio of totals, and as the mean of scenes' ratios."""
+    """The relative change of a cost over ``scenes`` scenes: as a ratio of totals, and as the mean
+    of scenes' ratios."""
 
     of_totals: float
     of_scenes: float
@@ -85,8 +90,11 @@ class Change:
         return f"{totals} as a ratio of totals, {ratios} as the mean of {self.scenes} scenes"
 
 
-def relative_change(baseline: Iterable[TrialResult], other: Iterable[TrialResult], read: Reader) -> Change | None:
-    """The change of a cost over the scenes on which both arms have a value above 0; None without such a scene."""
+def relative_change(
+    baseline: Iterable[TrialResult], other: Iterable[TrialResult], read: Reader
+) -> Change | None:
+    """The change of a cost over the scenes on which both arms have a value above 0; None without
+    such a scene."""
     one, two = (_means(own, read) for own in (baseline, other))
     scenes = sorted(one.keys() & two.keys())
     if not scenes:
@@ -101,8 +109,11 @@ def _means(trials: Iterable[TrialResult], read: Reader) -> dict[str, float]:
     return {scene: fmean(read(trial) or 0.0 for trial in own) for scene, own in with_value.items()}
 
 
-def choose_quantities(trials: Iterable[TrialResult], names: Iterable[str] | None = None) -> list[Quantity]:
-    """The named quantities; by default all metrics of any trial, the LPIPS that was asked for, and the main costs."""
+def choose_quantities(
+    trials: Iterable[TrialResult], names: Iterable[str] | None = None
+) -> list[Quantity]:
+    """The named quantities; by default all metrics of any trial, the LPIPS that was asked for, and
+    the main costs."""
     trials = list(trials)
     if names is None:
         wanted = {key for trial in trials for key in _lpips_asked_for(trial)}
@@ -111,16 +122,19 @@ def choose_quantities(trials: Iterable[TrialResult], names: Iterable[str] | None
 
 
 def quantity(name: str, trials: Iterable[TrialResult]) -> Quantity:
-    """The quantity ``name`` (a metric, a cost or an alias) for tables; raises ``InputError`` for an unknown name.
+    """The quantity ``name`` (a metric, a cost or an alias) for tables; raises ``InputError`` for an
+    unknown name.
 
-    Counts and times have a unit that suits the trials, unless the name fixes the unit (`FIXED_UNITS`).
+    Counts and times have a unit that suits the trials, unless the name fixes the unit
+    (`FIXED_UNITS`).
     """
     trials = list(trials)
     key = ALIASES.get(name, name)
     metric, _, step = key.partition(AT)
     if metric == "lpips":
         metric = _protocol_lpips(trials[0]) if trials else f"{LPIPS}{PAPER.lpips}"
-    if find_metric(metric) is not None or any(metric in trial.metrics for trial in trials):  # gsbench's or a user's
+    # gsbench's or a user's
+    if find_metric(metric) is not None or any(metric in trial.metrics for trial in trials):
         return _metric(metric, step, trials)
     if key in FIXED_UNITS:
         return _scaled(key, *FIXED_UNITS[key])
@@ -129,12 +143,21 @@ def quantity(name: str, trials: Iterable[TrialResult]) -> Quantity:
         raise InputError(f"unknown metric {name!r}; choose among {', '.join(names)}")
     largest = max((COSTS[key][1](trial) or 0.0 for trial in trials), default=0.0)
     if key in COUNTS:
-        return _scaled(key, key, "M", MILLION, 2) if largest >= MILLION else _scaled(key, key, "k", THOUSAND, 1)
-    return _scaled(key, key, "min", MINUTE, 1) if largest >= 10 * MINUTE else _scaled(key, key, "s", 1.0, 1)
+        return (
+            _scaled(key, key, "M", MILLION, 2)
+            if largest >= MILLION
+            else _scaled(key, key, "k", THOUSAND, 1)
+        )
+    return (
+        _scaled(key, key, "min", MINUTE, 1)
+        if largest >= 10 * MINUTE
+        else _scaled(key, key, "s", 1.0, 1)
+    )
 
 
 def asked_quantity(key: str, trials: Iterable[TrialResult] = ()) -> Quantity:
-    """The number that a question about ``key`` compares: a metric at the end of training, or a cost in its own unit.
+    """The number that a question about ``key`` compares: a metric at the end of training, or a cost
+    in its own unit.
 
     If ``key`` is a user's metric that no trial has, the quantity has default facts.
     """
@@ -160,14 +183,16 @@ def value_of(asked: Quantity, trial: TrialResult) -> float:
 
 
 def metric_keys(trials: Iterable[TrialResult], wanted: Container[str] = ()) -> list[str]:
-    """The metrics of any trial and those ``wanted``, in the order of tables; a user's own come last."""
+    """The metrics of any trial and those ``wanted``, in the order of tables; a user's own come
+    last."""
     present = {key for trial in trials for key in trial.metrics}
     own = sorted(key for key in present if find_metric(key) is None)
     return [key for key in known_keys() if key in present or key in wanted] + own
 
 
 def _metric(key: str, step: str, trials: Sequence[TrialResult]) -> Quantity:
-    """A metric at the end, or at iteration ``step`` unless it is "". Trials record the facts of a user's metric."""
+    """A metric at the end, or at iteration ``step`` unless it is "". Trials record the facts of a
+    user's metric."""
     records = [trial.record.metric_facts.get(key) for trial in trials if key in trial.metrics]
     facts = find_metric(key) or from_record(key, records[0] if records else None)
     name, read = facts.name, lambda trial: trial.metrics.get(key)
@@ -175,10 +200,17 @@ def _metric(key: str, step: str, trials: Sequence[TrialResult]) -> Quantity:
         measured = sorted({int(at) for trial in trials for at in trial.record.metrics_at})
         if step not in map(str, measured):
             steps = ", ".join(map(str, measured)) or "none"
-            raise InputError(f"no trial was measured at iteration {step!r}; measured were (eval.at) {steps}")
+            raise InputError(
+                f"no trial was measured at iteration {step!r}; measured were (eval.at) {steps}"
+            )
         name, read = f"{facts.label} at {int(step):,}", partial(_value_at, key, step)
     return Quantity(
-        f"{key}{AT}{step}" if step else key, name, facts.direction, facts.decimals, read, worthwhile=facts.worthwhile
+        f"{key}{AT}{step}" if step else key,
+        name,
+        facts.direction,
+        facts.decimals,
+        read,
+        worthwhile=facts.worthwhile,
     )
 
 
@@ -194,7 +226,8 @@ def _protocol_lpips(trial: TrialResult) -> str:
 
 
 def _lpips_asked_for(trial: TrialResult) -> list[str]:
-    """The key of the protocol's LPIPS variant, or those of ``eval.lpips`` if it asks only for other variants."""
+    """The key of the protocol's LPIPS variant, or those of ``eval.lpips`` if it asks only for other
+    variants."""
     by_protocol, setting = _protocol_lpips(trial), trial.config.get("eval.lpips")
     asked = [f"{LPIPS}{variant}" for variant in setting] if isinstance(setting, list) else []
     return asked if asked and by_protocol not in asked else [by_protocol]

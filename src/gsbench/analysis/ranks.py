@@ -1,6 +1,7 @@
 """Arms ranked over scenes, with the critical difference of Nemenyi's test (Demšar 2006, JMLR 7, 1).
 
-Scenes are the units, as in statements about scenes like these. This is a picture of all arms at once, and no verdict.
+Scenes are the units, as in statements about scenes like these. This is a picture of all arms at
+once, and no verdict.
 """
 
 import math
@@ -19,10 +20,12 @@ from gsbench.errors import InputError
 
 @dataclass(frozen=True)
 class Ranking:
-    """The mean ranks of ``arms`` over ``scenes`` in a metric, 1 for the best; the arms are in the order of their ranks.
+    """The mean ranks of ``arms`` over ``scenes`` in a metric, 1 for the best; the arms are in the
+    order of their ranks.
 
-    Two arms differ (5 %, all pairs together) if their mean ranks differ by ``critical`` or more. ``p`` is that of
-    Friedman's test that no arm differs; None for two arms, for which it is not defined.
+    Two arms differ (5 %, all pairs together) if their mean ranks differ by ``critical`` or more.
+    ``p`` is that of Friedman's test that no arm differs; None for two arms, for which it is not
+    defined.
     """
 
     quantity: Quantity
@@ -35,12 +38,20 @@ class Ranking:
     @property
     def groups(self) -> list[tuple[int, int]]:
         """The first and the last place of each largest group of arms that do not differ."""
-        ends = [max(k for k, rank in enumerate(self.ranks) if rank - first < self.critical) for first in self.ranks]
-        return [(first, last) for first, last in enumerate(ends) if last > first and last not in ends[:first]]
+        ends = [
+            max(k for k, rank in enumerate(self.ranks) if rank - first < self.critical)
+            for first in self.ranks
+        ]
+        return [
+            (first, last)
+            for first, last in enumerate(ends)
+            if last > first and last not in ends[:first]
+        ]
 
 
 def rank_arms(trials: Sequence[TrialResult], quantity: Quantity) -> Ranking | None:
-    """The ranking of all arms of ``trials``; None if fewer than `MIN_SCENES` scenes have comparable trials of each."""
+    """The ranking of all arms of ``trials``; None if fewer than `MIN_SCENES` scenes have comparable
+    trials of each."""
     arms = sorted({trial.arm for trial in trials})
     means: dict[str, list[float]] = {}
     for scene, own in group_by(trials, lambda trial: trial.scene).items():
@@ -68,7 +79,8 @@ def rank_arms(trials: Sequence[TrialResult], quantity: Quantity) -> Ranking | No
 
 
 def _means(trials: Sequence[TrialResult], arms: Sequence[Arm], quantity: Quantity) -> list[float]:
-    """The mean of each arm on the scene of ``trials``; raises InputError if one is missing or cannot be compared."""
+    """The mean of each arm on the scene of ``trials``; raises InputError if one is missing or
+    cannot be compared."""
     if differing_conditions(trials):
         raise InputError("the arms differ in their conditions")
     by_arm = group_by(trials, lambda trial: trial.arm)
@@ -84,9 +96,11 @@ def _means(trials: Sequence[TrialResult], arms: Sequence[Arm], quantity: Quantit
 
 
 def critical_difference(arms: int, scenes: int, level: float = ALPHA) -> float:
-    """The difference of mean ranks from which on two of ``arms`` differ: ``q sqrt(k (k + 1) / 6 N)``.
+    """The difference of mean ranks from which on two of ``arms`` differ: ``q sqrt(k (k + 1) / 6
+    N)``.
 
-    q is the upper quantile of the studentized range for infinite degrees of freedom, divided by the root of 2.
+    q is the upper quantile of the studentized range for infinite degrees of freedom, divided by the
+    root of 2.
     """
     from scipy import stats
 
@@ -96,4 +110,8 @@ def critical_difference(arms: int, scenes: int, level: float = ALPHA) -> float:
 
 def rank_all(trials: Sequence[TrialResult], quantities: Sequence[Quantity]) -> list[Ranking]:
     """The rankings in each of ``quantities`` that has one."""
-    return [ranking for one in quantities if not one.cost and (ranking := rank_arms(trials, one)) is not None]
+    return [
+        ranking
+        for one in quantities
+        if not one.cost and (ranking := rank_arms(trials, one)) is not None
+    ]

@@ -1,7 +1,9 @@
-"""Reading the results of an experiment: complete and sound trials, and a warning for every other folder.
+"""Reading the results of an experiment: complete and sound trials, and a warning for every other
+folder.
 
-A trial's folder is ``<runs>/<experiment>/<scene>/<init>-<densify>/<hash8>-seed<k>/``. Its ``results.json`` is written
-last: a folder that has it is complete. Nothing here needs torch, so tables over thousands of trials start quickly.
+A trial's folder is ``<runs>/<experiment>/<scene>/<init>-<densify>/<hash8>-seed<k>/``. Its
+``results.json`` is written last: a folder that has it is complete. Nothing here needs torch, so
+tables over thousands of trials start quickly.
 """
 
 import json
@@ -34,23 +36,26 @@ TRIAL_FOLDER = re.compile(rf"(?P<hash>[0-9a-f]{{8}}){SEED}(?P<seed>\d+)")
 
 
 class Configurations:
-    """The settings that determine results, of all trials of an experiment. Each file is read once for all seeds.
+    """The settings that determine results, of all trials of an experiment. Each file is read once
+    for all seeds.
 
-    ``trial`` is the key that the seeds of a trial share (`TrialResult.key`). ``known`` has, by this key, the settings
-    of trials that have not run and thus have no file.
+    ``trial`` is the key that the seeds of a trial share (`TrialResult.key`). ``known`` has, by this
+    key, the settings of trials that have not run and thus have no file.
     """
 
     def __init__(self, known: Mapping[str, Mapping[str, Any]] | None = None) -> None:
         self._known: dict[str, Mapping[str, Any]] = dict(known or {})
 
     def shared(self, trial: str, folder: Path) -> Mapping[str, Any]:
-        """The settings of a trial, read from ``folder`` or from another seed before; {} if they cannot be read."""
+        """The settings of a trial, read from ``folder`` or from another seed before; {} if they
+        cannot be read."""
         if trial not in self._known:
             self.read(trial, [folder])
         return self._known[trial]
 
     def read(self, trial: str, folders: Iterable[Path]) -> str:
-        """Read the settings of a trial from its first readable folder; return "", or the last folder's fault."""
+        """Read the settings of a trial from its first readable folder; return "", or the last
+        folder's fault."""
         fault = ""
         for folder in folders:
             try:
@@ -60,7 +65,11 @@ class Configurations:
             except DamagedError as error:
                 fault = f"{error.path.name} {error.reason}"
             else:
-                hashed = {key: value for key, value in config.items() if key.split(".")[0] not in NOT_HASHED}
+                hashed = {
+                    key: value
+                    for key, value in config.items()
+                    if key.split(".")[0] not in NOT_HASHED
+                }
                 self._known[trial] = hashed
                 return ""
         self._known.setdefault(trial, {})
@@ -68,10 +77,15 @@ class Configurations:
 
 
 def load_flat_config(folder: Path) -> dict[str, Any]:
-    """The configuration of the trial in ``folder`` with dotted keys; raises FileNotFoundError and DamagedError."""
+    """The configuration of the trial in ``folder`` with dotted keys; raises FileNotFoundError and
+    DamagedError."""
     values = TrialFolder(folder).settings()
-    if not isinstance(values, dict) or not all(isinstance(values.get(group), dict) for group in GROUPS):
-        raise DamagedError(folder / CONFIG, f"is damaged: it lacks one of the groups {', '.join(GROUPS)}")
+    if not isinstance(values, dict) or not all(
+        isinstance(values.get(group), dict) for group in GROUPS
+    ):
+        raise DamagedError(
+            folder / CONFIG, f"is damaged: it lacks one of the groups {', '.join(GROUPS)}"
+        )
     return flatten(values)
 
 
@@ -86,14 +100,15 @@ def canonical(value: object) -> str:
 class TrialResult:
     """One complete trial.
 
-    ``record`` is its ``results.json``, ``config_hash`` the hash in its folder's name. ``settings`` reads the
-    configurations of its experiment.
+    ``record`` is its ``results.json``, ``config_hash`` the hash in its folder's name. ``settings``
+    reads the configurations of its experiment.
     """
 
     path: Path
     config_hash: str
     record: TrialRecord = field(repr=False)
-    variant: tuple[tuple[str, str], ...] = ()  # swept settings that distinguish arms of one initialiser and densifier
+    # swept settings that distinguish arms of one initialiser and densifier
+    variant: tuple[tuple[str, str], ...] = ()
     settings: Configurations = field(default_factory=Configurations, repr=False, compare=False)
 
     @property
@@ -138,15 +153,18 @@ class TrialResult:
 
     @property
     def config(self) -> Mapping[str, Any]:
-        """The settings that determine the result, with dotted keys; empty if they are missing or cannot be read.
+        """The settings that determine the result, with dotted keys; empty if they are missing or
+        cannot be read.
 
-        They are read once for all trials that share them; `whole_config` is read from the trial's own file.
+        They are read once for all trials that share them; `whole_config` is read from the trial's
+        own file.
         """
         return self.settings.shared(self.key, self.path)
 
     @cached_property
     def key(self) -> str:
-        """The trial's folder within its experiment without the seed, ``<scene>/<init>-<densify>/<hash8>``.
+        """The trial's folder within its experiment without the seed,
+        ``<scene>/<init>-<densify>/<hash8>``.
 
         Trials that differ only in their seeds share it.
         """
@@ -154,7 +172,8 @@ class TrialResult:
 
     @cached_property
     def whole_config(self) -> Mapping[str, Any]:
-        """Every setting of the trial with dotted keys, also those that do not change the result; as `config`."""
+        """Every setting of the trial with dotted keys, also those that do not change the result; as
+        `config`."""
         try:
             return load_flat_config(self.path)
         except (FileNotFoundError, DamagedError):
@@ -169,7 +188,8 @@ class TrialResult:
     def code(self) -> dict[str, str]:
         """The versions of the code that made the trial; empty if another program made it.
 
-        ``code of <module>`` is the hash of a user's module, ``stage <name>`` the version of a stage of gsbench.
+        ``code of <module>`` is the hash of a user's module, ``stage <name>`` the version of a stage
+        of gsbench.
         """
         code = self.record.code
         return {f"code of {module}": digest for module, digest in code.sources.items()} | {
@@ -178,7 +198,8 @@ class TrialResult:
 
     @cached_property
     def rooms(self) -> dict[str, str]:
-        """The rooms (parts of gsbench's code) that made the trial, with their states then (`gsbench.runs.keys`)."""
+        """The rooms (parts of gsbench's code) that made the trial, with their states then
+        (`gsbench.runs.keys`)."""
         return {f"gsbench's {room}": state for room, state in self.record.code.rooms.items()}
 
     @property
@@ -196,18 +217,21 @@ class TrialResult:
 
     @property
     def cloud(self) -> str:
-        """The hash of the initial model's files (cameras, poses, points); "" if it was not recorded."""
+        """The hash of the initial model's files (cameras, poses, points); "" if it was not
+        recorded."""
         return self.record.hashes.get("cloud", "")
 
     @property
     def measured(self) -> float:
-        """The Unix time at which the metrics were measured; if it is not recorded, that of the file."""
+        """The Unix time at which the metrics were measured; if it is not recorded, that of the
+        file."""
         moment = unix_time(self.record.measured)
         return self.finished if moment is None else moment
 
     @cached_property
     def conditions(self) -> Mapping[str, str]:
-        """The recorded conditions that trials must share before their numbers may be averaged, as comparable text."""
+        """The recorded conditions that trials must share before their numbers may be averaged, as
+        comparable text."""
         conditions = {
             "protocol": self.record.protocol,
             "resolution": "x".join(map(str, self.record.resolution or (None,))),
@@ -220,19 +244,23 @@ class TrialResult:
         if not self.made_elsewhere:
             conditions["iterations"] = str(self.record.iterations)
         if not self.made_elsewhere and not self.program:
-            conditions["budget"] = "null" if self.record.budget is None else canonical(asdict(self.record.budget))
+            conditions["budget"] = (
+                "null" if self.record.budget is None else canonical(asdict(self.record.budget))
+            )
         return conditions
 
     @cached_property
     def split(self) -> str:
-        """The rule that holds views out, as short text; "" if neither the record nor the configuration has it."""
+        """The rule that holds views out, as short text; "" if neither the record nor the
+        configuration has it."""
         if self.record.split:
             return self.record.split
         return split_text(self.config) if self.config.get("scene.split") else ""
 
     @cached_property
     def question(self) -> str:
-        """The question that the held-out views ask, interpolation or extrapolation; "" for a list of views."""
+        """The question that the held-out views ask, interpolation or extrapolation; "" for a list
+        of views."""
         kind = re.split("[ ,]", self.split, maxsplit=1)[0]
         return QUESTIONS.get(kind, "")
 
@@ -243,7 +271,8 @@ class TrialResult:
 
     @property
     def made_elsewhere(self) -> bool:
-        """Return whether a training outside gsbench made the model or the renders: its time and budget are unknown."""
+        """Return whether a training outside gsbench made the model or the renders: its time and
+        budget are unknown."""
         return self.record.evaluated_from is not None and not self.program
 
     @property
@@ -258,13 +287,18 @@ class TrialResult:
 
     @property
     def budget_acted(self) -> bool:
-        """Return whether the budget may have changed the trial: a cap that blocks or steers growth, or a time limit."""
+        """Return whether the budget may have changed the trial: a cap that blocks or steers growth,
+        or a time limit."""
         if self.made_elsewhere or self.program:
             return False
         budget, events = self.record.budget, self.record.events
         if budget is None or not events:
             return True
-        return budget.cap == "governor" or budget.seconds is not None or events.get("blocked_by_cap") != 0
+        return (
+            budget.cap == "governor"
+            or budget.seconds is not None
+            or events.get("blocked_by_cap") != 0
+        )
 
 
 TrialPair = tuple[TrialResult, TrialResult]  # a trial of the baseline and one of the arm
@@ -305,7 +339,8 @@ def load_experiment(runs_dir: Path, name: str) -> Experiment:
         warnings = experiment.warnings
         first = f" (first: {warnings[0]})" if warnings else ""
         raise InputError(
-            f"experiment {name!r} has no complete trial among {len(warnings)} folders{first}; run it first"
+            f"experiment {name!r} has no complete trial among {len(warnings)} folders{first}; run "
+            "it first"
         )
     return experiment
 
@@ -322,29 +357,38 @@ def read_experiment(folder: Path) -> Experiment:
         except _UnusableError as reason:
             faults[path] = one_line(str(reason))
     of_settings = _read_settings(trials, settings)
-    faults |= {trial.path: f"damaged, {fault}" for trial in trials if (fault := of_settings.get(trial.key))}
+    faults |= {
+        trial.path: f"damaged, {fault}" for trial in trials if (fault := of_settings.get(trial.key))
+    }
     usable = [trial for trial in trials if trial.path not in faults]
-    usable.sort(key=lambda trial: (trial.scene, trial.init, trial.densify, trial.seed, trial.config_hash))
+    usable.sort(
+        key=lambda trial: (trial.scene, trial.init, trial.densify, trial.seed, trial.config_hash)
+    )
     warnings = sorted(f"{path.relative_to(runs_dir)}: {fault}" for path, fault in faults.items())
     return Experiment(folder.name, folder, tuple(usable), tuple(warnings))
 
 
 def _read_settings(trials: Sequence[TrialResult], settings: Configurations) -> dict[str, str]:
-    """Read the settings that are needed; return what is wrong with each, "" for nothing, by the trials' `key`.
+    """Read the settings that are needed; return what is wrong with each, "" for nothing, by the
+    trials' `key`.
 
-    Settings are needed only if trials of one scene, initialiser and densifier have different ones. Other trials' files
-    are not opened here, which saves time.
+    Settings are needed only if trials of one scene, initialiser and densifier have different ones.
+    Other trials' files are not opened here, which saves time.
     """
     faults: dict[str, str] = {}
     for own in group_by(trials, lambda trial: trial.key.rpartition("/")[0]).values():
         by_key = group_by(own, lambda trial: trial.key)
         if len(by_key) > 1:
-            faults |= {key: settings.read(key, [trial.path for trial in same]) for key, same in by_key.items()}
+            faults |= {
+                key: settings.read(key, [trial.path for trial in same])
+                for key, same in by_key.items()
+            }
     return faults
 
 
 def read_views(trial: TrialResult) -> dict[str, dict[str, float]]:
-    """The metrics of every test view, ``{view: {metric: value}}``; raises ``InputError`` if the file is damaged.
+    """The metrics of every test view, ``{view: {metric: value}}``; raises ``InputError`` if the
+    file is damaged.
 
     Its values must average to the trial's metrics, so a truncated file is detected.
     """
@@ -362,7 +406,8 @@ def read_views(trial: TrialResult) -> dict[str, dict[str, float]]:
             mean, expected, rel_tol=MEAN_TOLERANCE, abs_tol=MEAN_TOLERANCE
         ):
             raise InputError(
-                f"{path} does not average to the {key} of its trial ({mean:.6g}, not {expected:.6g}): damaged"
+                f"{path} does not average to the {key} of its trial ({mean:.6g}, not "
+                f"{expected:.6g}): damaged"
             )
     return views
 
@@ -387,7 +432,11 @@ def read_trial(path: Path, runs_dir: Path, settings: Configurations) -> TrialRes
     match = TRIAL_FOLDER.fullmatch(path.name)
     if match is None:
         raise _UnusableError("foreign, the folder is not named <hash8>-seed<k>")
-    recorded = {"experiment": record.experiment, "scene": record.scene, "arm": f"{record.init}-{record.densify}"}
+    recorded = {
+        "experiment": record.experiment,
+        "scene": record.scene,
+        "arm": f"{record.init}-{record.densify}",
+    }
     recorded["seed"] = str(record.seed)
     names = (*path.relative_to(runs_dir).parts[-4:-1], match["seed"])
     for (key, value), name in zip(recorded.items(), names, strict=True):

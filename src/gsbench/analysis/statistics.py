@@ -1,18 +1,20 @@
-"""Tests of paired differences, about these scenes and about scenes like these, and planning from pilot trials.
+"""Tests of paired differences, about these scenes and about scenes like these, and planning from
+pilot trials.
 
-Differences are matrices [S, K] of S scenes, each with K pairs of trainings. The views of a trial share its training, so
-a trial is the smallest independent unit.
+Differences are matrices [S, K] of S scenes, each with K pairs of trainings. The views of a trial
+share its training, so a trial is the smallest independent unit.
 
-*These scenes*: the mean over the given scenes, each with the same weight. Scenes are fixed, pairs within them are the
-units, and each scene has its own variance (Welch 1947; Satterthwaite 1946). *Scenes like these*, from ``MIN_SCENES``
-scenes on: the sign test of the number of scenes that gain, with the exact interval of the median effect. It assumes
-nothing about the distribution of effects; tests of the mean effect fail if one scene in eight differs much from the
-others.
+*These scenes*: the mean over the given scenes, each with the same weight. Scenes are fixed, pairs
+within them are the units, and each scene has its own variance (Welch 1947; Satterthwaite 1946).
+*Scenes like these*, from ``MIN_SCENES`` scenes on: the sign test of the number of scenes that gain,
+with the exact interval of the median effect. It assumes nothing about the distribution of effects;
+tests of the mean effect fail if one scene in eight differs much from the others.
 
-Planning: the paired difference of scene s and seed k is ``mean + scene effect + noise``. The scene effect has one
-deviation between scenes, the noise another one between trainings of a scene. Both are estimated from pilot trials by
-the analysis of variance (Searle, Casella and McCulloch 1992, *Variance components*, section 3.6). More seeds shrink
-only the noise; a statement about scenes like these needs more scenes.
+Planning: the paired difference of scene s and seed k is ``mean + scene effect + noise``. The scene
+effect has one deviation between scenes, the noise another one between trainings of a scene. Both
+are estimated from pilot trials by the analysis of variance (Searle, Casella and McCulloch 1992,
+*Variance components*, section 3.6). More seeds shrink only the noise; a statement about scenes like
+these needs more scenes.
 """
 
 import math
@@ -29,17 +31,25 @@ from gsbench.errors import InputError
 from gsbench.runs.experiments import ERROR_RATE
 
 ALPHA = ERROR_RATE
-MIN_SCENES = 6  # for a statement about scenes like these: the fewest with which the sign test can reach 5 %
-SUPPORTED, REFUTED, TOO_SMALL, UNDECIDED = "supported", "refuted", "too small to matter", "undecided"
+# for a statement about scenes like these: the fewest with which the sign test can reach 5 %
+MIN_SCENES = 6
+SUPPORTED, REFUTED, TOO_SMALL, UNDECIDED = (
+    "supported",
+    "refuted",
+    "too small to matter",
+    "undecided",
+)
 Outcome = Literal["supported", "refuted", "too small to matter", "undecided"]
 
-# Factor on Satterthwaite's degrees of freedom. They are twice too many if one scene is noisier than the others and has
-# two to four seeds, as simulations show (docs/verdict.md): its deviation is often underestimated.
+# Factor on Satterthwaite's degrees of freedom. They are twice too many if one scene is noisier than
+# the others and has two to four seeds, as simulations show (docs/verdict.md): its deviation is
+# often underestimated.
 DEGREES = 0.5
 SPENDING_POWER = 1.5  # exponent of the error-spending function of looks
 DRAWS = 100_000  # simulated sequences of trainings, for the error rates of looks
 FIRST_LOOK = 2  # seeds: one training of each arm does not show how trainings differ
-EACH_UP_TO = 12  # seeds up to which each seed is a look; more looks would save little and make bounds less precise
+# seeds up to which each seed is a look; more looks would save little and make bounds less precise
+EACH_UP_TO = 12
 
 POWER = 0.8  # of planned designs: that of the two-sided tests with the error rate ``ALPHA``
 MAX_SCENES, MAX_SEEDS = 30, 40  # the largest designs that are considered
@@ -73,7 +83,8 @@ class StudentT:
         return float(2 * special.stdtr(self.degrees, -abs(self.mean / self.error)))
 
     def interval(self, alpha: float = ALPHA) -> Interval:
-        """The values that the test with error rate ``alpha`` does not reject; it excludes 0 exactly if p < alpha."""
+        """The values that the test with error rate ``alpha`` does not reject; it excludes 0 exactly
+        if p < alpha."""
         half = float(special.stdtrit(self.degrees, 1 - alpha / 2)) * self.error
         return Interval(self.mean - half, self.mean + half)
 
@@ -81,13 +92,18 @@ class StudentT:
 def t_test(differences: Array) -> StudentT | None:
     """The test of the mean over scenes of ``differences`` [S, K]; None for a single pair.
 
-    With one pair per scene, the variance over scenes replaces that of trainings; on average it is never too small.
+    With one pair per scene, the variance over scenes replaces that of trainings; on average it is
+    never too small.
     """
     scenes, seeds = differences.shape
     if differences.size < 2:
         return None
     if seeds == 1:
-        return StudentT(float(differences.mean()), float(differences.std(ddof=1)) / math.sqrt(scenes), scenes - 1)
+        return StudentT(
+            float(differences.mean()),
+            float(differences.std(ddof=1)) / math.sqrt(scenes),
+            scenes - 1,
+        )
     # Without the shift, rounding would give equal pairs a tiny variance in place of 0.
     variances = (differences - differences[:, :1]).var(axis=1, ddof=1)
     error, degrees = error_and_degrees(variances[None], seeds)
@@ -95,18 +111,25 @@ def t_test(differences: Array) -> StudentT | None:
 
 
 def error_and_degrees(variances: Array, seeds: int) -> tuple[Array, Array]:
-    """Standard errors and degrees of freedom [D] of means over scenes, from the scenes' variances [D, S]."""
+    """Standard errors and degrees of freedom [D] of means over scenes, from the scenes' variances
+    [D, S]."""
     total, squares = variances.sum(axis=1), (variances**2).sum(axis=1)
-    satterthwaite = np.divide(total**2 * (seeds - 1), squares, out=np.full_like(total, seeds - 1.0), where=squares > 0)
-    return np.sqrt(total / seeds) / variances.shape[1], np.maximum(seeds - 1, DEGREES * satterthwaite)
+    satterthwaite = np.divide(
+        total**2 * (seeds - 1), squares, out=np.full_like(total, seeds - 1.0), where=squares > 0
+    )
+    return np.sqrt(total / seeds) / variances.shape[1], np.maximum(
+        seeds - 1, DEGREES * satterthwaite
+    )
 
 
 def outcome_of(interval: Interval, sign: int, least: float | None) -> Outcome:
-    """The outcome of the claim "the difference has this sign, and matters", from the interval of the difference.
+    """The outcome of the claim "the difference has this sign, and matters", from the interval of
+    the difference.
 
-    Too small to matter: the interval lies within ± ``least``. Supported: it lies on the claimed side of 0. Refuted: it
-    lies on the other side. Otherwise undecided. Sign 0 claims that no difference matters: supported within ± ``least``,
-    refuted if the interval lies beyond it on one side.
+    Too small to matter: the interval lies within ± ``least``. Supported: it lies on the claimed
+    side of 0. Refuted: it lies on the other side. Otherwise undecided. Sign 0 claims that no
+    difference matters: supported within ± ``least``, refuted if the interval lies beyond it on one
+    side.
     """
     within = least is not None and max(-interval.low, interval.high) < least
     if not sign:
@@ -123,9 +146,9 @@ def outcome_of(interval: Interval, sign: int, least: float | None) -> Outcome:
 class Answer:
     """A mean difference with its test, as a member of a family with the error rate ``level``.
 
-    ``p`` is adjusted for the family. ``interval`` has the adjusted error rate ``rate``: it excludes 0 exactly if ``p``
-    is below ``level``. "Too small to matter" is decided at ``equal_rate``, the member's equal share of ``level``. A
-    single pair has no test.
+    ``p`` is adjusted for the family. ``interval`` has the adjusted error rate ``rate``: it excludes
+    0 exactly if ``p`` is below ``level``. "Too small to matter" is decided at ``equal_rate``, the
+    member's equal share of ``level``. A single pair has no test.
     """
 
     mean: float
@@ -143,13 +166,18 @@ class Answer:
         if self.test is None or self.interval is None:
             return "undecided"
         at_equal_rate = outcome_of(self.test.interval(self.equal_rate), sign, least)
-        return at_equal_rate if at_equal_rate == TOO_SMALL or not sign else outcome_of(self.interval, sign, None)
+        return (
+            at_equal_rate
+            if at_equal_rate == TOO_SMALL or not sign
+            else outcome_of(self.interval, sign, None)
+        )
 
 
 def answer_family(members: Sequence[Array], level: float = ALPHA) -> list[Answer]:
     """Test each of ``members`` [S, K] as a member of one family, by Holm's method (1979).
 
-    The chance that any stated sign is false is at most ``level``; so is the chance that any "too small" is false.
+    The chance that any stated sign is false is at most ``level``; so is the chance that any "too
+    small" is false.
     """
     tests = [t_test(member) for member in members]
     factors = iter(holm_factors([test.p for test in tests if test is not None]))
@@ -160,15 +188,19 @@ def answer_family(members: Sequence[Array], level: float = ALPHA) -> list[Answer
             answers.append(Answer(float(member.mean()), None, level, level, level))
         else:
             factor = next(factors)
-            answers.append(Answer(test.mean, test, level, level / factor, equal_rate, min(1.0, factor * test.p)))
+            answers.append(
+                Answer(
+                    test.mean, test, level, level / factor, equal_rate, min(1.0, factor * test.p)
+                )
+            )
     return answers
 
 
 def holm_factors(p_values: Sequence[float]) -> list[float]:
     """The factor (at least 1) by which Holm's method multiplies each p.
 
-    The smallest of m p is multiplied by m, the next by m - 1, and so on. A product below the one before it is raised to
-    that one.
+    The smallest of m p is multiplied by m, the next by m - 1, and so on. A product below the one
+    before it is raised to that one.
     """
     factors = [0.0] * len(p_values)
     running = 0.0
@@ -181,11 +213,13 @@ def holm_factors(p_values: Sequence[float]) -> list[float]:
 
 @dataclass(frozen=True)
 class LikeThese:
-    """A statement about scenes like the given ``scenes``. In ``helped`` of them the difference has the asked sign.
+    """A statement about scenes like the given ``scenes``. In ``helped`` of them the difference has
+    the asked sign.
 
-    In ``beyond`` of them it is at least the least that matters; None if that is not known. ``share`` is the exact
-    interval (Clopper and Pearson 1934) of the share of such scenes with the sign. ``median`` is the interval of their
-    median effect, from order statistics; None with too few scenes for ``level``. ``p`` is that of the sign test.
+    In ``beyond`` of them it is at least the least that matters; None if that is not known.
+    ``share`` is the exact interval (Clopper and Pearson 1934) of the share of such scenes with the
+    sign. ``median`` is the interval of their median effect, from order statistics; None with too
+    few scenes for ``level``. ``p`` is that of the sign test.
     """
 
     scenes: int
@@ -199,7 +233,8 @@ class LikeThese:
 
     @property
     def needed(self) -> int | None:
-        """The number of scenes that must have the same sign to decide; None if all of them would not suffice."""
+        """The number of scenes that must have the same sign to decide; None if all of them would
+        not suffice."""
         return sign_test_needs(self.scenes, self.level)
 
     def power(self, share: float = 0.9) -> float:
@@ -209,8 +244,11 @@ class LikeThese:
         return float(special.bdtrc(self.needed - 1, self.scenes, share))
 
 
-def judge_like_these(means: Array, sign: int, least: float | None, level: float = ALPHA) -> LikeThese | None:
-    """The statement about scenes like these from the scenes' mean differences [S]; None below `MIN_SCENES`."""
+def judge_like_these(
+    means: Array, sign: int, least: float | None, level: float = ALPHA
+) -> LikeThese | None:
+    """The statement about scenes like these from the scenes' mean differences [S]; None below
+    `MIN_SCENES`."""
     count = len(means)
     if count < MIN_SCENES:
         return None
@@ -230,7 +268,8 @@ def judge_like_these(means: Array, sign: int, least: float | None, level: float 
 
 
 def median_interval(values: Array, level: float) -> Interval | None:
-    """The exact interval of the median of the distribution of ``values`` [n], or None for too few."""
+    """The exact interval of the median of the distribution of ``values`` [n], or None for too
+    few."""
     count = len(values)
     outer = [k for k in range(count // 2) if 2 * float(special.bdtr(k, count, 0.5)) <= level]
     if not outer:
@@ -240,8 +279,12 @@ def median_interval(values: Array, level: float) -> Interval | None:
 
 
 def sign_test_needs(scenes: int, level: float) -> int | None:
-    """The fewest of ``scenes`` with the same sign for which the sign test's p is at most ``level``; None if none is."""
-    return next((agree for agree in range(scenes // 2 + 1, scenes + 1) if _sign_p(agree, scenes) <= level), None)
+    """The fewest of ``scenes`` with the same sign for which the sign test's p is at most ``level``;
+    None if none is."""
+    return next(
+        (agree for agree in range(scenes // 2 + 1, scenes + 1) if _sign_p(agree, scenes) <= level),
+        None,
+    )
 
 
 def _sign_p(agree: int, count: int) -> float:
@@ -251,34 +294,43 @@ def _sign_p(agree: int, count: int) -> float:
 
 def _share_interval(helped: int, count: int, level: float) -> Interval:
     low = float(special.betaincinv(helped, count - helped + 1, level / 2)) if helped else 0.0
-    high = float(special.betaincinv(helped + 1, count - helped, 1 - level / 2)) if helped < count else 1.0
+    high = (
+        float(special.betaincinv(helped + 1, count - helped, 1 - level / 2))
+        if helped < count
+        else 1.0
+    )
     return Interval(low, high)
 
 
 def plan_looks(maximum: int) -> tuple[int, ...]:
-    """The looks up to ``maximum`` seeds: each seed from `FIRST_LOOK` on, after `EACH_UP_TO` every fourth."""
+    """The looks up to ``maximum`` seeds: each seed from `FIRST_LOOK` on, after `EACH_UP_TO` every
+    fourth."""
     early = range(FIRST_LOOK, min(maximum, EACH_UP_TO) + 1)
     return tuple(dict.fromkeys([*early, *range(EACH_UP_TO, maximum, 4), maximum]))
 
 
 @cache
 def look_levels(scenes: int, looks: tuple[int, ...], alpha: float) -> tuple[float, ...]:
-    """The error rate of the interval at each look, such that all looks together have the error rate ``alpha``.
+    """The error rate of the interval at each look, such that all looks together have the error rate
+    ``alpha``.
 
-    These are repeated confidence intervals (Jennison and Turnbull 1989): at whichever look one stops, and for whatever
-    reason, the chance of a false statement is at most ``alpha``. Looks up to the share t of all seeds may spend
-    ``alpha t^1.5`` of it (Lan and DeMets 1983; Kim and DeMets 1987). Looks share trials, so their errors overlap: the
-    rates come from `DRAWS` simulated sequences of trainings with equally noisy scenes. No rate exceeds what may be
-    spent by its look; this limit does not depend on the noise of scenes.
+    These are repeated confidence intervals (Jennison and Turnbull 1989): at whichever look one
+    stops, and for whatever reason, the chance of a false statement is at most ``alpha``. Looks up
+    to the share t of all seeds may spend ``alpha t^1.5`` of it (Lan and DeMets 1983; Kim and DeMets
+    1987). Looks share trials, so their errors overlap: the rates come from `DRAWS` simulated
+    sequences of trainings with equally noisy scenes. No rate exceeds what may be spent by its look;
+    this limit does not depend on the noise of scenes.
     """
     rng = np.random.default_rng(0)
-    totals, squares = np.zeros((DRAWS, scenes)), np.zeros((DRAWS, scenes))  # of the differences of each scene
+    # of the differences of each scene
+    totals, squares = np.zeros((DRAWS, scenes)), np.zeros((DRAWS, scenes))
     error_free = np.ones(DRAWS, dtype=bool)
     levels: list[float] = []
     seeds_before = 0
     for seeds in looks:
         new = seeds - seeds_before
-        # The sum of the new seeds' differences, and the sum of their squares: drawing each seed would be slower.
+        # The sum of the new seeds' differences, and the sum of their squares: drawing each seed
+        # would be slower.
         added = rng.normal(0, math.sqrt(new), totals.shape)
         totals += added
         squares += added**2 / new + (rng.chisquare(new - 1, totals.shape) if new > 1 else 0.0)
@@ -286,7 +338,11 @@ def look_levels(scenes: int, looks: tuple[int, ...], alpha: float) -> tuple[floa
         p = 2 * special.stdtr(degrees, -np.abs(totals.mean(axis=1) / seeds / error))
         spendable = alpha * (seeds / looks[-1]) ** SPENDING_POWER
         errors_left = round(spendable * DRAWS) - int(np.count_nonzero(~error_free))
-        level = min(spendable, float(np.partition(p[error_free], errors_left)[errors_left])) if errors_left > 0 else 0.0
+        level = (
+            min(spendable, float(np.partition(p[error_free], errors_left)[errors_left]))
+            if errors_left > 0
+            else 0.0
+        )
         error_free &= p >= level
         levels.append(level)
         seeds_before = seeds
@@ -295,9 +351,11 @@ def look_levels(scenes: int, looks: tuple[int, ...], alpha: float) -> tuple[floa
 
 @dataclass(frozen=True)
 class Components:
-    """Deviations of paired differences: of the effect ``between`` scenes, and of trainings ``within`` a scene.
+    """Deviations of paired differences: of the effect ``between`` scenes, and of trainings
+    ``within`` a scene.
 
-    ``between`` is None for a single scene; it is 0 if scenes differ by no more than trainings explain.
+    ``between`` is None for a single scene; it is 0 if scenes differ by no more than trainings
+    explain.
     """
 
     between: float | None
@@ -319,48 +377,58 @@ class Design:
 
 
 def estimate_components(differences: Sequence[NDArray[np.float64]]) -> Components:
-    """Estimate the two deviations from the paired differences of pilot trials, an array for each scene.
+    """Estimate the two deviations from the paired differences of pilot trials, an array for each
+    scene.
 
     Raises InputError if no scene has two pairs.
     """
     degrees = sum(len(values) - 1 for values in differences)
     if degrees == 0:
         raise InputError("planning needs pilot trials with at least two seeds of one scene")
-    within = math.sqrt(sum(float(((values - values.mean()) ** 2).sum()) for values in differences) / degrees)
+    within = math.sqrt(
+        sum(float(((values - values.mean()) ** 2).sum()) for values in differences) / degrees
+    )
     counts = np.array([len(values) for values in differences], dtype=float)
     total = int(counts.sum())
     between = None
     if len(differences) > 1:
         means = np.array([values.mean() for values in differences])
         overall = float(np.concatenate(list(differences)).mean())
-        pairs_per_scene = (total - float((counts**2).sum()) / total) / (len(counts) - 1)  # n_0 of unbalanced data
+        # n_0 of unbalanced data
+        pairs_per_scene = (total - float((counts**2).sum()) / total) / (len(counts) - 1)
         square = float((counts * (means - overall) ** 2).sum()) / (len(counts) - 1)
         between = math.sqrt(max(0.0, (square - within**2) / pairs_per_scene))
     return Components(between, within, len(differences), total)
 
 
 def power(design: Design, difference: float, components: Components, like_these: bool) -> float:
-    """The chance to see ``difference`` in the mean of these scenes, or by the sign test of scenes ``like_these``.
+    """The chance to see ``difference`` in the mean of these scenes, or by the sign test of scenes
+    ``like_these``.
 
     Raises InputError for scenes like these if the pilot had only one scene.
     """
     if not like_these:
         return power_of_mean(components.within, design, difference)
     if components.between is None:
-        raise InputError("one scene cannot show how an effect differs between scenes: run pilot trials on two")
+        raise InputError(
+            "one scene cannot show how an effect differs between scenes: run pilot trials on two"
+        )
     needed = sign_test_needs(design.scenes, ALPHA)
     if needed is None:
         return 0.0
     spread = math.hypot(components.between, components.within / math.sqrt(design.seeds))
-    chance = float(special.ndtr(abs(difference) / spread)) if spread else 1.0  # that one scene's mean has the sign
+    # that one scene's mean has the sign
+    chance = float(special.ndtr(abs(difference) / spread)) if spread else 1.0
     return float(special.bdtrc(needed - 1, design.scenes, chance))
 
 
 def power_of_mean(deviation: float, design: Design, difference: float) -> float:
-    """The chance that the t test of these scenes sees ``difference`` if trainings differ by ``deviation``.
+    """The chance that the t test of these scenes sees ``difference`` if trainings differ by
+    ``deviation``.
 
-    The test estimates each scene's variance and its own degrees of freedom. Given these, the power is that of a normal
-    mean; the result is its average over simulated variances. The far tail of the wrong sign is left out.
+    The test estimates each scene's variance and its own degrees of freedom. Given these, the power
+    is that of a normal mean; the result is its average over simulated variances. The far tail of
+    the wrong sign is left out.
     """
     if deviation == 0:
         return 1.0 if difference else 0.0
@@ -370,7 +438,8 @@ def power_of_mean(deviation: float, design: Design, difference: float) -> float:
 
 @cache
 def _thresholds(design: Design) -> NDArray[np.float64]:
-    """The significant means [DESIGN_DRAWS], in true standard errors, for simulated variances of the scenes."""
+    """The significant means [DESIGN_DRAWS], in true standard errors, for simulated variances of the
+    scenes."""
     freedom = design.seeds - 1
     variances = np.random.default_rng(0).chisquare(freedom, (DESIGN_DRAWS, design.scenes)) / freedom
     error, degrees = error_and_degrees(variances, design.seeds)
@@ -378,19 +447,25 @@ def _thresholds(design: Design) -> NDArray[np.float64]:
 
 
 def seeds_needed(deviation: float, scenes: int, difference: float) -> int | None:
-    """Seeds of each arm on these ``scenes`` that see ``difference`` with a power of `POWER`; None above `MAX_SEEDS`."""
+    """Seeds of each arm on these ``scenes`` that see ``difference`` with a power of `POWER`; None
+    above `MAX_SEEDS`."""
     designs = (Design(scenes, seeds) for seeds in range(2, MAX_SEEDS + 1))
-    return next((one.seeds for one in designs if power_of_mean(deviation, one, difference) >= POWER), None)
+    return next(
+        (one.seeds for one in designs if power_of_mean(deviation, one, difference) >= POWER), None
+    )
 
 
 def designs_needed(difference: float, components: Components, like_these: bool) -> list[Design]:
-    """The designs that see ``difference`` with a power of `POWER`: by number of scenes, the fewest seeds.
+    """The designs that see ``difference`` with a power of `POWER`: by number of scenes, the fewest
+    seeds.
 
-    A number of scenes is left out if it needs more than ``MAX_SEEDS`` seeds, or no fewer seeds than fewer scenes do. A
-    statement about scenes like these starts at ``MIN_SCENES``.
+    A number of scenes is left out if it needs more than ``MAX_SEEDS`` seeds, or no fewer seeds than
+    fewer scenes do. A statement about scenes like these starts at ``MIN_SCENES``.
     """
     if difference == 0 or not math.isfinite(difference):
-        raise InputError(f"the difference to resolve must be a number other than 0, got {difference}")
+        raise InputError(
+            f"the difference to resolve must be a number other than 0, got {difference}"
+        )
     chosen: list[Design] = []
     for scenes in range(MIN_SCENES if like_these else 1, MAX_SCENES + 1):
         most = chosen[-1].seeds - 1 if chosen else MAX_SEEDS

@@ -15,7 +15,8 @@ TEMPLATES = "gsbench.analysis.report"
 
 @dataclass(frozen=True)
 class TableEntry:
-    """A table cell as shown: ``text`` without markup, and the ``cell`` behind it if it shows a number."""
+    """A table cell as shown: ``text`` without markup, and the ``cell`` behind it if it shows a
+    number."""
 
     text: str
     bold: bool = False
@@ -24,7 +25,8 @@ class TableEntry:
 
 @dataclass(frozen=True)
 class Column:
-    """A column: its group (the quantity, shared by neighbours), its heading, and both for machines (``key``)."""
+    """A column: its group (the quantity, shared by neighbours), its heading, and both for machines
+    (``key``)."""
 
     group: str
     heading: str
@@ -40,7 +42,8 @@ class Row:
 
 @dataclass(frozen=True)
 class Table:
-    """A titled table with notes below it. The cells of a ``wrapped`` table may need several lines."""
+    """A titled table with notes below it. The cells of a ``wrapped`` table may need several
+    lines."""
 
     title: str
     row_headings: tuple[str, ...]
@@ -57,39 +60,73 @@ class Table:
 
 
 def fill(template: str, package: str = TEMPLATES, **values: Any) -> str:
-    """Fill a jinja2 template of ``package``, or else of the report, with ``values``. Values are escaped for HTML."""
+    """Fill a jinja2 template of ``package``, or else of the report, with ``values``. Values are
+    escaped for HTML."""
     return _environment(package).get_template(template).render(**values)
 
 
 @cache
 def _environment(package: str) -> Environment:
     loader = ChoiceLoader([PackageLoader(package, ""), PackageLoader(TEMPLATES, "")])
-    return Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    return Environment(
+        loader=loader,
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
 
 
 def to_markdown(table: Table) -> str:
     """A GitHub-flavoured Markdown table under its title, with its notes as a list."""
-    heads = [*table.row_headings, *(f"{column.group} {column.heading}".strip() for column in table.columns)]
+    heads = [
+        *table.row_headings,
+        *(f"{column.group} {column.heading}".strip() for column in table.columns),
+    ]
     rule = [":---"] * len(table.row_headings) + ["---:"] * len(table.columns)
-    rows = [[*row.labels, *(f"**{e.text}**" if e.bold else e.text for e in row.entries)] for row in table.rows]
+    rows = [
+        [*row.labels, *(f"**{e.text}**" if e.bold else e.text for e in row.entries)]
+        for row in table.rows
+    ]
     lines = [" | ".join(text.replace("|", "\\|") for text in row) for row in (heads, rule, *rows)]
     notes = [f"- {note}" for note in table.notes]
-    return "\n".join([f"### {table.title}", "", *(f"| {line} |" for line in lines), "", *notes]).rstrip() + "\n"
+    return (
+        "\n".join(
+            [f"### {table.title}", "", *(f"| {line} |" for line in lines), "", *notes]
+        ).rstrip()
+        + "\n"
+    )
 
 
 def to_csv(table: Table) -> str:
-    """CSV with one line per cell: its values in full precision, its text, and the folders of its trials."""
+    """CSV with one line per cell: its values in full precision, its text, and the folders of its
+    trials."""
     import pandas as pd  # here, since it is slow to import
 
-    heads = [*table.row_headings, "quantity", "column", "mean", "std", "count", "expected", "best", "text", "trials"]
+    heads = [
+        *table.row_headings,
+        "quantity",
+        "column",
+        "mean",
+        "std",
+        "count",
+        "expected",
+        "best",
+        "text",
+        "trials",
+    ]
     lines: list[list[object]] = []
     for row in table.rows:
         for column, entry in zip(table.columns, row.entries, strict=True):
             cell = entry.cell
-            numbers = [None] * 4 if cell is None else [cell.mean, cell.std, cell.count, cell.expected]
+            numbers = (
+                [None] * 4 if cell is None else [cell.mean, cell.std, cell.count, cell.expected]
+            )
             trials = "" if cell is None else " ".join(trial.label for trial in cell.trials)
             lines.append([*row.labels, *column.key, *numbers, int(entry.bold), entry.text, trials])
-    return str(pd.DataFrame(lines, columns=heads, dtype=object).to_csv(index=False, lineterminator="\n"))
+    return str(
+        pd.DataFrame(lines, columns=heads, dtype=object).to_csv(index=False, lineterminator="\n")
+    )
 
 
 def to_latex(table: Table) -> str:
@@ -100,11 +137,15 @@ def to_latex(table: Table) -> str:
     if table.wrapped:
         share = f"{WRAPPED_SHARE / len(table.columns):.2f}"
         columns = f">{{\\raggedright\\arraybackslash}}p{{{share}\\linewidth}}" * len(table.columns)
-    heads = [("", name) for name in table.row_headings] + [(one.group, one.heading) for one in table.columns]
+    heads = [("", name) for name in table.row_headings] + [
+        (one.group, one.heading) for one in table.columns
+    ]
     heads = [(escape_latex(group), escape_latex(name)) for group, name in heads]
     grouped = any(group for group, _ in heads)
     rows = [[*map(escape_latex, row.labels), *map(_latex_text, row.entries)] for row in table.rows]
-    frame = pd.DataFrame(rows, columns=pd.MultiIndex.from_tuples(heads) if grouped else [name for _, name in heads])
+    frame = pd.DataFrame(
+        rows, columns=pd.MultiIndex.from_tuples(heads) if grouped else [name for _, name in heads]
+    )
     text = frame.to_latex(
         index=False,
         escape=False,
@@ -114,7 +155,10 @@ def to_latex(table: Table) -> str:
     ).replace("\\begin{table}\n", "\\begin{table}\n\\centering\n")
     if table.notes:
         notes = "\\\\\n".join(escape_latex(note) for note in table.notes)
-        below = f"\\par\\smallskip\\begin{{minipage}}{{\\linewidth}}\\footnotesize\n{notes}\n\\end{{minipage}}\n"
+        below = (
+            "\\par\\smallskip\\begin{minipage}{\\linewidth}\\footnotesize\n"
+            f"{notes}\n\\end{{minipage}}\n"
+        )
         text = text.replace("\\end{table}", f"{below}\\end{{table}}")
     return f"% needs \\usepackage{{booktabs{',array' if table.wrapped else ''}}}\n{text}"
 
@@ -133,13 +177,42 @@ FORMATS: dict[str, tuple[str, Callable[[Table], str]]] = {  # name -> file suffi
 
 WRAPPED_SHARE = 0.7  # share of a LaTeX line for the columns of a ``wrapped`` table
 
-_LATEX = str.maketrans({
-    "\\": "\\textbackslash{}", "&": "\\&", "%": "\\%", "$": "\\$", "#": "\\#", "_": "\\_", "{": "\\{", "}": "\\}",
-    "~": "\\textasciitilde{}", "^": "\\textasciicircum{}", "<": "$<$", ">": "$>$", "|": "$|$",
-    "±": "$\\pm$", "↑": "$\\uparrow$", "↓": "$\\downarrow$", "—": "---", "–": "--", "−": "$-$", "…": "\\ldots{}",
-    "×": "$\\times$", "≈": "$\\approx$", "≠": "$\\neq$", "≤": "$\\leq$", "≥": "$\\geq$", "Δ": "$\\Delta$",
-    "·": "$\\cdot$", "²": "$^2$", "“": "``", "”": "''", "‘": "`", "’": "'",
-})  # fmt: skip
+_LATEX = str.maketrans(
+    {
+        "\\": "\\textbackslash{}",
+        "&": "\\&",
+        "%": "\\%",
+        "$": "\\$",
+        "#": "\\#",
+        "_": "\\_",
+        "{": "\\{",
+        "}": "\\}",
+        "~": "\\textasciitilde{}",
+        "^": "\\textasciicircum{}",
+        "<": "$<$",
+        ">": "$>$",
+        "|": "$|$",
+        "±": "$\\pm$",
+        "↑": "$\\uparrow$",
+        "↓": "$\\downarrow$",
+        "—": "---",
+        "–": "--",
+        "−": "$-$",
+        "…": "\\ldots{}",
+        "×": "$\\times$",
+        "≈": "$\\approx$",
+        "≠": "$\\neq$",
+        "≤": "$\\leq$",
+        "≥": "$\\geq$",
+        "Δ": "$\\Delta$",
+        "·": "$\\cdot$",
+        "²": "$^2$",
+        "“": "``",
+        "”": "''",
+        "‘": "`",
+        "’": "'",
+    }
+)
 
 
 def escape_latex(text: str) -> str:

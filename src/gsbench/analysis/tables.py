@@ -35,7 +35,8 @@ from gsbench.words import counted, some_of
 DEFAULT_ROWS = ("scene", "init", "densify")
 SIDE_BY_SIDE = ("scene.split", "scene.sector")
 
-ORIGINS = (  # trained here by another program (or elsewhere), what was measured, and its description
+# trained here by another program (or elsewhere), what was measured, and its description
+ORIGINS = (
     (True, FROM_MODEL, "Trained here by another program, its model rendered by gsbench"),
     (True, FROM_RENDERS, "Trained here by another program, its own renders measured as they are"),
     (False, FROM_MODEL, "A model that another program trained, rendered here"),
@@ -43,7 +44,8 @@ ORIGINS = (  # trained here by another program (or elsewhere), what was measured
 )
 
 Labels = tuple[str, ...]
-Position = tuple[Labels, Labels, str]  # of a cell: the labels of its row, those of its column, and the quantity's key
+# of a cell: the labels of its row, those of its column, and the quantity's key
+Position = tuple[Labels, Labels, str]
 
 
 def build_table(
@@ -58,15 +60,17 @@ def build_table(
 ) -> Table:
     """Cross the values of ``rows`` with those of ``columns``; each combination shows every metric.
 
-    ``rows`` and ``columns`` are fields of a trial or dotted configuration keys. Cells average over all others: seeds as
-    trials, scenes as means of scenes. By default, rows are scene, initialiser, densifier and every swept setting; swept
-    splits are columns. ``order`` gives the rows and columns to show, even if nothing was run there. ``names`` replaces
-    values in headings. Raises ``InputError`` if a cell would average unlike trials.
+    ``rows`` and ``columns`` are fields of a trial or dotted configuration keys. Cells average over
+    all others: seeds as trials, scenes as means of scenes. By default, rows are scene, initialiser,
+    densifier and every swept setting; swept splits are columns. ``order`` gives the rows and
+    columns to show, even if nothing was run there. ``names`` replaces values in headings. Raises
+    ``InputError`` if a cell would average unlike trials.
     """
     trials = list(experiment.trials if trials is None else trials)
     if rows is None:
         swept = swept_settings(trials)
-        if not columns:  # another split is another question about the same arms, so it gets a column
+        # another split is another question about the same arms, so it gets a column
+        if not columns:
             columns = tuple(key for key in SIDE_BY_SIDE if key in swept)
         rows = (*DEFAULT_ROWS, *(key for key in swept if key not in columns))
     quantities = choose_quantities(trials, metrics)
@@ -74,7 +78,9 @@ def build_table(
     check_fields(trials, fields)
     groups = group_by(trials, lambda trial: tuple(field_value(trial, name) for name in fields))
     for key, group in groups.items():
-        check_averageable(group, " ".join(f"{name}={value}" for name, value in zip(fields, key, strict=True)))
+        check_averageable(
+            group, " ".join(f"{name}={value}" for name, value in zip(fields, key, strict=True))
+        )
     expected = 1 if "seed" in fields else len({trial.seed for trial in trials})
     row_labels, column_labels = order or (
         sorted({key[: len(rows)] for key in groups}, key=_natural),
@@ -85,11 +91,21 @@ def build_table(
     cells: dict[Position, Cell] = {}
     for row, one, column in itertools.product(row_labels, quantities, column_labels):
         own_scenes = scenes if scene_index is None else [(*row, *column)[scene_index]]
-        cells[row, column, one.key] = make_cell(groups.get((*row, *column), []), one, own_scenes, expected)
+        cells[row, column, one.key] = make_cell(
+            groups.get((*row, *column), []), one, own_scenes, expected
+        )
     bold, notes = _best(cells, quantities, scene_index)
     shown = _rows(cells, bold, quantities)
     if "scene" in rows and len(scenes) > 1:
-        means = _means(groups, list(rows).index("scene"), row_labels, column_labels, quantities, scenes, expected)
+        means = _means(
+            groups,
+            list(rows).index("scene"),
+            row_labels,
+            column_labels,
+            quantities,
+            scenes,
+            expected,
+        )
         best = set() if notes else _best(means, quantities, None)[0]
         shown += _rows(means, best, quantities, ruled=True)
     headings = [
@@ -105,7 +121,13 @@ def build_table(
     notes += trials_notes(experiment, trials)
     if left_out := experiment.warnings:
         notes.append(f"Left out ({len(left_out)}): {some_of(left_out)}.")
-    return Table(title or f"Experiment {experiment.name}", tuple(rows), tuple(headings), tuple(shown), tuple(notes))
+    return Table(
+        title or f"Experiment {experiment.name}",
+        tuple(rows),
+        tuple(headings),
+        tuple(shown),
+        tuple(notes),
+    )
 
 
 LEARNT_NOTHING = "(!)"  # marks means over a trial that is not better than one colour
@@ -124,7 +146,10 @@ def format_cell(cell: Cell, quantity: Quantity) -> str:
 
 
 def _rows(
-    cells: Mapping[Position, Cell], bold: set[Position], quantities: Sequence[Quantity], ruled: bool = False
+    cells: Mapping[Position, Cell],
+    bold: set[Position],
+    quantities: Sequence[Quantity],
+    ruled: bool = False,
 ) -> list[Row]:
     """The cells row by row; if ``ruled``, the first row is below a rule.
 
@@ -149,8 +174,8 @@ def _best(
 ) -> tuple[set[Position], list[str]]:
     """The best cells of each scene, and a note for each scene whose cells cannot be compared.
 
-    ``scene_index`` is the index of the scene in the labels of row and column; None if all cells are compared. Cells
-    with different splits answer different questions, so they are not compared.
+    ``scene_index`` is the index of the scene in the labels of row and column; None if all cells are
+    compared. Cells with different splits answer different questions, so they are not compared.
     """
 
     def scene_and_split(position: Position) -> tuple[str, str]:
@@ -160,13 +185,18 @@ def _best(
     bold: set[Position] = set()
     notes: list[str] = []
     for quantity in quantities:
-        rivals = group_by((position for position in cells if position[2] == quantity.key), scene_and_split)
+        rivals = group_by(
+            (position for position in cells if position[2] == quantity.key), scene_and_split
+        )
         for (scene, _), positions in rivals.items():
             shown = [trial for position in positions for trial in cells[position].trials]
             by_scene = group_by(shown, lambda trial: trial.scene)
             differing = {key for group in by_scene.values() for key in differing_conditions(group)}
             if differing:
-                notes.append(f"{scene or 'arms'}: not compared, no best marked: {', '.join(sorted(differing))} differ.")
+                notes.append(
+                    f"{scene or 'arms'}: not compared, no best marked: "
+                    f"{', '.join(sorted(differing))} differ."
+                )
             else:
                 bold |= best_cells({position: cells[position] for position in positions}, quantity)
     return bold, list(dict.fromkeys(notes))
@@ -186,7 +216,9 @@ def _means(
     ``scene_index`` is the index of the scene in the labels of a row.
     """
     # The labels of rows without the scene: each gives one row of means.
-    mean_rows = dict.fromkeys(labels[:scene_index] + labels[scene_index + 1 :] for labels in row_labels)
+    mean_rows = dict.fromkeys(
+        labels[:scene_index] + labels[scene_index + 1 :] for labels in row_labels
+    )
 
     def trials(row: Labels, column: Labels, scene: str) -> Sequence[TrialResult]:
         return groups.get((*row[:scene_index], scene, *row[scene_index:], *column), [])
@@ -194,9 +226,13 @@ def _means(
     def has_value(quantity: Quantity, scene: str) -> bool:
         """Return whether every arm has a value on the scene."""
         arms = itertools.product(mean_rows, column_labels)
-        return all(any(quantity.read(trial) is not None for trial in trials(*arm, scene)) for arm in arms)
+        return all(
+            any(quantity.read(trial) is not None for trial in trials(*arm, scene)) for arm in arms
+        )
 
-    shared_scenes = {one.key: [scene for scene in scenes if has_value(one, scene)] for one in quantities}
+    shared_scenes = {
+        one.key: [scene for scene in scenes if has_value(one, scene)] for one in quantities
+    }
     most_scenes = max(map(len, shared_scenes.values()))
     if most_scenes == 0:
         return {}
@@ -257,7 +293,8 @@ def trials_notes(experiment: Experiment, trials: Sequence[TrialResult]) -> list[
 def doubt_notes(trials: Sequence[TrialResult]) -> list[str]:
     """Lines on results that are worth little or may surprise.
 
-    Renders not better than one colour, executors that failed their proof, twins, and doubts about initial points.
+    Renders not better than one colour, executors that failed their proof, twins, and doubts about
+    initial points.
     """
     notes = []
     for trial in trials:
@@ -265,21 +302,27 @@ def doubt_notes(trials: Sequence[TrialResult]) -> list[str]:
             notes.append(f"{LEARNT_NOTHING} {trial.label} is {line}.")
         notes += [f"{line}." for line in trial.record.raster_passed_over]
     folders, downscales = (
-        {trial.config.get(key) for trial in trials if trial.config} for key in ("scene.images", "scene.downscale")
+        {trial.config.get(key) for trial in trials if trial.config}
+        for key in ("scene.images", "scene.downscale")
     )
     if len(folders) > 1 and len(downscales) > 1:
         notes.append(
-            "Pictures of scene.images and of scene.downscale were made by different filters: results on them differ "
+            "Pictures of scene.images and of scene.downscale were made by different filters: "
+            "results on them differ "
             "by about 0.3 to 0.45 dB."
         )
     for trial in trials:
         twins = trial.record.twins or TwinViews()
         if twins.near:
             count = f"{len(twins.near)} of {trial.record.test_views} test views have"
-            notes.append(f"{trial.scene}: {count} a near twin in training, so they measure memory too.")
+            notes.append(
+                f"{trial.scene}: {count} a near twin in training, so they measure memory too."
+            )
         if twins.left_out:
             left_out = counted(len(twins.left_out), "photograph")
-            notes.append(f"{trial.scene}: {left_out} left out, since another one has its name or content.")
+            notes.append(
+                f"{trial.scene}: {left_out} left out, since another one has its name or content."
+            )
     for trial in trials:
         cloud = trial.record.initial_cloud
         lines = [] if cloud is None else cloud.warnings
@@ -288,13 +331,22 @@ def doubt_notes(trials: Sequence[TrialResult]) -> list[str]:
 
 
 def origin_notes(trials: Sequence[TrialResult]) -> list[str]:
-    """Lines on the arms that gsbench did not train: who did, and whether a model or renders were measured."""
+    """Lines on the arms that gsbench did not train: who did, and whether a model or renders were
+    measured."""
     notes = []
     not_ours = [trial for trial in trials if trial.program or trial.made_elsewhere]
     for trained_here, measured, what in ORIGINS:
-        own = [t for t in not_ours if bool(t.program) == trained_here and t.record.evaluated_from == measured]
-        versions = sorted({(f"{trial.init}-{trial.densify}", trial.trainer_version) for trial in own})
-        arms = ", ".join(f"{arm} (version {version})" if trained_here else arm for arm, version in versions)
+        own = [
+            t
+            for t in not_ours
+            if bool(t.program) == trained_here and t.record.evaluated_from == measured
+        ]
+        versions = sorted(
+            {(f"{trial.init}-{trial.densify}", trial.trainer_version) for trial in own}
+        )
+        arms = ", ".join(
+            f"{arm} (version {version})" if trained_here else arm for arm, version in versions
+        )
         limits = (
             "its time is that of the whole program, and it sets its own budget"
             if trained_here
@@ -305,15 +357,18 @@ def origin_notes(trials: Sequence[TrialResult]) -> list[str]:
 
 
 def comparison_notes(experiment: Experiment) -> list[str]:
-    """Lines on the compared arms: the declared verdict, arms that are equal to the last bit, and caveats.
+    """Lines on the compared arms: the declared verdict, arms that are equal to the last bit, and
+    caveats.
 
-    They are about the whole experiment, so choosing the trials that a table shows cannot change a verdict.
+    They are about the whole experiment, so choosing the trials that a table shows cannot change a
+    verdict.
     """
     trials, pairs = compared_pairs(experiment)
     declared = active_declaration(experiment.folder, experiment.trials)
     notes = []
     if declared is not None:
-        from gsbench.analysis.verdicts import declared_lines, judge_pairs  # here, since SciPy is slow to import
+        # here, since SciPy is slow to import
+        from gsbench.analysis.verdicts import declared_lines, judge_pairs
 
         notes = declared_lines(declared, judge_pairs(trials, pairs, declared))
     by_arm = group_by(trials, lambda trial: trial.arm)
@@ -322,13 +377,18 @@ def comparison_notes(experiment: Experiment) -> list[str]:
         if both and all(are_equal(*one) for one in both):
             names = f"{second} and {first}"
             notes.append(
-                f"{names} are equal to the last bit in all their trials: the settings that differ had no effect."
+                f"{names} are equal to the last bit in all their trials: the settings that differ "
+                "had no effect."
             )
-    sentences = (caveats([*by_arm[first], *by_arm[second]], first, second) for first, second in pairs)
+    sentences = (
+        caveats([*by_arm[first], *by_arm[second]], first, second) for first, second in pairs
+    )
     return notes + list(filter(None, sentences))
 
 
-def compared_pairs(experiment: Experiment, baseline: str = BASELINE) -> tuple[list[TrialResult], list[tuple[Arm, Arm]]]:
+def compared_pairs(
+    experiment: Experiment, baseline: str = BASELINE
+) -> tuple[list[TrialResult], list[tuple[Arm, Arm]]]:
     """The experiment's trials with their variants, and the pairs of arms to compare.
 
     A search has no pairs: its points were chosen by results, so no test of them is valid.
@@ -336,11 +396,13 @@ def compared_pairs(experiment: Experiment, baseline: str = BASELINE) -> tuple[li
     trials = with_variants(experiment.trials)
     if (experiment.folder / TUNING).exists():
         return trials, []
-    return trials, choose_pairs(sorted({trial.arm for trial in trials}), baseline, controls_of(trials))
+    return trials, choose_pairs(
+        sorted({trial.arm for trial in trials}), baseline, controls_of(trials)
+    )
 
 
-# Spearman's rank correlation with viewers' scores of trained 3DGS models: Chen et al. 2025, MUGSQA (arXiv 2511.06830),
-# table 3, main set.
+# Spearman's rank correlation with viewers' scores of trained 3DGS models: Chen et al. 2025, MUGSQA
+# (arXiv 2511.06830), table 3, main set.
 AGREEMENT = {
     "psnr": 0.52,
     "ssim": 0.37,
@@ -353,15 +415,19 @@ AGREEMENT = {
 
 
 def with_agreement(tables: Sequence[Table]) -> list[Table]:
-    """The tables, of which the first says how weakly its metrics agree with people, if a study measured any of them."""
+    """The tables, of which the first says how weakly its metrics agree with people, if a study
+    measured any of them."""
     shown = {column.key[0] for table in tables for column in table.columns}
     found = [
-        f"{value} for {facts.label}" for key, value in AGREEMENT.items() if key in shown and (facts := find_metric(key))
+        f"{value} for {facts.label}"
+        for key, value in AGREEMENT.items()
+        if key in shown and (facts := find_metric(key))
     ]
     if not found:
         return list(tables)
     note = (
-        "Metrics agree with people only in part. Their rank correlation with viewers' scores of 3DGS models was "
+        "Metrics agree with people only in part. Their rank correlation with viewers' scores of "
+        "3DGS models was "
         f"{', '.join(found)} in one study (arXiv 2511.06830, table 3). gsbench vote asks people."
     )
     return [replace(tables[0], notes=(*tables[0].notes, note)), *tables[1:]]
@@ -376,45 +442,67 @@ def machine_notes(trials: Sequence[TrialResult]) -> list[str]:
     listed = "; ".join(f"{kind}: {counted(count, 'trial')}" for kind, count in kinds.most_common())
     rest = f"; not recorded: {unknown}" if unknown else ""
     return [
-        f"The trials ran on {len(kinds)} kinds of machine: {listed}{rest}. There equal settings give other last digits "
+        f"The trials ran on {len(kinds)} kinds of machine: {listed}{rest}. There equal settings "
+        "give other last digits "
         "and, after thousands of iterations, other results."
     ]
 
 
 def cloud_notes(trials: Sequence[TrialResult]) -> list[str]:
-    """A line for each scene and initialiser whose trials have the same settings but started from several clouds."""
+    """A line for each scene and initialiser whose trials have the same settings but started from
+    several clouds."""
     notes = []
-    groups = group_by(trials, lambda trial: (trial.scene, trial.init, trial.record.hashes.get("init")))
+    groups = group_by(
+        trials, lambda trial: (trial.scene, trial.init, trial.record.hashes.get("init"))
+    )
     for (scene, init, _), group in groups.items():
         clouds = group_by([trial for trial in group if trial.cloud], lambda trial: trial.cloud)
         if len(clouds) > 1:
             listed = "; ".join(f"{cloud[:SHOWN]}: {_arms(own)}" for cloud, own in clouds.items())
-            notes.append(f"{scene}: trials of init {init} started from {len(clouds)} different clouds ({listed}).")
+            notes.append(
+                f"{scene}: trials of init {init} started from {len(clouds)} different clouds "
+                f"({listed})."
+            )
     return notes
 
 
 def held_out_notes(trials: Sequence[TrialResult]) -> list[str]:
-    """A line for each way in which views were held out; it names the scenes if there are several ways and scenes."""
+    """A line for each way in which views were held out; it names the scenes if there are several
+    ways and scenes."""
     notes = []
     recorded = [trial for trial in trials if trial.record.held_out]
     splits = group_by(recorded, lambda trial: (trial.question, trial.record.held_out))
-    for (question, words), group in sorted(splits.items(), key=lambda item: (-len(item[1]), item[0])):
+    for (question, words), group in sorted(
+        splits.items(), key=lambda item: (-len(item[1]), item[0])
+    ):
         scenes = sorted({trial.scene for trial in group})
-        counts = sorted({(trial.record.test_views or 0, trial.record.train_views or 0) for trial in group})
+        counts = sorted(
+            {(trial.record.test_views or 0, trial.record.train_views or 0) for trial in group}
+        )
         views = " and ".join(f"{test} of {test + train} views" for test, train in counts)
-        where = f", {', '.join(scenes)}" if len(splits) > 1 and len({trial.scene for trial in recorded}) > 1 else ""
+        where = (
+            f", {', '.join(scenes)}"
+            if len(splits) > 1 and len({trial.scene for trial in recorded}) > 1
+            else ""
+        )
         notes.append(f"Held out{f' ({question})' if question else ''}{where}: {words}; {views}.")
     return notes
 
 
 def points_notes(trials: Sequence[TrialResult]) -> list[str]:
-    """A line for each initialiser on the views that made its points; none for points that no photographs made."""
+    """A line for each initialiser on the views that made its points; none for points that no
+    photographs made."""
     notes = []
     for init, choice in sorted({(trial.init, _points_from(trial)) for trial in trials}):
         if choice == "all":
-            notes.append(f"Initial points of {init}: from all views, test views included (init.points_from=all).")
+            notes.append(
+                f"Initial points of {init}: from all views, test views included "
+                "(init.points_from=all)."
+            )
         elif choice:
-            notes.append(f"Initial points of {init}: from training views alone (init.points_from={choice}).")
+            notes.append(
+                f"Initial points of {init}: from training views alone (init.points_from={choice})."
+            )
     return notes
 
 

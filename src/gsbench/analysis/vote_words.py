@@ -1,4 +1,5 @@
-"""Rounds of votes in words, for the terminal and the report, with the views where people and LPIPS disagree."""
+"""Rounds of votes in words, for the terminal and the report, with the views where people and LPIPS
+disagree."""
 
 import logging
 from collections.abc import Sequence
@@ -25,13 +26,16 @@ log = logging.getLogger(__name__)
 
 
 def load_rounds(home: Path) -> list[RoundVerdict]:
-    """The verdicts of all rounds of the experiment in ``home``, the oldest first; a damaged round gives a warning."""
+    """The verdicts of all rounds of the experiment in ``home``, the oldest first; a damaged round
+    gives a warning."""
     verdicts = []
     for folder in (home / VOTES).glob("*/"):
         try:
             require_no_links(home.parent, folder, below=True)
             files = [file for file in sorted(folder.glob("*.json")) if file.name != VOTE_KEY]
-            verdicts.append(judge_round(read_key(folder), [read_typed(file, Ballot) for file in files]))
+            verdicts.append(
+                judge_round(read_key(folder), [read_typed(file, Ballot) for file in files])
+            )
         except InputError as error:
             log.warning("left out: %s", error)
     return sorted(verdicts, key=lambda one: one.key.time)
@@ -43,7 +47,8 @@ def people_words(count: int) -> str:
 
 
 def describe_round(verdict: RoundVerdict) -> list[str]:
-    """The lines of a round: how many voted, the verdict on each arm, the ranking, and who was left out."""
+    """The lines of a round: how many voted, the verdict on each arm, the ranking, and who was left
+    out."""
     key = verdict.key
     when = f"{key.time[:16].replace('T', ' ')} UTC"
     voted = f"{counted(verdict.votes, 'vote')} of {people_words(len(verdict.counted))}"
@@ -57,23 +62,28 @@ def describe_round(verdict: RoundVerdict) -> list[str]:
             f"{arm} {100 * chance:.0f} % ({100 * interval.low:.0f} to {100 * interval.high:.0f})"
             for arm, chance, interval in verdict.ranking
         ]
-        lines.append(f"Chance to win against the average arm, with 95 % intervals: {'; '.join(ranks)}.")
+        lines.append(
+            f"Chance to win against the average arm, with 95 % intervals: {'; '.join(ranks)}."
+        )
     if verdict.counted:
         lines.append(
-            f"{100 * verdict.consistent:.0f} % of the pairs shown again, swapped, had the same answer; "
+            f"{100 * verdict.consistent:.0f} % of the pairs shown again, swapped, had the same "
+            "answer; "
             f"{100 * verdict.left:.0f} % of the votes were for the left side."
         )
     return lines + [f"Left out: {person} {reason}." for person, reason in verdict.left_out.items()]
 
 
 def _describe_pair(pair: PairVotes, final: bool) -> list[str]:
-    """The votes on an arm against the baseline, and the statements about people and about scenes."""
+    """The votes on an arm against the baseline, and the statements about people and about
+    scenes."""
     parts = ""
     for how in ("most different", "random"):
         means = [mean for showing, mean in pair.views if showing.chosen == how]
         parts += f", {50 + 50 * sum(means) / len(means):.0f} % of the {how} views" if means else ""
     return [
-        f"{pair.arm} against {pair.baseline}: {_share(pair)} ({pair.wins} for it, {pair.losses} against it, "
+        f"{pair.arm} against {pair.baseline}: {_share(pair)} ({pair.wins} for it, {pair.losses} "
+        "against it, "
         f"{pair.ties} without a difference{parts}).",
         f"People like these, on these views: {_statement(pair.people, 'people', final)}.",
         f"Scenes like these, for these people: {_statement(pair.scenes, 'scenes', final)}.",
@@ -86,7 +96,9 @@ def _statement(like: LikeThese | None, units: str, final: bool) -> str:
         return f"{UNDECIDED}, since the sign test needs six {units}"
     median = ""
     if like.median is not None:
-        median = f"; median share {50 + 50 * like.median.low:.0f} to {50 + 50 * like.median.high:.0f} %"
+        median = (
+            f"; median share {50 + 50 * like.median.low:.0f} to {50 + 50 * like.median.high:.0f} %"
+        )
     votes = f"for it are {like.helped} of {like.scenes} {units}"
     test = f"sign test at {100 * like.level:.3g} %, p {p_text(like.p)}"
     return f"{_word(like, final)}; {votes} ({test}{median})"
@@ -100,10 +112,16 @@ def _share(pair: PairVotes) -> str:
     return f"{100 * pair.share:.0f} % of {pair.wins + pair.losses + pair.ties} votes"
 
 
-def vote_table(pair: PairVotes, final: bool, trials: Sequence[TrialResult], judged: Sequence[PairVerdicts]) -> Table:
-    """People's verdict beside those of metrics on the same arms, and how often a metric prefers what people prefer."""
+def vote_table(
+    pair: PairVotes, final: bool, trials: Sequence[TrialResult], judged: Sequence[PairVerdicts]
+) -> Table:
+    """People's verdict beside those of metrics on the same arms, and how often a metric prefers
+    what people prefer."""
     rows = [
-        Row((f"{units} like these",), (TableEntry(_word(like, final)), TableEntry(_share(pair)), TableEntry("")))
+        Row(
+            (f"{units} like these",),
+            (TableEntry(_word(like, final)), TableEntry(_share(pair)), TableEntry("")),
+        )
         for units, like in (("people", pair.people), ("scenes", pair.scenes))
     ]
     own = [one for one in judged if (one.first, one.second) == (pair.baseline, pair.arm)]
@@ -111,14 +129,27 @@ def vote_table(pair: PairVotes, final: bool, trials: Sequence[TrialResult], judg
     gains = view_gains(trials, pair)
     for metric in _metrics(pair, trials):
         both = zip(pair.views, gains, strict=True)
-        signs = [mean * metric.direction * gain[metric.key] for (_, mean), gain in both if gain.get(metric.key)]
+        signs = [
+            mean * metric.direction * gain[metric.key]
+            for (_, mean), gain in both
+            if gain.get(metric.key)
+        ]
         one = verdicts.get(metric.key)
-        word, difference = ("not compared", "") if one is None else (WORDS[one.outcome], one.shown(one.mean or 0.0))
+        word, difference = (
+            ("not compared", "")
+            if one is None
+            else (WORDS[one.outcome], one.shown(one.mean or 0.0))
+        )
         agreed = f"{sum(sign > 0 for sign in signs)} of {sum(sign != 0 for sign in signs)} views"
         rows.append(Row((metric.heading,), tuple(map(TableEntry, (word, difference, agreed)))))
     heads = ("verdict", "share of votes, or difference", "prefers what people prefer")
     title = f"People and metrics: {pair.arm} against {pair.baseline}"
-    return Table(title, ("judged by",), tuple(Column("", head, ("votes", head)) for head in heads), tuple(rows))
+    return Table(
+        title,
+        ("judged by",),
+        tuple(Column("", head, ("votes", head)) for head in heads),
+        tuple(rows),
+    )
 
 
 def _metrics(pair: PairVotes, trials: Sequence[TrialResult]) -> list[Quantity]:
@@ -129,7 +160,8 @@ def _metrics(pair: PairVotes, trials: Sequence[TrialResult]) -> list[Quantity]:
 
 
 def disagreements(pair: PairVotes, trials: Sequence[TrialResult]) -> list[ViewComparison]:
-    """Pictures of at most `MAX_SHOWN` views where people and LPIPS prefer different arms, the clearest votes first.
+    """Pictures of at most `MAX_SHOWN` views where people and LPIPS prefer different arms, the
+    clearest votes first.
 
     LPIPS is the first variant that both trials of the view have.
     """
@@ -140,10 +172,20 @@ def disagreements(pair: PairVotes, trials: Sequence[TrialResult]) -> list[ViewCo
         zip(pair.views, view_gains(trials, pair), strict=True), key=lambda both: -abs(both[0][1])
     ):
         metric = next((metric for metric in lpips if metric.key in gains), None)
-        if metric is None or mean * metric.direction * gains[metric.key] >= 0 or len(shown) == MAX_SHOWN:
+        if (
+            metric is None
+            or mean * metric.direction * gains[metric.key] >= 0
+            or len(shown) == MAX_SHOWN
+        ):
             continue
         people, other = (pair.arm, pair.baseline) if mean > 0 else (pair.baseline, pair.arm)
-        words = f"people prefer {people} (mean vote {signed(mean, '.2f')}), {metric.name} prefers {other}"
-        trials_shown = (by_trial[pair.baseline, one.scene, one.seed], by_trial[pair.arm, one.scene, one.seed])
+        words = (
+            f"people prefer {people} (mean vote {signed(mean, '.2f')}), {metric.name} prefers "
+            f"{other}"
+        )
+        trials_shown = (
+            by_trial[pair.baseline, one.scene, one.seed],
+            by_trial[pair.arm, one.scene, one.seed],
+        )
         shown.append(compare_view(words, trials_shown, one.view))
     return shown

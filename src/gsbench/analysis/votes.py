@@ -1,11 +1,14 @@
-"""People's votes on which of two renders is nearer to the photograph, and what a round of them shows.
+"""People's votes on which of two renders is nearer to the photograph, and what a round of them
+shows.
 
-`gsbench.claims.vote_page` makes a round: pairs of renders (each with the photograph), some of them a second time with
-the sides swapped, and traps, which show the photograph beside a blurred one. Everybody sees the same showings.
+`gsbench.claims.vote_page` makes a round: pairs of renders (each with the photograph), some of them
+a second time with the sides swapped, and traps, which show the photograph beside a blurred one.
+Everybody sees the same showings.
 
-A vote is independent neither of the other votes of its person nor of those of its scene. So a person's mean preference
-is one unit, and so is a scene's. `gsbench.analysis.statistics.judge_like_these`, an exact sign test, judges both:
-people like these on the shown views, and scenes like these for the people who voted. Each needs six units.
+A vote is independent neither of the other votes of its person nor of those of its scene. So a
+person's mean preference is one unit, and so is a scene's.
+`gsbench.analysis.statistics.judge_like_these`, an exact sign test, judges both: people like these
+on the shown views, and scenes like these for the people who voted. Each needs six units.
 """
 
 import math
@@ -35,7 +38,8 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class PairVotes:
-    """The votes on ``arm`` against ``baseline``, with the two statements; each is None below six units.
+    """The votes on ``arm`` against ``baseline``, with the two statements; each is None below six
+    units.
 
     ``views`` have the mean vote on each view, from -1 (all for the baseline) to 1.
     """
@@ -59,9 +63,10 @@ class PairVotes:
 class RoundVerdict:
     """The result of a round. ``left_out`` says by person why the votes do not count.
 
-    ``final`` is False below the declared number of votes: then nothing is decided yet. ``consistent`` is the share of
-    the pairs shown again that had the same answer, ``left`` that of votes for the left side; NaN without any.
-    ``ranking`` has the arms of a round of several, with their chance to win against the average arm, the best first.
+    ``final`` is False below the declared number of votes: then nothing is decided yet.
+    ``consistent`` is the share of the pairs shown again that had the same answer, ``left`` that of
+    votes for the left side; NaN without any. ``ranking`` has the arms of a round of several, with
+    their chance to win against the average arm, the best first.
     """
 
     key: RoundKey
@@ -82,17 +87,22 @@ class RoundVerdict:
 
 
 def judge_round(key: RoundKey, ballots: Sequence[Ballot]) -> RoundVerdict:
-    """The verdict of a round: first traps, then at most the declared number of people in the order of finishing."""
+    """The verdict of a round: first traps, then at most the declared number of people in the order
+    of finishing."""
     left_out: dict[str, str] = {}
     counted = list[Ballot]()
     traps = [one for one in key.showings if one.kind == "trap"]
     for ballot in sorted(ballots, key=lambda one: (unix_time(one.finished) or 0, one.person)):
         wrong = sum(_preference(trap, ballot, PHOTOGRAPH) != 1 for trap in traps)
         if wrong > key.traps_allowed:
-            left_out[ballot.label] = f"failed {wrong} of {len(traps)} traps, and {key.traps_allowed} may fail"
+            left_out[ballot.label] = (
+                f"failed {wrong} of {len(traps)} traps, and {key.traps_allowed} may fail"
+            )
         elif len(counted) == key.people:
             # Adding people until the result pleases would find effects that do not exist.
-            left_out[ballot.label] = f"came after the {key.people} people whose votes were declared to count"
+            left_out[ballot.label] = (
+                f"came after the {key.people} people whose votes were declared to count"
+            )
         else:
             counted.append(ballot)
     pairs = [_judge_pair(key, counted, arm) for arm in key.arms[1:] if counted]
@@ -103,7 +113,9 @@ def judge_round(key: RoundKey, ballots: Sequence[Ballot]) -> RoundVerdict:
         for one, ballot in seen
         if one.kind == "again"
     ]
-    sides = [ballot.answers[one.id] == "left" for one, ballot in seen if ballot.answers[one.id] != SAME]
+    sides = [
+        ballot.answers[one.id] == "left" for one, ballot in seen if ballot.answers[one.id] != SAME
+    ]
     return RoundVerdict(
         key,
         tuple(counted),
@@ -116,7 +128,8 @@ def judge_round(key: RoundKey, ballots: Sequence[Ballot]) -> RoundVerdict:
 
 
 def _preference(showing: Showing, ballot: Ballot, side: str) -> int:
-    """1 if the ballot prefers ``side`` (an arm, or of a trap the photograph), -1 the other, 0 for no difference."""
+    """1 if the ballot prefers ``side`` (an arm, or of a trap the photograph), -1 the other, 0 for
+    no difference."""
     answer = ballot.answers[showing.id]
     if answer == SAME:
         return 0
@@ -129,7 +142,9 @@ def _judge_pair(key: RoundKey, counted: Sequence[Ballot], arm: Arm) -> PairVotes
     showings = [one for one in key.pairs if {one.left, one.right} == sides]
     if not showings:
         return None
-    votes = np.array([[_preference(one, ballot, str(arm)) for one in showings] for ballot in counted])
+    votes = np.array(
+        [[_preference(one, ballot, str(arm)) for one in showings] for ballot in counted]
+    )
     statements = judge_votes(votes, [one.scene for one in showings], ALPHA / (len(key.arms) - 1))
     wins, losses, ties = (int((votes == side).sum()) for side in (1, -1, 0))
     means = zip(showings, map(float, votes.mean(axis=0)), strict=True)
@@ -143,17 +158,26 @@ def judge_votes(
 
     ``votes`` [K, V] of K people on V views are 1, 0 or -1; ``scenes`` has the scene of each view.
     """
-    of_scene = [[place for place, one in enumerate(scenes) if one == scene] for scene in dict.fromkeys(scenes)]
-    cells = np.stack([votes[:, places].mean(axis=1) for places in of_scene])  # [S, K]: scenes have the same weight
+    of_scene = [
+        [place for place, one in enumerate(scenes) if one == scene]
+        for scene in dict.fromkeys(scenes)
+    ]
+    cells = np.stack(
+        [votes[:, places].mean(axis=1) for places in of_scene]
+    )  # [S, K]: scenes have the same weight
     people, views = cells.mean(axis=0), cells.mean(axis=1)
-    return judge_like_these(people, 1, LEAST_PREFERENCE, level), judge_like_these(views, 1, LEAST_PREFERENCE, level)
+    return judge_like_these(people, 1, LEAST_PREFERENCE, level), judge_like_these(
+        views, 1, LEAST_PREFERENCE, level
+    )
 
 
 def rank_arms(key: RoundKey, counted: Sequence[Ballot]) -> tuple[tuple[Arm, float, Interval], ...]:
     """The arms by their chance to win against the average arm, the best first."""
     names = [str(arm) for arm in key.arms]
     scenes = list(dict.fromkeys(one.scene for one in key.pairs))
-    wins = np.zeros((len(counted), len(scenes), len(names), len(names)))  # [K, S, A, A], of row against column
+    wins = np.zeros(
+        (len(counted), len(scenes), len(names), len(names))
+    )  # [K, S, A, A], of row against column
     for person, ballot in enumerate(counted):
         for one in key.pairs:
             left, right = names.index(one.left), names.index(one.right)
@@ -168,30 +192,39 @@ def rank_arms(key: RoundKey, counted: Sequence[Ballot]) -> tuple[tuple[Arm, floa
 
 
 def rank_wins(wins: Array) -> tuple[Array, Array, Array]:
-    """The `bradley_terry` chances [A] and both ends [A] of their intervals of 95 %, from ``wins`` [K, S, A, A].
+    """The `bradley_terry` chances [A] and both ends [A] of their intervals of 95 %, from ``wins``
+    [K, S, A, A].
 
-    The standard errors of the log-odds come from drawing people and scenes anew, both with replacement (Owen 2007, Ann.
-    Appl. Stat. 1, 386). Percentiles of so few units would be too narrow, so Student's t widens them, with one degree
-    of freedom less than there are people or scenes, whichever are fewer. One person and one scene have no interval.
+    The standard errors of the log-odds come from drawing people and scenes anew, both with
+    replacement (Owen 2007, Ann. Appl. Stat. 1, 386). Percentiles of so few units would be too
+    narrow, so Student's t widens them, with one degree of freedom less than there are people or
+    scenes, whichever are fewer. One person and one scene have no interval.
     """
     rng = np.random.default_rng(0)
     units = [count for count in wins.shape[:2] if count > 1]
     people, scenes = (
-        rng.multinomial(count, np.full(count, 1 / count), DRAWS).astype(float) for count in wins.shape[:2]
+        rng.multinomial(count, np.full(count, 1 / count), DRAWS).astype(float)
+        for count in wins.shape[:2]
     )
     drawn = bradley_terry(np.einsum("dk,ds,ksij->dij", people, scenes, wins, optimize=True))
     error = special.logit(drawn).std(axis=0, ddof=1)
-    half = special.stdtrit(min(units) - 1, 1 - ALPHA / 2) * error if units else np.full(wins.shape[-1], np.inf)
+    half = (
+        special.stdtrit(min(units) - 1, 1 - ALPHA / 2) * error
+        if units
+        else np.full(wins.shape[-1], np.inf)
+    )
     chances = bradley_terry(wins.sum(axis=(0, 1))[None])[0]
     middle = special.logit(chances)
     return chances, special.expit(middle - half), special.expit(middle + half)
 
 
 def bradley_terry(wins: Array) -> Array:
-    """The chance [D, A] of each arm to win against the average arm, from the ``wins`` [D, A, A] of row against column.
+    """The chance [D, A] of each arm to win against the average arm, from the ``wins`` [D, A, A] of
+    row against column.
 
-    The model is that of Bradley and Terry (1952), fitted by the iteration of Hunter (2004, Ann. Stat. 32, 384). Half a
-    vote more for each arm against each other keeps an arm that never lost at a finite strength.
+    The model is that of Bradley and Terry (1952), fitted by the iteration of Hunter (2004, Ann.
+    Stat. 32, 384). Half a vote more for each arm against each other keeps an arm that never lost at
+    a finite strength.
     """
     arms = wins.shape[-1]
     wins = wins + 0.5 * (1 - np.eye(arms))
@@ -221,7 +254,8 @@ def view_gains(trials: Sequence[TrialResult], pair: PairVotes) -> list[dict[str,
     gains = []
     for one, _ in pair.views:
         arm, baseline = (
-            files.get((side, one.scene, one.seed), {}).get(f"{one.view}.png", {}) for side in (pair.arm, pair.baseline)
+            files.get((side, one.scene, one.seed), {}).get(f"{one.view}.png", {})
+            for side in (pair.arm, pair.baseline)
         )
         gains.append({key: arm[key] - baseline[key] for key in arm.keys() & baseline.keys()})
     return gains

@@ -1,8 +1,9 @@
 """gsbench as a Hydra app: a command line becomes trials and an exit code.
 
-Before Hydra runs, the whole configuration is composed and checked (`gsbench.config.compose`). Then ``hydra.main`` runs
-the task once, or hands it to gsbench's sweeper. A sweep may first tune its arms (`gsbench.app.tuning`). Its trials run
-as one batch, or seed by seed until their question is decided.
+Before Hydra runs, the whole configuration is composed and checked (`gsbench.config.compose`). Then
+``hydra.main`` runs the task once, or hands it to gsbench's sweeper. A sweep may first tune its arms
+(`gsbench.app.tuning`). Its trials run as one batch, or seed by seed until their question is
+decided.
 """
 
 import logging
@@ -52,7 +53,8 @@ log = logging.getLogger(__name__)
 
 
 def launch(argv: list[str]) -> int:
-    """Run the trials of the command line ``argv``; returns 0 if all are done (or left to Slurm), 1 if some failed.
+    """Run the trials of the command line ``argv``; returns 0 if all are done (or left to Slurm), 1
+    if some failed.
 
     Raises InputError for a wrong configuration, and for a single trial's bad input.
     """
@@ -74,12 +76,15 @@ def compose_trials(words: Sequence[str], multirun: bool = False) -> list[Trial]:
 def one_trial_per_scene(verb: str, settings: Sequence[str], metric: str) -> dict[str, Trial]:
     """A trial of each scene, for a verb that compares two versions of one trainer (gate, bisect).
 
-    Raises InputError for settings that make more than one arm, and for a metric that the trials do not compute.
+    Raises InputError for settings that make more than one arm, and for a metric that the trials do
+    not compute.
     """
     keys = [word.partition("=")[0].lstrip("+") for word in settings]
     if implied := [key for key in keys if key in ("seed", "eval.primary")]:
         raise InputError(f"{verb}: {implied[0]} follows from the other words: leave it out")
-    trials = compose_trials([*settings, "seed=0", *([] if "name" in keys else [f"name={verb}"])], multirun=True)
+    trials = compose_trials(
+        [*settings, "seed=0", *([] if "name" in keys else [f"name={verb}"])], multirun=True
+    )
     by_scene = {trial.values["scene"]["name"]: trial for trial in trials}
     if len(by_scene) < len(trials):
         raise InputError(f"{verb} is about one arm: only scene may list values")
@@ -91,12 +96,14 @@ def one_trial_per_scene(verb: str, settings: Sequence[str], metric: str) -> dict
 
 
 def run_trials(trials: Sequence[Trial]) -> int:
-    """Run those ``trials`` that are not done, by the launcher that they name; returns the exit code."""
+    """Run those ``trials`` that are not done, by the launcher that they name; returns the exit
+    code."""
     return summarize(run_batch(trials), trials)
 
 
 def run_app(words: Sequence[str], multirun: bool, task: TrialTask) -> None:
-    """Run ``task`` for the trials of a command line: one, or many with ``multirun`` or an experiment that is a sweep.
+    """Run ``task`` for the trials of a command line: one, or many with ``multirun`` or an
+    experiment that is a sweep.
 
     Raises InputError, one line, for a wrong configuration.
     """
@@ -118,7 +125,8 @@ def run_app(words: Sequence[str], multirun: bool, task: TrialTask) -> None:
         other = ""
     sweeper = config.hydra.sweeper
     task.grids = None if other else OmegaConf.to_container(sweeper, resolve=False).get("grids")  # type: ignore[union-attr]
-    # The grids are taken out: Hydra would resolve their ${…} when it makes the sweeper, before each trial's values.
+    # The grids are taken out: Hydra would resolve their ${…} when it makes the sweeper, before each
+    # trial's values.
     argv = [*words, *[f"{GRIDS}=[]"] * bool(task.grids)]
     if other:
         argv = prepare_other_sweeper(config, argv, task, other)
@@ -129,21 +137,33 @@ def run_app(words: Sequence[str], multirun: bool, task: TrialTask) -> None:
         load_callbacks(config.hydra.callbacks, task.allowed)
         argv += words_for_hydras_files(config, words, multirun)
         if config.hydra.job.chdir:
-            log.info("hydra.job.chdir: paths still start in %s, where the command was given", task.folder)
+            log.info(
+                "hydra.job.chdir: paths still start in %s, where the command was given", task.folder
+            )
     # Another sweeper may raise any error for its settings.
     errors = Exception if other else (HydraException, OmegaConfBaseException, OSError)
     with compose.explained(words, errors):
         compose.run_main(task, [*argv, f"hydra.mode={'MULTIRUN' if multirun else 'RUN'}"], config)
     if other and not task.trials:
         name = config.name
-        log.info("hydra/sweeper=%s has ended: gsbench status %s; the table: gsbench tables %s", other, name, name)
+        log.info(
+            "hydra/sweeper=%s has ended: gsbench status %s; the table: gsbench tables %s",
+            other,
+            name,
+            name,
+        )
 
 
 # ---- Hydra's other sweepers, and its own files
 
 GRID_SWEEPER = "basic"  # Hydra's own, which expands lists and asks for no values
 LOGGING = ("hydra/job_logging", "hydra/hydra_logging", "hydra.job_logging", "hydra.hydra_logging")
-NO_FILES = ["hydra/job_logging=none", "hydra/hydra_logging=none", "hydra.run.dir=.", "hydra.output_subdir=null"]
+NO_FILES = [
+    "hydra/job_logging=none",
+    "hydra/hydra_logging=none",
+    "hydra.run.dir=.",
+    "hydra.output_subdir=null",
+]
 HYDRAS_FILES = ("run", "sweep", "output_subdir")
 MAX_CHOICES = 1000  # of groups, in a sweep of another sweeper
 
@@ -154,32 +174,49 @@ def other_sweeper(config: DictConfig) -> str:
     return "" if name == OWN else name
 
 
-def words_without_sweeper(config: DictConfig, words: Sequence[str], name: str) -> tuple[list[str], bool]:
+def words_without_sweeper(
+    config: DictConfig, words: Sequence[str], name: str
+) -> tuple[list[str], bool]:
     """The words for a look at what another sweeper would run, and whether they are a sweep."""
-    kept = [word for word in words if not key_of(word).startswith(("hydra/sweeper", "hydra.sweeper."))]
+    kept = [
+        word for word in words if not key_of(word).startswith(("hydra/sweeper", "hydra.sweeper."))
+    ]
     if name == GRID_SWEEPER:
         return [*kept, f"hydra/sweeper={OWN}"], True
     points = config.hydra.sweeper.get("n_trials")
     count = "trials" if points is None else f"{points} trials (hydra.sweeper.n_trials)"
-    print(f"hydra/sweeper={name} searches: it proposes {count} from the results, so they are not known yet")
+    print(
+        f"hydra/sweeper={name} searches: it proposes {count} from the results, so they are not "
+        "known yet"
+    )
     return [*(word for word in kept if not is_sweep(word)), f"hydra/sweeper={OWN}"], False
 
 
-def prepare_other_sweeper(config: DictConfig, words: Sequence[str], task: TrialTask, name: str) -> list[str]:
+def prepare_other_sweeper(
+    config: DictConfig, words: Sequence[str], task: TrialTask, name: str
+) -> list[str]:
     """Give the ``task`` what another sweeper asks for; returns the words for Hydra.
 
-    Raises InputError for a choice among the words that would run what is not allowed: Hydra reads a job's logging
-    before the job can be checked.
+    Raises InputError for a choice among the words that would run what is not allowed: Hydra reads a
+    job's logging before the job can be checked.
     """
     params = config.hydra.sweeper.get("params") or {}
     lists = {bare_key(str(key)): f"{key}={value}" for key, value in params.items()}
     lists |= {key_of(word): word for word in words if is_sweep(word)}
-    choices = [grid_points([parse_word(word)]) for key, word in lists.items() if "." not in key and key != "seed"]
+    choices = [
+        grid_points([parse_word(word)])
+        for key, word in lists.items()
+        if "." not in key and key != "seed"
+    ]
     for number, point in enumerate(product(*choices)):
         if number == MAX_CHOICES:
-            raise InputError(f"hydra/sweeper={name}: more than {MAX_CHOICES} combinations of choices")
+            raise InputError(
+                f"hydra/sweeper={name}: more than {MAX_CHOICES} combinations of choices"
+            )
         with compose.hydra_ready():
-            compose.compose_whole([*(w for w in words if not is_sweep(w)), *(word for (word,) in point)])
+            compose.compose_whole(
+                [*(w for w in words if not is_sweep(w)), *(word for (word,) in point)]
+            )
     if name == GRID_SWEEPER:
         task.objective = Objective(-1)
         return list(words)
@@ -187,27 +224,38 @@ def prepare_other_sweeper(config: DictConfig, words: Sequence[str], task: TrialT
         metric, direction = metric_of(compose.resolve_trial(config, words).values)
     sign = 1 if _maximizes(config.hydra.sweeper) else -1
     # A search must not choose among seeds: each job has them all.
-    seeds = [word for (word,) in grid_points([parse_word(lists["seed"])])] if "seed" in lists else []
+    seeds = (
+        [word for (word,) in grid_points([parse_word(lists["seed"])])] if "seed" in lists else []
+    )
     task.objective = Objective(sign, tuple(seeds))
     log.info(
-        "hydra/sweeper=%s gets %s%s of test views, %s; gsbench's own sweeper would tune on validation views and "
+        "hydra/sweeper=%s gets %s%s of test views, %s; gsbench's own sweeper would tune on "
+        "validation views and "
         "can stop by looks",
-        name, "-" if sign != direction else "", metric, "maximized" if sign > 0 else "minimized",
-    )  # fmt: skip
+        name,
+        "-" if sign != direction else "",
+        metric,
+        "maximized" if sign > 0 else "minimized",
+    )
     kept = [word for word in words if key_of(word) != "seed" or not is_sweep(word)]
     return kept + ["~hydra.sweeper.params.seed"] * ("seed" in params)
 
 
 def _maximizes(sweeper: DictConfig) -> bool:
-    """Return whether a sweeper was told (as Optuna's, Nevergrad's or Ax's is) to look for the largest value."""
+    """Return whether a sweeper was told (as Optuna's, Nevergrad's or Ax's is) to look for the
+    largest value."""
     direction = sweeper.get("direction")
     name = str(getattr(direction, "name", direction)).lower()
-    nevergrad, ax = (OmegaConf.select(sweeper, key) for key in ("optim.maximize", "ax_config.experiment.minimize"))
+    nevergrad, ax = (
+        OmegaConf.select(sweeper, key)
+        for key in ("optim.maximize", "ax_config.experiment.minimize")
+    )
     return name == "maximize" or nevergrad is True or ax is False
 
 
 def words_for_hydras_files(config: DictConfig, words: Sequence[str], multirun: bool) -> list[str]:
-    """The words by which Hydra writes its own files as in any app, if one of its folders or logs was asked for.
+    """The words by which Hydra writes its own files as in any app, if one of its folders or logs
+    was asked for.
 
     Otherwise Hydra writes nothing, since each trial's folder has its configuration and log.
     """
@@ -228,9 +276,13 @@ def words_for_hydras_files(config: DictConfig, words: Sequence[str], multirun: b
         added["hydra.sweep.subdir"] = "${hydra.job.num}"
     if multirun and config.hydra.runtime.choices["hydra/launcher"] == OWN:
         if config.launch.name == "serial":
-            added["hydra/launcher"] = "basic"  # runs one job after the other, with Hydra's files for each
+            # runs one job after the other, with Hydra's files for each
+            added["hydra/launcher"] = "basic"
         else:
-            log.info("launch=%s writes no files of Hydra's: each trial's folder has them", config.launch.name)
+            log.info(
+                "launch=%s writes no files of Hydra's: each trial's folder has them",
+                config.launch.name,
+            )
     return [f"{key}={value}" for key, value in added.items()]
 
 
@@ -244,24 +296,37 @@ def list_trials(trials: Sequence[Trial]) -> list[Outcome]:
 
 
 def check_sweep_settings(config: DictConfig, multirun: bool) -> None:
-    """Refuse settings of a sweep without a sweep, parameters that are no mapping, and a second launcher."""
+    """Refuse settings of a sweep without a sweep, parameters that are no mapping, and a second
+    launcher."""
     sweeper = config.hydra.sweeper
     params = sweeper.get("params")
     if not multirun and config.hydra.mode is None and (params or sweeper.get("grids")):
-        raise InputError("hydra.sweeper lists values: add -m to run a trial for each, or hydra.mode=RUN for one")
+        raise InputError(
+            "hydra.sweeper lists values: add -m to run a trial for each, or hydra.mode=RUN for one"
+        )
     if params is not None and not OmegaConf.is_dict(params):
-        raise InputError(f"hydra.sweeper.params={params} must map settings to values; seed=0,1 can be typed itself")
+        raise InputError(
+            f"hydra.sweeper.params={params} must map settings to values; seed=0,1 can be typed "
+            "itself"
+        )
     if config.launch.stop_when_decided and not multirun:
-        raise InputError("launch.stop_when_decided adds seeds to a sweep: add -m, two densifiers and seed=0,1,2,3")
+        raise InputError(
+            "launch.stop_when_decided adds seeds to a sweep: add -m, two densifiers and "
+            "seed=0,1,2,3"
+        )
     launcher = config.hydra.runtime.choices["hydra/launcher"]
     if launcher != OWN and not multirun:
         raise InputError(f"hydra/launcher={launcher} launches sweeps: add -m, or leave it out")
     if launcher != OWN and config.launch.name != "serial":
-        raise InputError(f"hydra/launcher={launcher} and launch={config.launch.name} are two launchers: choose one")
+        raise InputError(
+            f"hydra/launcher={launcher} and launch={config.launch.name} are two launchers: choose "
+            "one"
+        )
 
 
 def summarize(outcomes: Sequence[Outcome], trials: Sequence[Trial]) -> int:
-    """Report how the trials ended; returns 0 if all are done, 1 if some failed, 2 if all failed for bad input.
+    """Report how the trials ended; returns 0 if all are done, 1 if some failed, 2 if all failed for
+    bad input.
 
     A single trial's failure is raised, so that the program prints this one line only.
     """
@@ -287,19 +352,32 @@ def summarize(outcomes: Sequence[Outcome], trials: Sequence[Trial]) -> int:
 # ---- sweeps
 
 
-def run_sweep(sweep: Sweep, params: Mapping[str, Any], tune: Mapping[str, Any], words: Sequence[str]) -> None:
-    """Run all points that the ``words`` and ``params`` (``hydra.sweeper.params``) of the sweep span.
+def run_sweep(
+    sweep: Sweep, params: Mapping[str, Any], tune: Mapping[str, Any], words: Sequence[str]
+) -> None:
+    """Run all points that the ``words`` and ``params`` (``hydra.sweeper.params``) of the sweep
+    span.
 
-    ``tune`` (``hydra.sweeper.tune``) says how intervals among them are searched first (`gsbench.app.tuning`).
+    ``tune`` (``hydra.sweeper.tune``) says how intervals among them are searched first
+    (`gsbench.app.tuning`).
     """
     grids = checked_grids(sweep.task.grids or [])
     jobs: list[list[str]] = []
-    intervals: list[dict[str, Override]] = []  # for each job, the settings that are searched for its arm
+    # for each job, the settings that are searched for its arm
+    intervals: list[dict[str, Override]] = []
     for grid_words in words_of_grids(params, grids, words):
-        by_key = {bare_key(override.get_key_element()): override for override in sweep.parse(grid_words)}
-        points = grid_points([override for override in by_key.values() if not is_interval(override)])
+        by_key = {
+            bare_key(override.get_key_element()): override for override in sweep.parse(grid_words)
+        }
+        points = grid_points(
+            [override for override in by_key.values() if not is_interval(override)]
+        )
         jobs += points
-        searched = {override.get_key_element(): override for override in by_key.values() if is_interval(override)}
+        searched = {
+            override.get_key_element(): override
+            for override in by_key.values()
+            if is_interval(override)
+        }
         intervals += [searched] * len(points)
     trials = sweep.trials(tuned_jobs(sweep, tune, jobs, intervals))
     if any(trial.values["launch"]["stop_when_decided"] for trial in trials):
@@ -309,7 +387,8 @@ def run_sweep(sweep: Sweep, params: Mapping[str, Any], tune: Mapping[str, Any], 
 
 
 def _run_until_decided(sweep: Sweep, trials: Sequence[Trial]) -> None:
-    """Run the trials in the looks that the sequential test plans. Decided pairs of arms get no further trials.
+    """Run the trials in the looks that the sequential test plans. Decided pairs of arms get no
+    further trials.
 
     Raises InputError for a sweep that cannot be tested so.
     """
@@ -330,14 +409,18 @@ def _run_until_decided(sweep: Sweep, trials: Sequence[Trial]) -> None:
 
     for verdict in run_looks(stopping.declaration, stopping.judged, run):
         log.info("%s", headline(verdict))
-    spared = [trial for trial in trials if trial.folder not in launched and not (trial.folder / RESULTS).exists()]
+    spared = [
+        trial
+        for trial in trials
+        if trial.folder not in launched and not (trial.folder / RESULTS).exists()
+    ]
     log.info("%d of %d trials were not needed", len(spared), len(trials))
 
 
 # ---- grids
 #
-# An experiment's file may join several grids. Each maps settings to values, and all share the settings of
-# ``hydra.sweeper.params``:
+# An experiment's file may join several grids. Each maps settings to values, and all share the
+# settings of ``hydra.sweeper.params``:
 #
 #     hydra:
 #       mode: MULTIRUN
@@ -349,29 +432,38 @@ def _run_until_decided(sweep: Sweep, trials: Sequence[Trial]) -> None:
 #           - densify: volumetric
 #             densify.volume_threshold: 0.01,0.03
 #
-# If some grids list the setting of a word of the command line, the word replaces their values and does not reach the
-# other grids. Any other word is for all grids.
+# If some grids list the setting of a word of the command line, the word replaces their values and
+# does not reach the other grids. Any other word is for all grids.
 
 
 def checked_grids(grids: Any) -> list[dict[str, str]]:
-    """The grids of the configuration, with values as texts. Raises InputError unless they are a list of mappings."""
+    """The grids of the configuration, with values as texts. Raises InputError unless they are a
+    list of mappings."""
     if not isinstance(grids, list) or not all(isinstance(grid, dict) and grid for grid in grids):
-        raise InputError(f"{GRIDS} must be a list, each a mapping of settings to values, got {grids!r}")
+        raise InputError(
+            f"{GRIDS} must be a list, each a mapping of settings to values, got {grids!r}"
+        )
     return [{str(key): _text(key, value) for key, value in grid.items()} for grid in grids]
 
 
 def words_of_grids(
     params: Mapping[str, Any], grids: Sequence[Mapping[str, str]], given: Sequence[str]
 ) -> list[list[str]]:
-    """The words of each grid: its own, the shared ``params``, and the words ``given`` that are for it.
+    """The words of each grid: its own, the shared ``params``, and the words ``given`` that are for
+    it.
 
-    If two set one key, the later counts. Trials are in the order of the grids; the shared settings vary fastest.
+    If two set one key, the later counts. Trials are in the order of the grids; the shared settings
+    vary fastest.
     """
     listed = {bare_key(key) for grid in grids for key in grid}
     return [
         [
             *(f"{key}={value}" for key, value in grid.items()),
-            *(f"{key}={value}" for key, value in params.items() if bare_key(key) not in map(bare_key, grid)),
+            *(
+                f"{key}={value}"
+                for key, value in params.items()
+                if bare_key(key) not in map(bare_key, grid)
+            ),
             *(word for word in given if key_of(word) not in listed - set(map(bare_key, grid))),
         ]
         for grid in grids or [{}]
@@ -380,5 +472,7 @@ def words_of_grids(
 
 def _text(key: object, value: object) -> str:
     if value is None or isinstance(value, list | dict):
-        raise InputError(f"{GRIDS}: {key} must list values as on the command line, such as 1,2,3, got {value!r}")
+        raise InputError(
+            f"{GRIDS}: {key} must list values as on the command line, such as 1,2,3, got {value!r}"
+        )
     return value_text(value)

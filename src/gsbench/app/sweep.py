@@ -1,7 +1,9 @@
-"""A sweep that Hydra has started, and the task that runs a trial: what search and grids have in common.
+"""A sweep that Hydra has started, and the task that runs a trial: what search and grids have in
+common.
 
-Hydra's task function is `TrialTask`. gsbench's own sweeper hands all trials to it as one batch. Another launcher calls
-it for each job, perhaps in another process. Another sweeper proposes the jobs, and gets a value for each.
+Hydra's task function is `TrialTask`. gsbench's own sweeper hands all trials to it as one batch.
+Another launcher calls it for each job, perhaps in another process. Another sweeper proposes the
+jobs, and gets a value for each.
 """
 
 import copy
@@ -43,15 +45,17 @@ log = logging.getLogger(__name__)
 class Objective:
     """The value that another sweeper gets for a job: the mean of a metric over the job's seeds.
 
-    ``sign`` says what the sweeper looks for: the largest value (1) or the least (-1). A metric whose better direction
-    is the other one is negated. ``seeds`` are the words of the seeds, none for the job's own seed.
+    ``sign`` says what the sweeper looks for: the largest value (1) or the least (-1). A metric
+    whose better direction is the other one is negated. ``seeds`` are the words of the seeds, none
+    for the job's own seed.
     """
 
     sign: int
     seeds: tuple[str, ...] = ()
 
     def value(self, trials: Sequence[Trial]) -> float:
-        """The value of a job's ``trials``, which are done. Raises GsbenchError if one lacks the metric."""
+        """The value of a job's ``trials``, which are done. Raises GsbenchError if one lacks the
+        metric."""
         metric, direction = metric_of(trials[0].values)
         records = [trial.files.sound_record() for trial in trials]
         values = [record.metrics.get(metric) for record in records if record is not None]
@@ -62,11 +66,14 @@ class Objective:
 
 
 def metric_of(values: Mapping[str, Any]) -> tuple[str, int]:
-    """The metric that judges a trial (``eval.primary``, else PSNR), and 1 if more of it is better, else -1."""
+    """The metric that judges a trial (``eval.primary``, else PSNR), and 1 if more of it is better,
+    else -1."""
     metric = metric_and_question(str(values["eval"].get("primary") or ""))[0] or DEFAULT_METRIC
     direction = facts_for(metric, values).direction
     if not direction:
-        raise InputError(f"eval.primary={metric}: whether more or less of it is better is not known")
+        raise InputError(
+            f"eval.primary={metric}: whether more or less of it is better is not known"
+        )
     return metric, 1 if direction > 0 else -1
 
 
@@ -74,9 +81,10 @@ def metric_of(values: Mapping[str, Any]) -> tuple[str, int]:
 class TrialTask:
     """Hydra's task function: it gets a composed configuration and hands its trial to ``handle``.
 
-    ``handle`` runs trials; with ``look_only`` it only reports what would run. ``allowed`` is what the command line
-    permits, ``folder`` is where it was given, ``grids`` are the grids that gsbench's sweeper joins. ``objective`` is
-    for another sweeper. ``trials`` and ``outcomes`` collect all batches of a sweep.
+    ``handle`` runs trials; with ``look_only`` it only reports what would run. ``allowed`` is what
+    the command line permits, ``folder`` is where it was given, ``grids`` are the grids that
+    gsbench's sweeper joins. ``objective`` is for another sweeper. ``trials`` and ``outcomes``
+    collect all batches of a sweep.
     """
 
     handle: Callable[[Sequence[Trial]], list[Outcome]]
@@ -90,19 +98,29 @@ class TrialTask:
 
     def __reduce__(self) -> tuple[Any, ...]:
         # Pickled for another launcher's processes, which need nothing that was collected here.
-        return TrialTask, (self.handle, self.look_only, self.allowed, self.folder, None, self.objective)
+        return TrialTask, (
+            self.handle,
+            self.look_only,
+            self.allowed,
+            self.folder,
+            None,
+            self.objective,
+        )
 
     def __call__(self, config: DictConfig) -> float | None:
-        """Run one job. Called by Hydra or by another launcher, perhaps in another process; raises if it failed.
+        """Run one job. Called by Hydra or by another launcher, perhaps in another process; raises
+        if it failed.
 
         Returns the job's value for another sweeper, else None.
         """
-        # Paths of the command line start where it was given, also with hydra.job.chdir and on a node of a cluster.
+        # Paths of the command line start where it was given, also with hydra.job.chdir and on a
+        # node of a cluster.
         if Path(self.folder).is_dir():
             os.chdir(self.folder)
         allow_modules(self.allowed, self.folder)
         hydra: Any = HydraConfig.instance().cfg
-        # Checked again: the files that this job chooses may set other things of Hydra than the checked ones.
+        # Checked again: the files that this job chooses may set other things of Hydra than the
+        # checked ones.
         compose.check_permitted(hydra, self.allowed)
         has_log = bool(hydra.hydra.job_logging.get("root"))
         set_up_logging(hydra.hydra.verbose, has_log)
@@ -111,7 +129,9 @@ class TrialTask:
         seeds = self.objective.seeds if self.objective else ()
         trials = [compose.resolve_trial(config, [*hydra_words, *words])]
         if seeds:
-            trials = [self._trial_of_seed(config, word, [*hydra_words, *words, word]) for word in seeds]
+            trials = [
+                self._trial_of_seed(config, word, [*hydra_words, *words, word]) for word in seeds
+            ]
         for trial in trials if has_log else ():  # Hydra's log lies elsewhere
             log.info("the trial's folder is %s", trial.folder)
         if hydra.hydra.mode == RunMode.RUN:
@@ -141,7 +161,8 @@ class TrialTask:
 
 @dataclass(frozen=True)
 class Sweep:
-    """A sweep that Hydra has started: its configuration, its task, Hydra's context and the launcher."""
+    """A sweep that Hydra has started: its configuration, its task, Hydra's context and the
+    launcher."""
 
     config: DictConfig
     task: TrialTask
@@ -155,7 +176,9 @@ class Sweep:
         set_up_logging(config.hydra.verbose)
         config.allow_targets = list(task.allowed)
         compose.resolve_times(config)
-        launcher = Plugins.instance().instantiate_launcher(hydra_context=context, task_function=task, config=config)
+        launcher = Plugins.instance().instantiate_launcher(
+            hydra_context=context, task_function=task, config=config
+        )
         return cls(config, task, context, launcher)
 
     def parse(self, words: Sequence[str]) -> list[Override]:
@@ -171,41 +194,58 @@ class Sweep:
         return compose.compose_jobs(self.context.config_loader, self.config, jobs)
 
     def launch(self, trials: Sequence[Trial]) -> None:
-        """Run trials by the launcher. For another launcher than gsbench's, all trials are checked before the first."""
+        """Run trials by the launcher. For another launcher than gsbench's, all trials are checked
+        before the first."""
         name = self.config.hydra.runtime.choices["hydra/launcher"]
         if name == OWN or self.task.look_only:
             self.task.launch(trials)
             return
         assert self.launcher is not None
         begin_for_another_launcher(trials)
-        jobs = [[word for word in trial.overrides if not parse_word(word).is_hydra_override()] for trial in trials]
+        jobs = [
+            [word for word in trial.overrides if not parse_word(word).is_hydra_override()]
+            for trial in trials
+        ]
         try:
             returned = self.launcher.launch(jobs, initial_job_idx=len(self.task.trials))
         except GsbenchError:
             raise
         except Exception as error:
             message = " ".join(str(error).split()) or type(error).__name__
-            raise GsbenchError(f"hydra/launcher={name}: {message} (gsbench status tells how far it came)") from error
+            raise GsbenchError(
+                f"hydra/launcher={name}: {message} (gsbench status tells how far it came)"
+            ) from error
         self.task.trials += trials
-        self.task.outcomes += [_outcome(trial, ended) for trial, ended in zip(trials, returned, strict=True)]
+        self.task.outcomes += [
+            _outcome(trial, ended) for trial, ended in zip(trials, returned, strict=True)
+        ]
 
     def run_jobs(self, jobs: Sequence[Sequence[str]]) -> list[JobReturn]:
         """Run the jobs that another sweeper proposes as one batch; returns their values."""
         objective = self.task.objective
         assert objective is not None
         seeds = objective.seeds
-        trials = self.trials([[*job, *own] for job in jobs for own in ([[word] for word in seeds] or [[]])])
+        trials = self.trials(
+            [[*job, *own] for job in jobs for own in ([[word] for word in seeds] or [[]])]
+        )
         first = len(self.task.outcomes)
         self.task.launch(trials)
-        Path(self.config.hydra.sweep.dir).mkdir(parents=True, exist_ok=True)  # where sweepers write what they found
+        # where sweepers write what they found
+        Path(self.config.hydra.sweep.dir).mkdir(parents=True, exist_ok=True)
         outcomes = {outcome.folder: outcome for outcome in self.task.outcomes[first:]}
         size = max(1, len(seeds))
         own_trials = [trials[start : start + size] for start in range(0, len(trials), size)]
-        return [_returned(job, own, outcomes, objective) for job, own in zip(jobs, own_trials, strict=True)]
+        return [
+            _returned(job, own, outcomes, objective)
+            for job, own in zip(jobs, own_trials, strict=True)
+        ]
 
 
 def _returned(
-    job: Sequence[str], trials: Sequence[Trial], outcomes: Mapping[Path, Outcome], objective: Objective
+    job: Sequence[str],
+    trials: Sequence[Trial],
+    outcomes: Mapping[Path, Outcome],
+    objective: Objective,
 ) -> JobReturn:
     """What a launcher returns to another sweeper for a job."""
     returned = JobReturn(overrides=job)
@@ -221,5 +261,10 @@ def _returned(
 
 def _outcome(trial: Trial, returned: JobReturn) -> Outcome:
     """The outcome of a trial that another launcher ran."""
-    value: Any = returned._return_value  # the public property `return_value` would write a line to stderr
-    return outcome_of_error(trial.folder, value) if isinstance(value, Exception) else Outcome(trial.folder, "done")
+    # the public property `return_value` would write a line to stderr
+    value: Any = returned._return_value
+    return (
+        outcome_of_error(trial.folder, value)
+        if isinstance(value, Exception)
+        else Outcome(trial.folder, "done")
+    )

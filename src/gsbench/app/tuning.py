@@ -1,12 +1,14 @@
-"""Tuning parity: before a sweep's trials, each arm gets the same number of search points, on validation views.
+"""Tuning parity: before a sweep's trials, each arm gets the same number of search points, on
+validation views.
 
-Intervals among the words of the sweep or in its grids say what is tuned, and for which arms. An arm without intervals
-is not tuned. Each arm has its own search, whose points are trained in an experiment of its own, so that no table shows
-them. The first point is the arm's own values, if they lie in the intervals. The best point's values become words of the
-sweep's jobs.
+Intervals among the words of the sweep or in its grids say what is tuned, and for which arms. An arm
+without intervals is not tuned. Each arm has its own search, whose points are trained in an
+experiment of its own, so that no table shows them. The first point is the arm's own values, if they
+lie in the intervals. The best point's values become words of the sweep's jobs.
 
-Each search has an Optuna study in memory, whose proposals depend only on the results before them. After a kill, the
-same proposals are made again from the first, and finished trials are found in their folders.
+Each search has an Optuna study in memory, whose proposals depend only on the results before them.
+After a kill, the same proposals are made again from the first, and finished trials are found in
+their folders.
 """
 
 from __future__ import annotations
@@ -27,7 +29,13 @@ from pydantic import NonNegativeInt, PositiveInt
 
 from gsbench.app.sweep import DEFAULT_METRIC, Sweep
 from gsbench.claims.stopping import facts_for
-from gsbench.config.command_words import bare_key, check_makes_trials, grid_points, key_of, parse_word
+from gsbench.config.command_words import (
+    bare_key,
+    check_makes_trials,
+    grid_points,
+    key_of,
+    parse_word,
+)
 from gsbench.config.compose import Trial
 from gsbench.errors import GsbenchError, InputError
 from gsbench.eval.facts import known_keys
@@ -49,14 +57,17 @@ log = logging.getLogger(__name__)
 PLACE = "hydra.sweeper.tune"
 DEFAULT_POINTS = 20
 SEED = "seed"
-NOT_TUNED = ("scene", "eval", "launch", "tracking", "hydra")  # groups that say how all arms are run and judged
-REPLACED = (SEED, "name", "scene.validation", "eval.primary")  # settings that a point's trials have different values of
+# groups that say how all arms are run and judged
+NOT_TUNED = ("scene", "eval", "launch", "tracking", "hydra")
+# settings that a point's trials have different values of
+REPLACED = (SEED, "name", "scene.validation", "eval.primary")
 DIGITS = 4  # significant digits of a value, so that people can type it
 
 
 @dataclass(frozen=True)
 class TuneSettings:
-    """Settings of a tuning. ``points`` is the number for each arm; 0: nothing is tuned, and intervals are left out.
+    """Settings of a tuning. ``points`` is the number for each arm; 0: nothing is tuned, and
+    intervals are left out.
 
     ``seed`` lists the seeds of a point's trials. The sweep may have none of them.
     """
@@ -74,8 +85,9 @@ class TuneSettings:
 class ArmSearch:
     """The search for the values of an arm, in the experiment whose folder is ``home``.
 
-    ``record`` says what is searched and by which metric, and gets the judged points. ``jobs`` are the arm's jobs in the
-    sweep without the settings `REPLACED`. ``first`` are the arm's own values, None if they lie outside the ranges.
+    ``record`` says what is searched and by which metric, and gets the judged points. ``jobs`` are
+    the arm's jobs in the sweep without the settings `REPLACED`. ``first`` are the arm's own values,
+    None if they lie outside the ranges.
     """
 
     record: TuningRecord
@@ -92,7 +104,9 @@ class ArmSearch:
 
         optuna.logging.set_verbosity(optuna.logging.WARNING)
         sampler = optuna.samplers.TPESampler(seed=0, constant_liar=self.at_once > 1)
-        direction: Literal["maximize", "minimize"] = "maximize" if self.record.direction > 0 else "minimize"
+        direction: Literal["maximize", "minimize"] = (
+            "maximize" if self.record.direction > 0 else "minimize"
+        )
         study = optuna.create_study(direction=direction, sampler=sampler)
         if self.first is not None:
             study.enqueue_trial(dict(self.first))
@@ -105,7 +119,12 @@ class ArmSearch:
 
     def jobs_of(self, values: Mapping[str, Any]) -> list[list[str]]:
         """The words of a point's trials."""
-        own = [f"name={self.home.name}", "scene.validation=true", "eval.primary=null", *words_of_values(values)]
+        own = [
+            f"name={self.home.name}",
+            "scene.validation=true",
+            "eval.primary=null",
+            *words_of_values(values),
+        ]
         return [[*job, *own, f"{SEED}={seed}"] for job in self.jobs for seed in self.record.seeds]
 
     def value_of(self, trial: Trial) -> float | None:
@@ -114,24 +133,32 @@ class ArmSearch:
         return None if record is None else record.metrics.get(self.record.metric)
 
     def judge(self, proposal: Proposal, trials: Sequence[Trial]) -> SearchPoint:
-        """Judge a point by the mean of its trials. It has failed if one of them lacks the metric."""
+        """Judge a point by the mean of its trials. It has failed if one of them lacks the
+        metric."""
         from optuna.trial import TrialState
 
         values = [value for trial in trials if (value := self.value_of(trial)) is not None]
         mean = statistics.fmean(values) if len(values) == len(trials) else None
-        self.study.tell(proposal, mean, state=TrialState.FAIL if mean is None else TrialState.COMPLETE)
-        point = SearchPoint(settings={key: _rounded(value) for key, value in proposal.params.items()}, value=mean)
+        self.study.tell(
+            proposal, mean, state=TrialState.FAIL if mean is None else TrialState.COMPLETE
+        )
+        point = SearchPoint(
+            settings={key: _rounded(value) for key, value in proposal.params.items()}, value=mean
+        )
         self.record.points.append(point)
         return point
 
 
 def tuned_jobs(
-    sweep: Sweep, settings: Any, jobs: Sequence[Sequence[str]], intervals: Sequence[Mapping[str, Override]]
+    sweep: Sweep,
+    settings: Any,
+    jobs: Sequence[Sequence[str]],
+    intervals: Sequence[Mapping[str, Override]],
 ) -> list[list[str]]:
     """Tune each arm in the ``intervals`` of its jobs; returns the jobs with the values found.
 
-    Raises InputError for wrong ``settings`` (``hydra.sweeper.tune``) or intervals, and GsbenchError if no point of an
-    arm could be judged.
+    Raises InputError for wrong ``settings`` (``hydra.sweeper.tune``) or intervals, and GsbenchError
+    if no point of an arm could be judged.
     """
     given: Any = OmegaConf.to_container(OmegaConf.create(settings))
     tune = TuneSettings(**check_values(TuneSettings, given, PLACE))
@@ -146,17 +173,24 @@ def tuned_jobs(
     if sweep.task.look_only:
         print(_describe(searches))
     if not _search(sweep, list(tuned.values())):
-        print(f"then the trials of the sweep ({len(jobs)}) with the values found, which are not known yet")
+        print(
+            f"then the trials of the sweep ({len(jobs)}) with the values found, which are not "
+            "known yet"
+        )
         sweep.task.handle = lambda trials: []  # trials with other values are not listed
         return untuned
     best_words = {arm: _best_words(search) for arm, search in tuned.items()}
-    return [[*job, *best_words.get(trial.folder.parent.name, ())] for job, trial in zip(jobs, trials, strict=True)]
+    return [
+        [*job, *best_words.get(trial.folder.parent.name, ())]
+        for job, trial in zip(jobs, trials, strict=True)
+    ]
 
 
 def _search(sweep: Sweep, searches: Sequence[ArmSearch]) -> bool:
     """Propose, train and judge the points of all arms side by side.
 
-    A dry run judges only points whose trials are done already; it returns False at the first that is not.
+    A dry run judges only points whose trials are done already; it returns False at the first that
+    is not.
     """
     while proposals := [(search, proposal) for search in searches for proposal in search.propose()]:
         jobs_by_point = [search.jobs_of(proposal.params) for search, proposal in proposals]
@@ -166,7 +200,9 @@ def _search(sweep: Sweep, searches: Sequence[ArmSearch]) -> bool:
             (search, proposal, [next(trials) for _ in jobs])
             for (search, proposal), jobs in zip(proposals, jobs_by_point, strict=True)
         ]
-        missing = [trial for search, _, own in points for trial in own if search.value_of(trial) is None]
+        missing = [
+            trial for search, _, own in points for trial in own if search.value_of(trial) is None
+        ]
         if missing and sweep.task.look_only:
             return False
         if missing:
@@ -176,7 +212,10 @@ def _search(sweep: Sweep, searches: Sequence[ArmSearch]) -> bool:
             point = search.judge(proposal, own)
             if missing:
                 value = "failed" if point.value is None else f"{point.value:.5g}"
-                settings, number = ", ".join(words_of_values(point.settings)), len(search.record.points)
+                settings, number = (
+                    ", ".join(words_of_values(point.settings)),
+                    len(search.record.points),
+                )
                 title = f"{search.home.name}: point {number} of {search.record.wanted}"
                 log.info("%s: %s: %s %s", title, settings, search.record.metric, value)
     if not sweep.task.look_only:
@@ -196,24 +235,40 @@ def _best_words(search: ArmSearch) -> list[str]:
     """The words of the best point of an arm. Raises GsbenchError if no point has the metric."""
     record, best, name = search.record, search.record.best, search.home.name
     if best is None:
-        raise GsbenchError(f"{PLACE}: no point of {record.arm} has a {record.metric} (gsbench status {name} says why)")
+        raise GsbenchError(
+            f"{PLACE}: no point of {record.arm} has a {record.metric} (gsbench status {name} says "
+            "why)"
+        )
     words = words_of_values(best.settings)
     failed = sum(point.value is None for point in record.points)
     count = counted(len(record.points), "point") + (f", {failed} failed" if failed else "")
     where = " ".join(words)
-    log.info("search: best %s %.5g at %s (%s); gsbench report %s", record.metric, best.value, where, count, name)
+    log.info(
+        "search: best %s %.5g at %s (%s); gsbench report %s",
+        record.metric,
+        best.value,
+        where,
+        count,
+        name,
+    )
     return words
 
 
 def _describe(searches: Sequence[ArmSearch]) -> str:
     """The line in which a dry run describes the searches."""
     first = searches[0].record
-    trials = {search.record.arm: len(search.jobs) * len(first.seeds) for search in searches if search.ranges}
+    trials = {
+        search.record.arm: len(search.jobs) * len(first.seeds)
+        for search in searches
+        if search.ranges
+    }
     untuned = [search.record.arm for search in searches if not search.ranges]
     return (
-        f"a search tunes first: {counted(first.wanted, 'point')} each for {listed(list(trials))}, by {first.metric} "
+        f"a search tunes first: {counted(first.wanted, 'point')} each for {listed(list(trials))}, "
+        f"by {first.metric} "
         f"of validation views on {listed(first.scenes)} with {counted(len(first.seeds), 'seed')}, "
-        f"{sum(trials.values()) * first.wanted} trainings" + (f"; not tuned: {listed(untuned)}" if untuned else "")
+        f"{sum(trials.values()) * first.wanted} trainings"
+        + (f"; not tuned: {listed(untuned)}" if untuned else "")
     )
 
 
@@ -234,20 +289,32 @@ def _plan(
         raise InputError(f"a search needs Optuna: {install_command('search')}")
     homes = {trial.files.home for trial in trials}
     if len(homes) > 1:
-        raise InputError(f"{PLACE}: all trials of the sweep need one name, got {listed(sorted(h.name for h in homes))}")
+        raise InputError(
+            f"{PLACE}: all trials of the sweep need one name, got "
+            f"{listed(sorted(h.name for h in homes))}"
+        )
     if any(trial.values["scene"]["validation"] for trial in trials):
-        raise InputError(f"{PLACE} searches on validation views by itself: leave scene.validation out")
+        raise InputError(
+            f"{PLACE} searches on validation views by itself: leave scene.validation out"
+        )
     metric, direction, seeds = _goal(tune, trials)
     (home,) = homes
     arms = [trial.folder.parent.name for trial in trials]
     searches = []
     for arm in dict.fromkeys(arms):
         indices = [index for index, name in enumerate(arms) if name == arm]
-        arm_intervals = dict(sorted((key, interval) for i in indices for key, interval in intervals[i].items()))
-        arm_jobs = [tuple(word for word in jobs[i] if key_of(word) not in REPLACED) for i in indices]
+        arm_intervals = dict(
+            sorted((key, interval) for i in indices for key, interval in intervals[i].items())
+        )
+        arm_jobs = [
+            tuple(word for word in jobs[i] if key_of(word) not in REPLACED) for i in indices
+        ]
         fixed = {key_of(word) for job in arm_jobs for word in job}
         if both := next((key for key in arm_intervals if bare_key(key) in fixed), None):
-            raise InputError(f"{both} of {arm} is searched in one grid and given in another: leave one of them out")
+            raise InputError(
+                f"{both} of {arm} is searched in one grid and given in another: leave one of them "
+                "out"
+            )
         ranges = {key: distribution(interval) for key, interval in arm_intervals.items()}
         first = _own_values(trials[indices[0]].values, ranges)
         record = TuningRecord(
@@ -258,12 +325,17 @@ def _plan(
             wanted=tune.points,
             seeds=seeds,
             scenes=list(dict.fromkeys(trial.values["scene"]["name"] for trial in trials)),
-            ranges={key: str(interval.input_line).partition("=")[2] for key, interval in arm_intervals.items()},
+            ranges={
+                key: str(interval.input_line).partition("=")[2]
+                for key, interval in arm_intervals.items()
+            },
             log=[key for key, values in ranges.items() if getattr(values, "log", False)],
             points=[],
         )
         own_home = home.with_name(f"{home.name}-tune-{arm}")
-        searches.append(ArmSearch(record, own_home, tune.at_once, ranges, list(dict.fromkeys(arm_jobs)), first))
+        searches.append(
+            ArmSearch(record, own_home, tune.at_once, ranges, list(dict.fromkeys(arm_jobs)), first)
+        )
     return searches
 
 
@@ -277,16 +349,28 @@ def _goal(tune: TuneSettings, trials: Sequence[Trial]) -> tuple[str, Literal[-1,
     metric = tune.metric or primary or DEFAULT_METRIC
     known = (*known_keys(), *(values["eval"].get("extra") or ()))
     if metric not in known:
-        raise InputError(f"{PLACE}.metric={metric}: there is no such metric{did_you_mean(metric, known)}")
+        raise InputError(
+            f"{PLACE}.metric={metric}: there is no such metric{did_you_mean(metric, known)}"
+        )
     sign = facts_for(metric, values).direction
     if not sign:
-        raise InputError(f"{PLACE}.metric={metric}: whether more or less of it is better is not known")
+        raise InputError(
+            f"{PLACE}.metric={metric}: whether more or less of it is better is not known"
+        )
     try:
-        seeds = [int(word.partition("=")[2]) for (word,) in grid_points([parse_word(f"{SEED}={tune.seed}")])]
+        seeds = [
+            int(word.partition("=")[2])
+            for (word,) in grid_points([parse_word(f"{SEED}={tune.seed}")])
+        ]
     except ValueError:
-        raise InputError(f"{PLACE}.seed must list whole numbers, as 100,101, got {tune.seed!r}") from None
+        raise InputError(
+            f"{PLACE}.seed must list whole numbers, as 100,101, got {tune.seed!r}"
+        ) from None
     if both := sorted(set(seeds) & {trial.values["seed"] for trial in trials}):
-        raise InputError(f"{PLACE}.seed: {listed(list(map(str, both)))} is a seed of the sweep, too: tune with others")
+        raise InputError(
+            f"{PLACE}.seed: {listed(list(map(str, both)))} is a seed of the sweep, too: tune with "
+            "others"
+        )
     return metric, 1 if sign > 0 else -1, seeds
 
 
@@ -294,7 +378,8 @@ def _goal(tune: TuneSettings, trials: Sequence[Trial]) -> tuple[str, Literal[-1,
 
 
 def distribution(override: Override) -> BaseDistribution:
-    """The range of an interval, for Optuna. Raises InputError for a wrong interval or a setting that arms share."""
+    """The range of an interval, for Optuna. Raises InputError for a wrong interval or a setting
+    that arms share."""
     from optuna.distributions import FloatDistribution, IntDistribution
 
     check_makes_trials(override)
@@ -317,23 +402,38 @@ def distribution(override: Override) -> BaseDistribution:
         raise InputError(f"{override.input_line}: {error}") from error
 
 
-def _own_values(values: Mapping[str, Any], ranges: Mapping[str, BaseDistribution]) -> dict[str, Any] | None:
-    """The arm's own values of the searched settings; None if one lies outside its range, or nothing is searched."""
+def _own_values(
+    values: Mapping[str, Any], ranges: Mapping[str, BaseDistribution]
+) -> dict[str, Any] | None:
+    """The arm's own values of the searched settings; None if one lies outside its range, or nothing
+    is searched."""
     settings = flatten(values)
     own = {key: settings.get(bare_key(key)) for key in ranges}
-    return own if own and all(_is_in(own[key], searched) for key, searched in ranges.items()) else None
+    return (
+        own if own and all(_is_in(own[key], searched) for key, searched in ranges.items()) else None
+    )
 
 
 def _is_in(value: Any, searched: Any) -> bool:
-    """Return whether the range ``searched`` contains a value that rounding to `DIGITS` leaves as it is."""
-    if isinstance(value, bool) or not isinstance(value, int | float) or not searched.low <= value <= searched.high:
+    """Return whether the range ``searched`` contains a value that rounding to `DIGITS` leaves as it
+    is."""
+    if (
+        isinstance(value, bool)
+        or not isinstance(value, int | float)
+        or not searched.low <= value <= searched.high
+    ):
         return False
-    return isinstance(value, int) if isinstance(searched.low, int) else _rounded(float(value)) == value
+    return (
+        isinstance(value, int) if isinstance(searched.low, int) else _rounded(float(value)) == value
+    )
 
 
 def words_of_values(values: Mapping[str, Any]) -> list[str]:
     """The words of a command line that set ``values``."""
-    return [f"{key}={f'{value:.{DIGITS}g}' if isinstance(value, float) else value}" for key, value in values.items()]
+    return [
+        f"{key}={f'{value:.{DIGITS}g}' if isinstance(value, float) else value}"
+        for key, value in values.items()
+    ]
 
 
 def _rounded(value: Any) -> Any:

@@ -1,4 +1,5 @@
-"""Comparison of rasterizers: training steps in parts, whole training steps, and frames as in a viewer."""
+"""Comparison of rasterizers: training steps in parts, whole training steps, and frames as in a
+viewer."""
 
 import itertools
 import statistics
@@ -27,12 +28,15 @@ from gsbench.train.trainer import Trainer
 WARM_UP_STEPS = 2  # they compile kernels and fill memory pools
 SH_DEGREE = 3
 NEVER = 10**9  # iterations
-# Learning rate: Adam does its work, but the scene does not change. Not smaller: its products would fall below float32's
-# normal range, where Intel processors need some 150 cycles per operation (at 1e-30 Adam took 35 ms for 6).
+# Learning rate: Adam does its work, but the scene does not change. Not smaller: its products would
+# fall below float32's normal range, where Intel processors need some 150 cycles per operation (at
+# 1e-30 Adam took 35 ms for 6).
 ZERO_RATE = 1e-20
-STEPS_AT_ONCE = {"cpu": 1, "cuda": 10}  # whole steps between two readings of the clock and of the losses
+# whole steps between two readings of the clock and of the losses
+STEPS_AT_ONCE = {"cpu": 1, "cuda": 10}
 LONGEST_KERNELS = 12  # that get a name of their own
-# Calls of CUDA's runtime in which the host waits for the GPU. A copy waits only if it goes to pageable memory.
+# Calls of CUDA's runtime in which the host waits for the GPU. A copy waits only if it goes to
+# pageable memory.
 WAITING_CALLS = (
     "cudaStreamSynchronize",
     "cudaDeviceSynchronize",
@@ -56,7 +60,8 @@ class Setting:
 
 
 class Stepper:
-    """A training of ``setting`` with the rasterizer ``raster``, an executor's name or the import path of a class."""
+    """A training of ``setting`` with the rasterizer ``raster``, an executor's name or the import
+    path of a class."""
 
     def __init__(self, raster: str, setting: Setting) -> None:
         self.threads = setting.threads or torch.get_num_threads()
@@ -64,7 +69,9 @@ class Stepper:
         self.device = device_of(raster)
         if self.device.type == "cuda":
             disable_tf32()
-        gaussians, scene = make_scene(setting.scene, setting.width, setting.height, setting.count, setting.ply)
+        gaussians, scene = make_scene(
+            setting.scene, setting.width, setting.height, setting.count, setting.ply
+        )
         self.count = len(gaussians)
         self.trainer = Trainer(
             scene,
@@ -101,7 +108,8 @@ class Stepper:
         }
 
     def steps_per_second(self) -> float:
-        """The speed of whole training steps: view, render, loss, backward, statistics, Adam, losses read at times."""
+        """The speed of whole training steps: view, render, loss, backward, statistics, Adam, losses
+        read at times."""
         steps = STEPS_AT_ONCE[self.device.type]
         begin = self._now()
         for _ in range(steps):
@@ -119,7 +127,8 @@ class Stepper:
         return frames / (self._now() - begin)
 
     def profiled_steps(self) -> dict[str, dict[str, float]]:
-        """The kernels of whole training steps, and the host's waits for them, as `per_step` describes them."""
+        """The kernels of whole training steps, and the host's waits for them, as `per_step`
+        describes them."""
         steps = STEPS_AT_ONCE[self.device.type]
         gpu = [ProfilerActivity.CUDA] if self.device.type == "cuda" else []
         self._now()
@@ -135,11 +144,14 @@ class Stepper:
         return time.perf_counter()
 
 
-def per_step(events: Iterable[Any], steps: int, device: torch.device) -> dict[str, dict[str, float]]:
+def per_step(
+    events: Iterable[Any], steps: int, device: torch.device
+) -> dict[str, dict[str, float]]:
     """Times of one step, from what torch's profiler recorded on ``device`` in ``steps`` steps.
 
-    ``kernels_ms``: the time of each kernel, the longest first; on a CPU, the own time of each of torch's operators.
-    ``waits_ms``: the host's time in each of `WAITING_CALLS`. ``waits``: how often it makes that call.
+    ``kernels_ms``: the time of each kernel, the longest first; on a CPU, the own time of each of
+    torch's operators. ``waits_ms``: the host's time in each of `WAITING_CALLS`. ``waits``: how
+    often it makes that call.
     """
     on_gpu = device.type == "cuda"
     kind = "CUDA" if on_gpu else "CPU"
@@ -160,7 +172,8 @@ def per_step(events: Iterable[Any], steps: int, device: torch.device) -> dict[st
 
 
 def device_of(raster: str) -> torch.device:
-    """The device for timing ``raster``: a GPU if it needs one, or if it is a user's class and there is a GPU."""
+    """The device for timing ``raster``: a GPU if it needs one, or if it is a user's class and there
+    is a GPU."""
     if "." in raster:
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     device = torch.device("cpu" if find_executor(raster).runs_on("cpu") else "cuda")
@@ -170,15 +183,29 @@ def device_of(raster: str) -> torch.device:
 
 
 def make_rasterizer(raster: str, device: torch.device, threads: int) -> Rasterizer:
-    """Make the executor called ``raster``, or the class at that import path, which the user has typed and so trusts."""
-    own = build_own_rasterizer({"_target_": raster}, [raster.partition(".")[0]]) if "." in raster else None
+    """Make the executor called ``raster``, or the class at that import path, which the user has
+    typed and so trusts."""
+    own = (
+        build_own_rasterizer({"_target_": raster}, [raster.partition(".")[0]])
+        if "." in raster
+        else None
+    )
     return create_rasterizer(raster, device, threads) if own is None else own
 
 
 def constant_scene_options() -> TrainConfig:
     """Options of a training that does not end and does not change the Gaussians."""
-    rates = ("position_initial", "position_final", "sh_dc", "sh_rest", "opacity", "scale", "rotation")
-    return TrainConfig(name="bench", iterations=NEVER, sh_interval=1, **dict.fromkeys(rates, ZERO_RATE))  # type: ignore[arg-type]
+    rates = (
+        "position_initial",
+        "position_final",
+        "sh_dc",
+        "sh_rest",
+        "opacity",
+        "scale",
+        "rotation",
+    )
+    zero: dict[str, Any] = dict.fromkeys(rates, ZERO_RATE)
+    return TrainConfig(name="bench", iterations=NEVER, sh_interval=1, **zero)
 
 
 def peak_memory(raster: str, setting: Setting) -> float:
@@ -202,19 +229,22 @@ def run_bench(
     scene: str = "trained",
     kernels: bool = False,
 ) -> list[dict[str, Any]]:
-    """Time the training step with each of ``rasters`` for each image size (width, height) and count of Gaussians.
+    """Time the training step with each of ``rasters`` for each image size (width, height) and count
+    of Gaussians.
 
-    The rasterizers take turns, step by step. Times are medians over ``repeats``, in ms. With ``ply``, that model is
-    timed instead of ``counts``. Raises InputError for a rasterizer that cannot run here. Columns:
+    The rasterizers take turns, step by step. Times are medians over ``repeats``, in ms. With
+    ``ply``, that model is timed instead of ``counts``. Raises InputError for a rasterizer that
+    cannot run here. Columns:
 
-    - ``step_ms``: the whole step, which consists of ``forward_ms`` (render), ``loss_ms``, ``backward_ms`` (of loss and
-      render) and ``adam_ms``;
+    - ``step_ms``: the whole step, which consists of ``forward_ms`` (render), ``loss_ms``,
+      ``backward_ms`` (of loss and render) and ``adam_ms``;
     - ``cpu_ms``: processor time of the step on all threads;
-    - ``step_ratio``: median over the turns of ``step_ms`` divided by that of the first of ``rasters``;
+    - ``step_ratio``: median over the turns of ``step_ms`` divided by that of the first of
+      ``rasters``;
     - ``steps_per_second``: whole training steps, without waits in between;
     - ``fps``: frames per second of rendering alone;
-    - ``peak_memory_mb``: of a fresh process that makes the same steps (on a GPU: torch's allocations there); None if
-      ``memory`` is False;
+    - ``peak_memory_mb``: of a fresh process that makes the same steps (on a GPU: torch's
+      allocations there); None if ``memory`` is False;
     - with ``kernels``, also the columns of `per_step`, of steps that are not timed otherwise.
     """
     rows = []
@@ -227,7 +257,12 @@ def run_bench(
 
 
 def _compare(
-    rasters: list[str], setting: Setting, repeats: int, memory: bool, kernels: bool, report: Progress
+    rasters: list[str],
+    setting: Setting,
+    repeats: int,
+    memory: bool,
+    kernels: bool,
+    report: Progress,
 ) -> list[dict[str, Any]]:
     model = f"{setting.count:,} Gaussians" if setting.ply is None else setting.ply.name
     what, turns = f"{setting.width}x{setting.height}, {model}", WARM_UP_STEPS + repeats
@@ -237,7 +272,10 @@ def _compare(
         for raster, stepper in steppers.items():
             report(what, repeat, turns, raster)
             sample = stepper.step()
-            sample |= {"steps_per_second": stepper.steps_per_second(), "fps": stepper.frames_per_second()}
+            sample |= {
+                "steps_per_second": stepper.steps_per_second(),
+                "fps": stepper.frames_per_second(),
+            }
             if repeat >= WARM_UP_STEPS:
                 samples[raster].append(sample)
     rows = []
@@ -250,7 +288,10 @@ def _compare(
             "size": f"{setting.width}x{setting.height}",
             "count": stepper.count,
         }
-        row |= {key: round(statistics.median(s[key] for s in samples[raster]), 3) for key in samples[raster][0]}
+        row |= {
+            key: round(statistics.median(s[key] for s in samples[raster]), 3)
+            for key in samples[raster][0]
+        }
         row |= {"threads": stepper.threads, "device": stepper.device.type, "peak_memory_mb": None}
         rows.append(row | (stepper.profiled_steps() if kernels else {}))
     del steppers, stepper  # frees memory for the processes below

@@ -1,4 +1,5 @@
-"""Scenes for timing: synthetic Gaussians, the same on every machine, or a trained model; and a camera for them."""
+"""Scenes for timing: synthetic Gaussians, the same on every machine, or a trained model; and a
+camera for them."""
 
 import math
 from pathlib import Path
@@ -16,28 +17,38 @@ SEED = 0
 FOCAL = 0.9  # of the image width
 VIEWS = 2
 FIRST_DEPTH, DEPTH_RATIO = 2.0, 12.0  # trained-like scene: least depth, and largest / least depth
-# Standard deviation of the median Gaussian of 100,000, in units of depth: 1.6 px in an image 500 px wide.
+# Standard deviation of the median Gaussian of 100,000, in units of depth: 1.6 px in an image 500 px
+# wide.
 MEDIAN_SIGMA = 1.6 / (FOCAL * 500)
 SIGMA_EXPONENT = 0.4  # sigma is proportional to count^-0.4: many Gaussians are smaller
 SIGMA_SPREAD = 0.7  # standard deviation of log sigma
-# Skewed scene; for comparison, a trained courtyard has 117 entries per block on average, and at most 1,054.
-SPOTS, SPOT_SHARE, SPOT_RADIUS = 40, 0.5, 0.05  # number; share of Gaussians; standard deviation of x/z and y/z
+# Skewed scene; for comparison, a trained courtyard has 117 entries per block on average, and at
+# most 1,054.
+# number; share of Gaussians; standard deviation of x/z and y/z
+SPOTS, SPOT_SHARE, SPOT_RADIUS = 40, 0.5, 0.05
 BOX_DEPTH, BOX_SIDE = 4.0, 4.0  # random scene: depth of its centre, and side
 NEIGHBOUR = 0.7  # distance to the nearest neighbours in units of count^-1/3, approximately
 INITIAL_OPACITY = 0.1  # 3DGS
 
 
 def trained_like_gaussians(count: int, seed: int = SEED) -> Gaussians:
-    """Make ``count`` Gaussians like those of a trained model: many small and flat, few large, with varied opacities.
+    """Make ``count`` Gaussians like those of a trained model: many small and flat, few large, with
+    varied opacities.
 
     They fill the view of `frontal_camera` and a margin around it.
     """
     generator = _generator(count, seed)
-    depth = FIRST_DEPTH * torch.exp(torch.rand(count, generator=generator) * math.log(DEPTH_RATIO))  # [N]
-    slopes = (torch.rand(count, 2, generator=generator) - 0.5) * torch.tensor([1.4, 1.05])  # [N, 2] x/z, y/z
+    depth = FIRST_DEPTH * torch.exp(
+        torch.rand(count, generator=generator) * math.log(DEPTH_RATIO)
+    )  # [N]
+    slopes = (torch.rand(count, 2, generator=generator) - 0.5) * torch.tensor(
+        [1.4, 1.05]
+    )  # [N, 2] x/z, y/z
     spread = torch.exp(SIGMA_SPREAD * torch.randn(count, generator=generator))
     sigma = MEDIAN_SIGMA * (100_000 / count) ** SIGMA_EXPONENT * spread * depth
-    shape = 0.5 * torch.randn(count, 3, generator=generator) - torch.tensor([0.0, 0.0, 1.5])  # [N, 3] flat
+    shape = 0.5 * torch.randn(count, 3, generator=generator) - torch.tensor(
+        [0.0, 0.0, 1.5]
+    )  # [N, 3] flat
     return Gaussians(
         means=torch.cat([slopes * depth[:, None], depth[:, None]], 1),
         log_scales=sigma.log()[:, None] + shape,
@@ -49,8 +60,8 @@ def trained_like_gaussians(count: int, seed: int = SEED) -> Gaussians:
 
 
 def random_gaussians(count: int, seed: int = SEED) -> Gaussians:
-    """Make ``count`` Gaussians like those at the start of a training: faint spheres of equal size in a box in front of
-    `frontal_camera`. Their size is the distance to their neighbours.
+    """Make ``count`` Gaussians like those at the start of a training: faint spheres of equal size
+    in a box in front of `frontal_camera`. Their size is the distance to their neighbours.
     """
     generator = _generator(count, seed)
     means = BOX_SIDE * (torch.rand(count, 3, generator=generator) - 0.5)
@@ -66,15 +77,18 @@ def random_gaussians(count: int, seed: int = SEED) -> Gaussians:
 
 
 def skewed_gaussians(count: int, seed: int = SEED) -> Gaussians:
-    """Make `trained_like_gaussians`, but move half of them to a few spots of the image, most to the first ones, like
-    detail in photographs.
+    """Make `trained_like_gaussians`, but move half of them to a few spots of the image, most to the
+    first ones, like detail in photographs.
 
-    The longest list of a tile is eight to nine times the mean; without the spots it is 1.3 times the mean.
+    The longest list of a tile is eight to nine times the mean; without the spots it is 1.3 times
+    the mean.
     """
     gaussians = trained_like_gaussians(count, seed)
     generator = _generator(count, seed + 1)
     weights = 1 / torch.arange(1, SPOTS + 1)  # Zipf's
-    spots = (torch.rand(SPOTS, 2, generator=generator) - 0.5) * torch.tensor([1.0, 0.7])  # [S, 2] x/z, y/z
+    spots = (torch.rand(SPOTS, 2, generator=generator) - 0.5) * torch.tensor(
+        [1.0, 0.7]
+    )  # [S, 2] x/z, y/z
     chosen = torch.multinomial(weights, count, replacement=True, generator=generator)  # [N]
     slopes = spots[chosen] + SPOT_RADIUS * torch.randn(count, 2, generator=generator)  # [N, 2]
     moved = torch.rand(count, generator=generator) < SPOT_SHARE  # [N]
@@ -86,8 +100,11 @@ def skewed_gaussians(count: int, seed: int = SEED) -> Gaussians:
 SCENES = {"trained": trained_like_gaussians, "random": random_gaussians, "skewed": skewed_gaussians}
 
 
-def make_scene(kind: str, width: int, height: int, count: int, ply: Path | None = None) -> tuple[Gaussians, Scene]:
-    """Make Gaussians, from the model ``ply`` or of a ``kind`` in `SCENES`, and a scene of noise images for them."""
+def make_scene(
+    kind: str, width: int, height: int, count: int, ply: Path | None = None
+) -> tuple[Gaussians, Scene]:
+    """Make Gaussians, from the model ``ply`` or of a ``kind`` in `SCENES`, and a scene of noise
+    images for them."""
     if ply is not None:
         gaussians = read_ply(ply)
         camera = camera_before(gaussians, width, height)
@@ -97,7 +114,9 @@ def make_scene(kind: str, width: int, height: int, count: int, ply: Path | None 
         raise InputError(f"--scene {kind} is not known; choose {' or '.join(SCENES)}")
     noise = np.random.default_rng(SEED)
     images = [noise.integers(0, 256, (height, width, 3), dtype=np.uint8) for _ in range(VIEWS)]
-    return gaussians, Scene("bench", tuple(View(f"{k}.png", camera, image) for k, image in enumerate(images)), ())
+    return gaussians, Scene(
+        "bench", tuple(View(f"{k}.png", camera, image) for k, image in enumerate(images)), ()
+    )
 
 
 def frontal_camera(width: int, height: int) -> Camera:
@@ -106,7 +125,8 @@ def frontal_camera(width: int, height: int) -> Camera:
 
 
 def camera_before(scene: Gaussians, width: int, height: int) -> Camera:
-    """A camera that looks along z at the middle of ``scene`` from twice the median distance of its Gaussians."""
+    """A camera that looks along z at the middle of ``scene`` from twice the median distance of its
+    Gaussians."""
     center: Tensor = scene.means.median(0).values  # [3]
     distance = (scene.means - center).norm(dim=-1).median().item()
     return _along_z(width, height, -center.double().numpy() + np.array([0.0, 0.0, 2 * distance]))

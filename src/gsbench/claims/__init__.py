@@ -1,1 +1,2 @@
-"""Claims and their verdicts: questions declared first, seeds added until they are decided, results of many pooled."""
+"""Claims and their verdicts: questions declared first, seeds added until they are decided, results
+of many pooled."""

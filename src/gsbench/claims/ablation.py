@@ -1,8 +1,10 @@
-"""Ablation of a densifier: its switches, the runs of all their combinations, and the verdicts on them.
+"""Ablation of a densifier: its switches, the runs of all their combinations, and the verdicts on
+them.
 
-A switch turns one part of the densifier off by its ``off`` settings; as configured, all switches are on. The class
-(``SWITCHES``), the YAML file (``switches``) or the command line declares it. A switch may have no effect while another
-is off (the scales of children if nothing is split). Runs that differ only in such switches are trained once.
+A switch turns one part of the densifier off by its ``off`` settings; as configured, all switches
+are on. The class (``SWITCHES``), the YAML file (``switches``) or the command line declares it. A
+switch may have no effect while another is off (the scales of children if nothing is split). Runs
+that differ only in such switches are trained once.
 """
 
 import itertools
@@ -26,14 +28,16 @@ TrialKeys = Mapping[str, str]  # scene -> folder of a run's trials, without the 
 
 
 def declared_switches(own: Mapping[str, Switch], values: Mapping[str, Any]) -> dict[str, Switch]:
-    """The switches of a densifier's class (``own``) and of its settings, without those whose ``off`` settings hold
-    already.
+    """The switches of a densifier's class (``own``) and of its settings, without those whose
+    ``off`` settings hold already.
 
     Raises InputError for a malformed switch.
     """
     in_settings = values.get("switches") or {}
     if not isinstance(in_settings, Mapping):
-        raise InputError(f"densify.switches must be a mapping NAME: {{off: {{KEY: VALUE}}}}, got {in_settings!r}")
+        raise InputError(
+            f"densify.switches must be a mapping NAME: {{off: {{KEY: VALUE}}}}, got {in_settings!r}"
+        )
     switches = dict(own)
     for name, entry in in_settings.items():
         where = f"densify.switches.{name}"
@@ -47,7 +51,9 @@ def declared_switches(own: Mapping[str, Switch], values: Mapping[str, Any]) -> d
     }
 
 
-def choose_switches(declared: Mapping[str, Switch], names: Sequence[str], densify: str) -> dict[str, Switch]:
+def choose_switches(
+    declared: Mapping[str, Switch], names: Sequence[str], densify: str
+) -> dict[str, Switch]:
     """The declared switches of these names, by default all.
 
     Raises InputError for an unknown name, if no switch is declared, and for too many switches.
@@ -55,22 +61,27 @@ def choose_switches(declared: Mapping[str, Switch], names: Sequence[str], densif
     for name in names:
         if name not in declared:
             raise InputError(
-                f"{name!r} is not a switch of densify={densify}{did_you_mean(name, declared)} (there are "
+                f"{name!r} is not a switch of densify={densify}{did_you_mean(name, declared)} "
+                "(there are "
                 f"{', '.join(declared) or 'none'})"
             )
     if not declared:
         raise InputError(
-            f"densify={densify} declares no switch that is on: name one by +densify.switches.NAME.off.KEY=VALUE, where "
+            f"densify={densify} declares no switch that is on: name one by "
+            "+densify.switches.NAME.off.KEY=VALUE, where "
             "the setting turns a part off (docs/claims.md)"
         )
     chosen = {name: declared[name] for name in names or declared}
     if len(chosen) > MAX_SWITCHES:
-        raise InputError(f"{len(chosen)} switches make {2 ** len(chosen)} runs: choose at most {MAX_SWITCHES}")
+        raise InputError(
+            f"{len(chosen)} switches make {2 ** len(chosen)} runs: choose at most {MAX_SWITCHES}"
+        )
     return chosen
 
 
 def effective_run(run: Run, switches: Mapping[str, Switch]) -> Run:
-    """The run without the switches that have no effect in it, because the switch that they depend on is off."""
+    """The run without the switches that have no effect in it, because the switch that they depend
+    on is off."""
 
     def acts(name: str) -> bool:
         within = switches[name].within
@@ -80,15 +91,20 @@ def effective_run(run: Run, switches: Mapping[str, Switch]) -> Run:
 
 
 def runs_to_train(switches: Mapping[str, Switch]) -> list[Run]:
-    """All different runs, the one with all switches on first; raises InputError if switches depend on each other."""
+    """All different runs, the one with all switches on first; raises InputError if switches depend
+    on each other."""
     for name in switches:
         chain, outer = [name], switches[name].within
         while outer in switches:
             if outer in chain:
-                raise InputError(f"the switches {', '.join(chain)} form a circle: each is within the next")
+                raise InputError(
+                    f"the switches {', '.join(chain)} form a circle: each is within the next"
+                )
             chain, outer = [*chain, outer], switches[outer].within
     sizes = range(len(switches) + 1)
-    combinations = [Run(chosen) for size in sizes for chosen in itertools.combinations(switches, size)]
+    combinations = [
+        Run(chosen) for size in sizes for chosen in itertools.combinations(switches, size)
+    ]
     runs = dict.fromkeys(effective_run(run, switches) for run in combinations)
     return sorted(runs, key=lambda run: (-len(run), sorted(run)))
 
@@ -108,8 +124,11 @@ def run_name(run: Run, switches: Sequence[str]) -> str:
     return f"without {listed(off)}" if off else "with all of them"
 
 
-def judge_runs(trials: Sequence[TrialResult], runs: Mapping[Run, TrialKeys], metric: str) -> list[Verdict]:
-    """The verdicts on all runs against the run with all switches on, as one family, in the order of ``runs``."""
+def judge_runs(
+    trials: Sequence[TrialResult], runs: Mapping[Run, TrialKeys], metric: str
+) -> list[Verdict]:
+    """The verdicts on all runs against the run with all switches on, as one family, in the order of
+    ``runs``."""
     quantity = asked_quantity(metric, trials)
     full = max(runs, key=len)
     questions = [
@@ -130,9 +149,14 @@ def judge_runs(trials: Sequence[TrialResult], runs: Mapping[Run, TrialKeys], met
 def markdown_table(verdicts: Sequence[Verdict]) -> list[str]:
     """The verdicts as lines of a Markdown table."""
     name = verdicts[0].quantity.name
-    lines = [f"| run | difference in {name} from all parts | interval | verdict |", "|---|---|---|---|"]
+    lines = [
+        f"| run | difference in {name} from all parts | interval | verdict |",
+        "|---|---|---|---|",
+    ]
     for one in verdicts:
         mean = "unknown" if one.mean is None else one.shown(one.mean)
         interval = "unknown" if one.interval is None else one.shown_interval(one.interval)
-        lines.append(f"| {one.question.arm} | {mean} | {interval} | {one.untestable or WORDS[one.outcome]} |")
+        lines.append(
+            f"| {one.question.arm} | {mean} | {interval} | {one.untestable or WORDS[one.outcome]} |"
+        )
     return lines

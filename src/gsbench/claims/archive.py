@@ -3,15 +3,18 @@
 It holds:
 
 - ``results.jsonl``: the ``results.json`` of every trial, one per line, with the trial's folder;
-- ``configurations.jsonl``: every configuration without the seed, with its trials' folders and seeds;
+- ``configurations.jsonl``: every configuration without the seed, with its trials' folders and
+  seeds;
 - ``per_view.csv``: the metrics of every test view;
 - ``declared.jsonl``: the declarations of the experiment, if there are any;
 - ``from_pixels.jsonl``: measures of the trials' pictures, if declared claims use them;
 - ``pictures/``: renders and photographs of test views by trial, only if they were asked for;
 - ``archive.json``: the version of this format and the sha256 of the files above;
-- ``ro-crate-metadata.json``: the same in the terms of RO-Crate (w3id.org/ro/crate/1.2), for other tools.
+- ``ro-crate-metadata.json``: the same in the terms of RO-Crate (w3id.org/ro/crate/1.2), for other
+  tools.
 
-Of paths on this machine only the last name is kept. The same results give the same archive, bit by bit.
+Of paths on this machine only the last name is kept. The same results give the same archive, bit by
+bit.
 """
 
 import csv
@@ -38,7 +41,15 @@ from gsbench.errors import InputError
 from gsbench.files import atomic
 from gsbench.parsing import read_bytes, read_yaml
 from gsbench.runs.experiments import read_declarations
-from gsbench.runs.layout import CONFIG, DECLARED, FROM_PIXELS, GROUND_TRUTH, PER_VIEW, RENDERS, RESULTS
+from gsbench.runs.layout import (
+    CONFIG,
+    DECLARED,
+    FROM_PIXELS,
+    GROUND_TRUTH,
+    PER_VIEW,
+    RENDERS,
+    RESULTS,
+)
 from gsbench.settings import is_folder_name
 from gsbench.words import readable_bytes, without_folders
 
@@ -47,10 +58,12 @@ PIXELS = "from_pixels.jsonl"
 MANIFEST, CRATE = "archive.json", "ro-crate-metadata.json"
 TRIALS, CONFIGURATIONS = "results.jsonl", "configurations.jsonl"
 PICTURES_FOLDER, PICTURES = "pictures", (RENDERS, GROUND_TRUTH)
-# Archives may come from strangers: these limits stop a zip bomb. They are larger than any experiment needs.
+# Archives may come from strangers: these limits stop a zip bomb. They are larger than any
+# experiment needs.
 MAX_BYTES = 1 << 28  # bytes of one unpacked file
 MAX_TOTAL_BYTES = 1 << 30  # bytes of all unpacked files
-FIXED_DATE = (1980, 1, 1, 0, 0, 0)  # of all files in the zip, so that archives do not depend on time: zip's earliest
+# of all files in the zip, so that archives do not depend on time: zip's earliest
+FIXED_DATE = (1980, 1, 1, 0, 0, 0)
 PRIVATE = ("runs", "tracking")  # settings that only name the user's folders and servers
 PASSWORD = re.compile(r"(?<=://)[^/@\s]*@")  # user and password in a URL
 FOLDERS = re.compile(r"(?<=:)///+\S*/")  # folders in a file's URL, such as sqlite:////home/me/a.db
@@ -60,7 +73,10 @@ NAMED_GROUPS = ("scene", "init", "densify")  # groups of settings whose names re
 SPECIFICATION = "https://w3id.org/ro/crate/1.2"
 PICTURE = ("image/png", "A test view of a trial: its render, or the photograph")
 FILES = {  # media types and descriptions
-    TRIALS: ("application/jsonl", "Results of every trial, one JSON object a line: metrics, counts, hashes, code"),
+    TRIALS: (
+        "application/jsonl",
+        "Results of every trial, one JSON object a line: metrics, counts, hashes, code",
+    ),
     CONFIGURATIONS: ("application/jsonl", "Every configuration, with the trials that had it"),
     PER_VIEW: ("text/csv", "Metrics of every test view of every trial"),
     PIXELS: ("application/jsonl", "What declared claims ask of the trials' pictures, measured"),
@@ -70,37 +86,51 @@ FILES = {  # media types and descriptions
 
 
 def write_archive(experiment: Experiment, out: Path, pictures: bool = False) -> list[str]:
-    """Write the experiment's results to the file ``out``; return a line for each trial that is left out, with why.
+    """Write the experiment's results to the file ``out``; return a line for each trial that is left
+    out, with why.
 
     ``pictures`` adds those of the test views. Raises InputError if no trial can be exported.
     """
     kept, rows, left_out = [], [], list(experiment.warnings)
-    configurations: dict[str, list[tuple[str, int]]] = {}  # {configuration as JSON: (folder, seed) of its trials}
+    # {configuration as JSON: (folder, seed) of its trials}
+    configurations: dict[str, list[tuple[str, int]]] = {}
     for trial in experiment.trials:
         try:
             views, configuration = read_views(trial), _configuration(trial)
         except InputError as error:
             left_out.append(f"{trial.label}: {error}")
             continue
-        rows += [{"trial": _folder(trial), "view": view} | metrics for view, metrics in sorted(views.items())]
+        rows += [
+            {"trial": _folder(trial), "view": view} | metrics
+            for view, metrics in sorted(views.items())
+        ]
         configurations.setdefault(configuration, []).append((_folder(trial), trial.seed))
         kept.append(trial)
     if not kept:
         raise InputError(f"{experiment.name} has no whole trial to export (first: {left_out[0]})")
     declared = experiment.folder / DECLARED
     contents = {
-        TRIALS: _json_lines({"folder": _folder(trial), "results": _results(trial)} for trial in kept),
+        TRIALS: _json_lines(
+            {"folder": _folder(trial), "results": _results(trial)} for trial in kept
+        ),
         CONFIGURATIONS: _json_lines(
-            {"configuration": json.loads(text), "trials": trials} for text, trials in configurations.items()
+            {"configuration": json.loads(text), "trials": trials}
+            for text, trials in configurations.items()
         ),
         PER_VIEW: _table(rows),
     } | ({DECLARED: read_bytes(declared)} if declared.is_file() else {})
-    if any(q.metric == TEXTURED.key for one in read_declarations(experiment.folder) for q in one.questions):
+    if any(
+        q.metric == TEXTURED.key
+        for one in read_declarations(experiment.folder)
+        for q in one.questions
+    ):
         contents[PIXELS] = _json_lines(_pixel_measures(kept))
     for trial in kept if pictures else ():
         for kind in PICTURES:
             for path in trial.folder.pictures(kind):
-                contents[f"{PICTURES_FOLDER}/{_folder(trial)}/{kind}/{path.name}"] = read_bytes(path)
+                contents[f"{PICTURES_FOLDER}/{_folder(trial)}/{kind}/{path.name}"] = read_bytes(
+                    path
+                )
     _check_size(sum(map(len, contents.values())))
     manifest = {
         "format": FORMAT,
@@ -110,7 +140,9 @@ def write_archive(experiment: Experiment, out: Path, pictures: bool = False) -> 
         "sha256": {name: hashlib.sha256(content).hexdigest() for name, content in contents.items()},
     }
     contents[MANIFEST] = (json.dumps(manifest, indent=1) + "\n").encode()
-    crate = crate_metadata(experiment.name, kept, {name: len(content) for name, content in contents.items()})
+    crate = crate_metadata(
+        experiment.name, kept, {name: len(content) for name, content in contents.items()}
+    )
     contents[CRATE] = (json.dumps(crate, indent=1) + "\n").encode()
     with atomic(out, sync=False) as temporary, zipfile.ZipFile(temporary, "w") as archive:
         for name in (CRATE, *(name for name in contents if name != CRATE)):
@@ -123,13 +155,18 @@ def _pixel_measures(trials: Sequence[TrialResult]) -> Iterator[dict[str, Any]]:
     """The folder and the measures of each trial whose pictures can be read."""
     for trial in trials:
         with suppress(InputError):
-            yield {"folder": _folder(trial), "measures": PixelMeasures(error_textured=textured_error(trial)).to_json()}
+            yield {
+                "folder": _folder(trial),
+                "measures": PixelMeasures(error_textured=textured_error(trial)).to_json(),
+            }
 
 
 def unpack_archive(file: Path, runs: Path) -> Experiment:
-    """Unpack the trials of an archive into the empty runs folder ``runs``, and read them as an experiment.
+    """Unpack the trials of an archive into the empty runs folder ``runs``, and read them as an
+    experiment.
 
-    Raises InputError, one line that names the file, if it is no archive, or is cut, edited or of another version.
+    Raises InputError, one line that names the file, if it is no archive, or is cut, edited or of
+    another version.
     """
     try:
         manifest, contents = _read(file)
@@ -137,12 +174,16 @@ def unpack_archive(file: Path, runs: Path) -> Experiment:
         if not isinstance(name, str) or not is_folder_name(name):
             raise InputError(f"{name!r} cannot be the name of an experiment")
         home = runs / name
-        trials = [(_checked_folder(line["folder"]), line["results"]) for line in _lines(contents[TRIALS])]
+        trials = [
+            (_checked_folder(line["folder"]), line["results"]) for line in _lines(contents[TRIALS])
+        ]
         _unpack(home, trials, contents)
     except InputError as error:
         raise InputError(f"{file}: {error}") from None
     except (KeyError, TypeError, ValueError, AttributeError, RecursionError, csv.Error) as error:
-        raise InputError(f"{file}: its content is not that of an archive ({error!r}): export it again") from None
+        raise InputError(
+            f"{file}: its content is not that of an archive ({error!r}): export it again"
+        ) from None
     experiment = read_experiment(home)
     if not experiment.trials or experiment.warnings:
         reason = experiment.warnings[0] if experiment.warnings else "it has no trial"
@@ -157,29 +198,42 @@ def unpack_archive(file: Path, runs: Path) -> Experiment:
     return experiment
 
 
-def _check_configuration(folder: str, values: Mapping[str, Any], results: Mapping[str, Any]) -> None:
-    """Raise InputError if the configuration ``values`` contradicts the ``results`` of the trial in ``folder``."""
+def _check_configuration(
+    folder: str, values: Mapping[str, Any], results: Mapping[str, Any]
+) -> None:
+    """Raise InputError if the configuration ``values`` contradicts the ``results`` of the trial in
+    ``folder``."""
     names = {SEED_KEY: values[SEED_KEY]}
-    names |= {group: values[group].get("name") for group in NAMED_GROUPS if isinstance(values.get(group), dict)}
+    names |= {
+        group: values[group].get("name")
+        for group in NAMED_GROUPS
+        if isinstance(values.get(group), dict)
+    }
     for key, value in names.items():
         if value != results[key]:
             raise InputError(
-                f"{folder}: its configuration says {key} {value}, its results {results[key]}: export it again"
+                f"{folder}: its configuration says {key} {value}, its results {results[key]}: "
+                "export it again"
             )
 
 
 def _read(file: Path) -> tuple[dict[str, Any], dict[str, bytes]]:
     """The manifest, and the content of the files that it lists, whose checksums were compared."""
-    if file.exists() and not (file.is_file() or file.is_dir()):  # reading a pipe or a device may never end
+    # reading a pipe or a device may never end
+    if file.exists() and not (file.is_file() or file.is_dir()):
         raise InputError("it is not a regular file: give an archive")
     try:
         with zipfile.ZipFile(file) as archive:
             manifest = json.loads(_member(archive, MANIFEST))
             if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
-                raise InputError(f"its {MANIFEST} is not one of gsbench: give what gsbench export --results wrote")
+                raise InputError(
+                    f"its {MANIFEST} is not one of gsbench: give what gsbench export --results "
+                    "wrote"
+                )
             if manifest.get("version") != VERSION:
                 raise InputError(
-                    f"it is of version {manifest.get('version')} of the archive (gsbench {manifest.get('gsbench')}), "
+                    f"it is of version {manifest.get('version')} of the archive (gsbench "
+                    f"{manifest.get('gsbench')}), "
                     f"and this gsbench reads {VERSION}: use one gsbench for both"
                 )
             _check_size(sum(info.file_size for info in archive.infolist()))
@@ -190,31 +244,52 @@ def _read(file: Path) -> tuple[dict[str, Any], dict[str, bytes]]:
         raise InputError("it is a folder: give an archive") from None
     except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise InputError(f"its {MANIFEST} is not JSON ({error})") from None
-    except (OSError, zipfile.BadZipFile, zlib.error, LZMAError, EOFError, NotImplementedError, RuntimeError) as error:
-        raise InputError(f"it is not a complete zip archive ({error}): fetch or export it again") from None
+    except (
+        OSError,
+        zipfile.BadZipFile,
+        zlib.error,
+        LZMAError,
+        EOFError,
+        NotImplementedError,
+        RuntimeError,
+    ) as error:
+        raise InputError(
+            f"it is not a complete zip archive ({error}): fetch or export it again"
+        ) from None
     for name, content in contents.items():
         if hashlib.sha256(content).hexdigest() != manifest["sha256"][name]:
-            raise InputError(f"{name} was changed after the export (its sha256 is another): export it again")
+            raise InputError(
+                f"{name} was changed after the export (its sha256 is another): export it again"
+            )
     return manifest, contents
 
 
 def _check_size(size: int) -> None:
     if size > MAX_TOTAL_BYTES:
-        raise InputError(f"its files are {readable_bytes(size)}, and {readable_bytes(MAX_TOTAL_BYTES)} are the most")
+        raise InputError(
+            f"its files are {readable_bytes(size)}, and {readable_bytes(MAX_TOTAL_BYTES)} are the "
+            "most"
+        )
 
 
 def _member(archive: zipfile.ZipFile, name: str) -> bytes:
     try:
         info = archive.getinfo(name)
     except KeyError:
-        raise InputError(f"it lacks {name}: it is not an archive of gsbench, or it is incomplete") from None
+        raise InputError(
+            f"it lacks {name}: it is not an archive of gsbench, or it is incomplete"
+        ) from None
     if info.file_size > MAX_BYTES:
-        raise InputError(f"{name} would be {info.file_size} bytes: no archive of gsbench's has so many")
+        raise InputError(
+            f"{name} would be {info.file_size} bytes: no archive of gsbench's has so many"
+        )
     with archive.open(info) as stream:
         return stream.read(MAX_BYTES)
 
 
-def _unpack(home: Path, trials: Sequence[tuple[str, dict[str, Any]]], contents: Mapping[str, bytes]) -> None:
+def _unpack(
+    home: Path, trials: Sequence[tuple[str, dict[str, Any]]], contents: Mapping[str, bytes]
+) -> None:
     """Write the files of every trial into its folder below ``home``."""
     for folder, results in trials:
         if (home / folder).exists():
@@ -227,7 +302,9 @@ def _unpack(home: Path, trials: Sequence[tuple[str, dict[str, Any]]], contents: 
             if folder in results_by_folder:
                 configuration = line["configuration"] | {SEED_KEY: seed}
                 _check_configuration(folder, configuration, results_by_folder[folder])
-                (home / folder / CONFIG).write_text(yaml.safe_dump(configuration, sort_keys=False), encoding="utf-8")
+                (home / folder / CONFIG).write_text(
+                    yaml.safe_dump(configuration, sort_keys=False), encoding="utf-8"
+                )
     reader = csv.DictReader(io.StringIO(contents[PER_VIEW].decode()))
     by_trial: dict[str, list[dict[str, str]]] = {}
     for row in reader:
@@ -240,7 +317,9 @@ def _unpack(home: Path, trials: Sequence[tuple[str, dict[str, Any]]], contents: 
             writer.writerows(by_trial[folder])
     for line in _lines(contents.get(PIXELS, b"")):
         if line["folder"] in results_by_folder:
-            (home / line["folder"] / FROM_PIXELS).write_text(json.dumps(line["measures"]), encoding="utf-8")
+            (home / line["folder"] / FROM_PIXELS).write_text(
+                json.dumps(line["measures"]), encoding="utf-8"
+            )
     for name in contents:
         if name.startswith(f"{PICTURES_FOLDER}/"):
             _unpack_picture(home, name, contents[name])
@@ -249,9 +328,14 @@ def _unpack(home: Path, trials: Sequence[tuple[str, dict[str, Any]]], contents: 
 
 
 def _unpack_picture(home: Path, name: str, content: bytes) -> None:
-    """Write a picture of a test view into its trial's folder; raises InputError for a name that leads elsewhere."""
+    """Write a picture of a test view into its trial's folder; raises InputError for a name that
+    leads elsewhere."""
     folder, kind, file = name.removeprefix(f"{PICTURES_FOLDER}/").rsplit("/", 2)
-    if kind not in PICTURES or not is_folder_name(file) or not (home / _checked_folder(folder) / RESULTS).is_file():
+    if (
+        kind not in PICTURES
+        or not is_folder_name(file)
+        or not (home / _checked_folder(folder) / RESULTS).is_file()
+    ):
         raise InputError(f"{name!r} cannot be a picture of a trial")
     (home / folder / kind).mkdir(exist_ok=True)
     (home / folder / kind / file).write_bytes(content)
@@ -263,7 +347,8 @@ def _folder(trial: TrialResult) -> str:
 
 
 def _checked_folder(folder: object) -> str:
-    """A trial's folder within its experiment; raises InputError for a path that could lead out of the runs folder."""
+    """A trial's folder within its experiment; raises InputError for a path that could lead out of
+    the runs folder."""
     parts = str(folder).split("/")
     if len(parts) != 3 or not all(map(is_folder_name, parts)):
         raise InputError(f"{folder!r} cannot be the folder of a trial")
@@ -271,14 +356,19 @@ def _checked_folder(folder: object) -> str:
 
 
 def _configuration(trial: TrialResult) -> str:
-    """The trial's ``config.yaml`` as JSON, without paths of this machine; raises InputError if it is damaged."""
+    """The trial's ``config.yaml`` as JSON, without paths of this machine; raises InputError if it
+    is damaged."""
     try:
         values = read_yaml(trial.path / CONFIG)
     except FileNotFoundError:
         raise InputError(NO_CONFIGURATION) from None
     if not isinstance(values, dict):
         raise InputError(f"its {CONFIG} is not a mapping")
-    return json.dumps(without_paths({key: value for key, value in values.items() if key not in (*PRIVATE, SEED_KEY)}))
+    return json.dumps(
+        without_paths(
+            {key: value for key, value in values.items() if key not in (*PRIVATE, SEED_KEY)}
+        )
+    )
 
 
 def _results(trial: TrialResult) -> dict[str, Any]:
@@ -290,13 +380,15 @@ def _results(trial: TrialResult) -> dict[str, Any]:
 
 
 def without_paths(value: Any) -> Any:
-    """Plain values in which only the last name of each path on this machine is kept, and no URL has a password."""
+    """Plain values in which only the last name of each path on this machine is kept, and no URL has
+    a password."""
     if isinstance(value, Mapping):
         return {key: without_paths(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):
         return [without_paths(entry) for entry in value]
     if isinstance(value, str):
-        if value.startswith(("/", "~")) or PurePath(value).is_absolute():  # `without_folders` would stop at a blank
+        # `without_folders` would stop at a blank
+        if value.startswith(("/", "~")) or PurePath(value).is_absolute():
             return PurePath(value).name
         return without_folders(FOLDERS.sub("///", PASSWORD.sub("", value)))
     return value
@@ -312,13 +404,17 @@ def _lines(content: bytes) -> list[dict[str, Any]]:
 
 def _table(rows: Sequence[Mapping[str, object]]) -> bytes:
     text = io.StringIO()
-    writer = csv.DictWriter(text, dict.fromkeys(name for row in rows for name in row), lineterminator="\n")
+    writer = csv.DictWriter(
+        text, dict.fromkeys(name for row in rows for name in row), lineterminator="\n"
+    )
     writer.writeheader()
     writer.writerows(rows)
     return text.getvalue().encode()
 
 
-def crate_metadata(name: str, trials: Sequence[TrialResult], sizes: Mapping[str, int]) -> dict[str, Any]:
+def crate_metadata(
+    name: str, trials: Sequence[TrialResult], sizes: Mapping[str, int]
+) -> dict[str, Any]:
     """The archive in the terms of RO-Crate; ``sizes`` are the bytes of each of its files."""
     scenes = sorted({trial.scene for trial in trials})
     arms = sorted({str(trial.arm) for trial in trials})
@@ -328,7 +424,8 @@ def crate_metadata(name: str, trials: Sequence[TrialResult], sizes: Mapping[str,
         "@id": "./",
         "@type": "Dataset",
         "name": f"{name}: results of gsbench",
-        "description": f"{len(trials)} trainings of 3D Gaussian Splatting: {', '.join(arms)} on {', '.join(scenes)}, "
+        "description": f"{len(trials)} trainings of 3D Gaussian Splatting: {', '.join(arms)} on "
+        f"{', '.join(scenes)}, "
         f"measured by {', '.join(protocols)}. No models.",
         "datePublished": day,
         "hasPart": [{"@id": file} for file in sizes],

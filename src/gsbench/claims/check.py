@@ -1,7 +1,9 @@
-"""Checks of a file of claims: what can be tested here, the trials that are needed, the verdicts, and their page.
+"""Checks of a file of claims: what can be tested here, the trials that are needed, the verdicts,
+and their page.
 
-The trials are ordinary trials of one experiment. So a check that was killed continues where it stopped and ends with
-the same verdicts. A published archive gives the same verdicts without any training.
+The trials are ordinary trials of one experiment. So a check that was killed continues where it
+stopped and ends with the same verdicts. A published archive gives the same verdicts without any
+training.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -25,15 +27,27 @@ from gsbench.claims.stopping import KeyAndSeed, trials_of_look
 from gsbench.config.compose import Trial, compose_one, with_seed
 from gsbench.errors import InputError
 from gsbench.parsing import read_if_sound
-from gsbench.runs.experiments import Declaration, declared_now, latest_declaration, read_declarations
+from gsbench.runs.experiments import (
+    Declaration,
+    declared_now,
+    latest_declaration,
+    read_declarations,
+)
 from gsbench.runs.layout import FAILED, SEED
 from gsbench.runs.trial_record import Failure
 from gsbench.words import counted, some_of, without_folders
 
-FindMissing = Callable[[Sequence[Trial]], Sequence[str]]  # a line for each thing that these trials need and lack
+# a line for each thing that these trials need and lack
+FindMissing = Callable[[Sequence[Trial]], Sequence[str]]
 NOT_TESTABLE = "not testable here"
 LARGE = 1000.0  # numbers from here on are counts or seconds, shown without decimals
-SYMBOLS = {"supported": "✔", "refuted": "✘", "too small to matter": "≈", "undecided": "?", NOT_TESTABLE: "–"}
+SYMBOLS = {
+    "supported": "✔",
+    "refuted": "✘",
+    "too small to matter": "≈",
+    "undecided": "?",
+    NOT_TESTABLE: "–",
+}
 
 
 @dataclass(frozen=True)
@@ -60,17 +74,28 @@ class ClaimVerdict:
         if verdict.untestable:
             return verdict.untestable
         if verdict.outcome == TOO_SMALL or (verdict.outcome == SUPPORTED and not claim.sign):
-            has_sign = verdict.mean is not None and verdict.interval is not None and verdict.interval.excludes_zero()
+            has_sign = (
+                verdict.mean is not None
+                and verdict.interval is not None
+                and verdict.interval.excludes_zero()
+            )
             side = f"; it is {'higher' if (verdict.mean or 0) > 0 else 'lower'}" if has_sign else ""
             return f"any effect is smaller than the least that matters ({least}){side}"
         if verdict.outcome == SUPPORTED:
             return f"it is {claim.direction}{self._by_least()}"
         if verdict.outcome == "refuted":
-            return f"it is the opposite of {claim.direction}" if claim.sign else f"it differs by more than {least}"
+            return (
+                f"it is the opposite of {claim.direction}"
+                if claim.sign
+                else f"it differs by more than {least}"
+            )
         if verdict.rests_on_outlying and verdict.final:
             return "it depends on trials far outside the others"
         if verdict.final:
-            return f"all {verdict.pairs.seeds} seeds show neither a difference nor that it is below {least}"
+            return (
+                f"all {verdict.pairs.seeds} seeds show neither a difference nor that it is "
+                f"below {least}"
+            )
         waits = "trials are missing: the next look waits for them"
         return waits + (f"; failed: {some_of(list(self.failed))}" if self.failed else "")
 
@@ -104,7 +129,9 @@ class Check:
 
     def trials(self, seeds: int) -> list[Trial]:
         """The trials of the first ``seeds`` seeds of every claim."""
-        return self.to_run(trials_of_look(self.declaration, range(len(self.declaration.questions)), seeds))
+        return self.to_run(
+            trials_of_look(self.declaration, range(len(self.declaration.questions)), seeds)
+        )
 
     def judged(self) -> list[Verdict]:
         """The verdicts on the declared questions from the trials that are done."""
@@ -118,16 +145,24 @@ class Check:
     def _failures(self, verdict: Verdict) -> list[str]:
         """The reasons why trials of an undecided question failed, each once."""
         keys = [key for both in verdict.question.scenes.values() for key in both]
-        folders = [self.home / f"{key}{SEED}{seed}" for key in keys for seed in verdict.question.seeds]
-        failures = [read_if_sound(folder / FAILED, Failure) for folder in ([] if verdict.final else folders)]
+        folders = [
+            self.home / f"{key}{SEED}{seed}" for key in keys for seed in verdict.question.seeds
+        ]
+        failures = [
+            read_if_sound(folder / FAILED, Failure) for folder in ([] if verdict.final else folders)
+        ]
         return list(dict.fromkeys(failure.reason for failure in failures if failure is not None))
 
 
-def prepare(file: ClaimsFile, runs: Path, find_missing: FindMissing, permissions: Sequence[str] = ()) -> Check:
-    """Compose the first trial of each scene and arm of each claim; scenes with something missing are not tested.
+def prepare(
+    file: ClaimsFile, runs: Path, find_missing: FindMissing, permissions: Sequence[str] = ()
+) -> Check:
+    """Compose the first trial of each scene and arm of each claim; scenes with something missing
+    are not tested.
 
-    ``permissions`` are words such as ``allow_targets=[mine]`` from the command line: a file of claims cannot give
-    permissions. Raises InputError that names claim, scene and arm for settings that do not compose.
+    ``permissions`` are words such as ``allow_targets=[mine]`` from the command line: a file of
+    claims cannot give permissions. Raises InputError that names claim, scene and arm for settings
+    that do not compose.
     """
     first_trials: dict[str, Trial] = {}
     composed: dict[tuple[str, ...], Trial] = {}
@@ -138,9 +173,16 @@ def prepare(file: ClaimsFile, runs: Path, find_missing: FindMissing, permissions
         for scene in () if claim.not_testable else claim.scenes or file.scenes:
             trials = []
             for arm in (claim.baseline, claim.arm):
-                words = (*file.words(claim, scene, arm), f"name={file.name}", "seed=0", *permissions)
+                words = (
+                    *file.words(claim, scene, arm),
+                    f"name={file.name}",
+                    "seed=0",
+                    *permissions,
+                )
                 if words not in composed:
-                    composed[words] = _compose(words, runs, f"claim {claim.id}, scene {scene}, arm {arm}")
+                    composed[words] = _compose(
+                        words, runs, f"claim {claim.id}, scene {scene}, arm {arm}"
+                    )
                 trials.append(composed[words])
             reason = next((line for trial in trials for line in find_missing([trial])), "")
             if reason:
@@ -148,20 +190,30 @@ def prepare(file: ClaimsFile, runs: Path, find_missing: FindMissing, permissions
                 continue
             baseline, arm_key = (trial.files.key for trial in trials)
             if baseline == arm_key:
-                raise InputError(f"claim {claim.id}: {claim.baseline} and {claim.arm} are the same trial on {scene}")
+                raise InputError(
+                    f"claim {claim.id}: {claim.baseline} and {claim.arm} are the same trial on "
+                    f"{scene}"
+                )
             first_trials |= {baseline: trials[0], arm_key: trials[1]}
             scenes[scene] = baseline, arm_key
         if scenes:
             questions.append(file.question(claim, scenes))
         if reasons:
-            missing[claim.id] = [without_folders(f"{some_of(names)}: {reason}") for reason, names in reasons.items()]
+            missing[claim.id] = [
+                without_folders(f"{some_of(names)}: {reason}") for reason, names in reasons.items()
+            ]
     asked = tuple(questions)
-    declaration = declared_now(questions=asked, error_rate=file.error_rate, looks=file.looks, missing=missing)
+    declaration = declared_now(
+        questions=asked, error_rate=file.error_rate, looks=file.looks, missing=missing
+    )
     return Check(file, runs, declaration, first_trials)
 
 
-def claim_verdicts(file: ClaimsFile, declaration: Declaration, judged: Sequence[Verdict]) -> list[ClaimVerdict]:
-    """Every claim of the file with its verdict among ``judged``, or with the reason why it could not be tested."""
+def claim_verdicts(
+    file: ClaimsFile, declaration: Declaration, judged: Sequence[Verdict]
+) -> list[ClaimVerdict]:
+    """Every claim of the file with its verdict among ``judged``, or with the reason why it could
+    not be tested."""
     by_name = {verdict.question.name: verdict for verdict in judged}
     verdicts = []
     for claim in file.claims:
@@ -176,26 +228,36 @@ def claim_verdicts(file: ClaimsFile, declaration: Declaration, judged: Sequence[
     return verdicts
 
 
-def recheck(file: ClaimsFile, archive: Path, folder: Path) -> tuple[list[ClaimVerdict], Declaration, list[Declaration]]:
-    """Judge the claims of ``file`` by the trials in ``archive`` alone, unpacked into the empty folder ``folder``.
+def recheck(
+    file: ClaimsFile, archive: Path, folder: Path
+) -> tuple[list[ClaimVerdict], Declaration, list[Declaration]]:
+    """Judge the claims of ``file`` by the trials in ``archive`` alone, unpacked into the empty
+    folder ``folder``.
 
-    Returns the verdicts, the declaration that they follow, and all declarations of claims. Raises InputError, one line,
-    for an archive that is damaged, of another experiment or without declared claims, and if the file's claims differ
-    from the declared ones.
+    Returns the verdicts, the declaration that they follow, and all declarations of claims. Raises
+    InputError, one line, for an archive that is damaged, of another experiment or without declared
+    claims, and if the file's claims differ from the declared ones.
     """
     experiment = unpack_archive(archive, folder)
     if experiment.name != file.name:
         raise InputError(f"{archive} is of the experiment {experiment.name}, not of {file.name}")
     declarations = [one for one in read_declarations(experiment.folder) if one.kind == "claims"]
     if not declarations:
-        raise InputError(f"{archive}: it declares no claims, so it is not an archive of a gsbench check")
+        raise InputError(
+            f"{archive}: it declares no claims, so it is not an archive of a gsbench check"
+        )
     declaration = latest_declaration(declarations)
     _check_same_claims(file, declaration)
-    return claim_verdicts(file, declaration, judge(experiment.trials, declaration)), declaration, declarations
+    return (
+        claim_verdicts(file, declaration, judge(experiment.trials, declaration)),
+        declaration,
+        declarations,
+    )
 
 
 def _check_same_claims(file: ClaimsFile, declaration: Declaration) -> None:
-    """Raise InputError if a claim's question differs from the one that was declared before the trials ran."""
+    """Raise InputError if a claim's question differs from the one that was declared before the
+    trials ran."""
     declared = {question.name: question for question in declaration.questions}
     for claim in file.claims:
         in_file, before = file.question(claim, {}), declared.get(claim.id)
@@ -204,13 +266,16 @@ def _check_same_claims(file: ClaimsFile, declaration: Declaration) -> None:
         for what in ("metric", "sign", "least", "relative"):
             if getattr(in_file, what) != getattr(before, what):
                 raise InputError(
-                    f"claim {claim.id}: its {what} was {getattr(before, what)} when it was declared "
-                    f"({declaration.when}), and is {getattr(in_file, what)} in the file: use the file as it was then"
+                    f"claim {claim.id}: its {what} was {getattr(before, what)} when it was "
+                    "declared "
+                    f"({declaration.when}), and is {getattr(in_file, what)} in the file: use the "
+                    "file as it was then"
                 )
         arms = [arm.densify for arm in (before.baseline, before.arm) if arm is not None]
         if arms != [claim.baseline, claim.arm]:
             raise InputError(
-                f"claim {claim.id}: other arms were declared ({declaration.when}): use the file as it was then"
+                f"claim {claim.id}: other arms were declared ({declaration.when}): use the file "
+                "as it was then"
             )
     if unknown := declared.keys() - {claim.id for claim in file.claims}:
         raise InputError(f"the file lacks claims that were declared: {', '.join(sorted(unknown))}")
@@ -249,24 +314,36 @@ class Page:
 
 
 def make_page(
-    file: ClaimsFile, verdicts: Sequence[ClaimVerdict], declared: Declaration, declarations: Sequence[Declaration]
+    file: ClaimsFile,
+    verdicts: Sequence[ClaimVerdict],
+    declared: Declaration,
+    declarations: Sequence[Declaration],
 ) -> Page:
     """The content of the page.
 
-    ``declared`` is the declaration that the verdicts follow, ``declarations`` are all under the experiment's name.
+    ``declared`` is the declaration that the verdicts follow, ``declarations`` are all under the
+    experiment's name.
     """
     counts = {word: sum(verdict.word == word for verdict in verdicts) for word in SYMBOLS}
     tested = sum(one.word != NOT_TESTABLE for one in verdicts)
-    lines = [f"{file.paper}. " + ", ".join(f"{count} {word}" for word, count in counts.items() if count) + "."]
+    lines = [
+        f"{file.paper}. "
+        + ", ".join(f"{count} {word}" for word, count in counts.items() if count)
+        + "."
+    ]
     if tested:
         which = "the verdict" if tested == 1 else f"any of the {tested} verdicts"
         lines.append(
-            f"The chance that {which} is false is at most {100 * file.error_rate:g} %, over all looks, if trainings "
-            "differ about normally (docs/verdict.md). A verdict is about these scenes at this size. From six scenes on "
+            f"The chance that {which} is false is at most {100 * file.error_rate:g} %, over all "
+            "looks, if trainings "
+            "differ about normally (docs/verdict.md). A verdict is about these scenes at this "
+            "size. From six scenes on "
             "there is also a statement about scenes like these, with its own error rate."
         )
     lines.append(_declared_line(declared, declarations))
-    judged = list({trial.path: trial for one in verdicts for trial in one.verdict.pairs.trials}.values())
+    judged = list(
+        {trial.path: trial for one in verdicts for trial in one.verdict.pairs.trials}.values()
+    )
     lines += [f"The paper: {file.size}."] if file.size else []
     lines += [*machine_notes(judged), *cloud_notes(judged)]
     return Page(f"{file.name}: claims and verdicts", tuple(lines), tuple(map(_section, verdicts)))
@@ -293,11 +370,14 @@ def _section(one: ClaimVerdict) -> ClaimSection:
     headline = one.reason
     if answer is not None and answer.interval is not None:
         headline = (
-            f"{verdict.quantity.name} of {claim.arm} against {claim.baseline}: {verdict.shown(answer.mean)} "
-            f"({100 * (1 - answer.level):.3g} % interval {verdict.shown_interval(answer.interval)}); {one.reason}"
+            f"{verdict.quantity.name} of {claim.arm} against {claim.baseline}: "
+            f"{verdict.shown(answer.mean)} "
+            f"({100 * (1 - answer.level):.3g} % interval "
+            f"{verdict.shown_interval(answer.interval)}); {one.reason}"
         )
         evidence += [
-            f"least effect that matters: {claim.effect}; baseline's mean {_number(verdict.pairs.baseline)}",
+            f"least effect that matters: {claim.effect}; baseline's mean "
+            f"{_number(verdict.pairs.baseline)}",
             _judged_on(one),
             _like_these(one),
         ]
@@ -306,7 +386,12 @@ def _section(one: ClaimVerdict) -> ClaimSection:
     if mixed:
         headline += f". {mixed}"
     return ClaimSection(
-        one, headline, tuple(filter(None, evidence)), fairness, _folders(verdict.pairs.trials), _chart(one)
+        one,
+        headline,
+        tuple(filter(None, evidence)),
+        fairness,
+        _folders(verdict.pairs.trials),
+        _chart(one),
     )
 
 
@@ -317,7 +402,8 @@ def _judged_on(one: ClaimVerdict) -> str:
         return ""
     planned = ", ".join(str(seeds) for seeds in plan_looks(len(verdict.question.seeds)))
     return (
-        f"judged on {counted(len(verdict.pairs.trials), 'trial')}: {counted(len(verdict.scenes), 'scene')}, "
+        f"judged on {counted(len(verdict.pairs.trials), 'trial')}: "
+        f"{counted(len(verdict.scenes), 'scene')}, "
         f"{verdict.pairs.seeds} seeds, two arms; looks planned at {planned} seeds"
     )
 
@@ -332,7 +418,8 @@ def _late_words(one: ClaimVerdict) -> str:
     if not one.verdict.late:
         return ""
     return (
-        f"{counted(one.verdict.late, 'trial')} had been measured before this was declared. So the metric shares the "
+        f"{counted(one.verdict.late, 'trial')} had been measured before this was declared. So the "
+        "metric shares the "
         "error rate with all metrics that could have been chosen"
     )
 
@@ -340,15 +427,22 @@ def _late_words(one: ClaimVerdict) -> str:
 def _fairness(one: ClaimVerdict) -> tuple[tuple[Table, ...], str]:
     """The fairness sheets of a claim's arms, and the `caveats` of comparing them."""
     trials = with_variants(one.verdict.pairs.trials)  # baseline and arm alternate
-    arms = dict.fromkeys((baseline.arm, new.arm) for baseline, new in zip(trials[::2], trials[1::2], strict=True))
+    arms = dict.fromkeys(
+        (baseline.arm, new.arm) for baseline, new in zip(trials[::2], trials[1::2], strict=True)
+    )
     pairs = [(baseline, arm) for baseline, arm in arms if baseline != arm]
     sentences = dict.fromkeys(caveats(trials, *pair) for pair in pairs)
     return tuple(fairness_table(trials, *pair) for pair in pairs), " ".join(filter(None, sentences))
 
 
 def _declared_line(declared: Declaration, declarations: Sequence[Declaration]) -> str:
-    line = f"The claims were declared {declared.when}. A claim says so if trials had been measured before."
-    earlier = {one.hash for one in declarations if one.kind == "claims" and one.moment < declared.moment}
+    line = (
+        f"The claims were declared {declared.when}. A claim says so if trials had been "
+        "measured before."
+    )
+    earlier = {
+        one.hash for one in declarations if one.kind == "claims" and one.moment < declared.moment
+    }
     if earlier:
         line += f" Earlier declarations under this name: {len(earlier)}."
     return line

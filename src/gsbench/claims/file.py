@@ -1,4 +1,5 @@
-"""The file of claims: what a paper says, and how it is tested here. It is checked before any trial runs.
+"""The file of claims: what a paper says, and how it is tested here. It is checked before any trial
+runs.
 
     name: check_volumetric
     paper: Refining Gaussian Splatting (arXiv 2508.05187)
@@ -17,7 +18,8 @@
         least: 0.005
         refuted_if: the difference is above 0, or within 0.005 of it
 
-Settings, scenes, arms, budgets and splits have settings as on the command line. docs/claims.md has every key.
+Settings, scenes, arms, budgets and splits have settings as on the command line. docs/claims.md has
+every key.
 """
 
 import math
@@ -46,14 +48,19 @@ MAX_ALPHA = 0.2
 NO_SIZE = "the whole claim depends on it: 0.005, or 10% of the baseline's value"
 DIRECTIONS = {"higher": 1, "lower": -1, "same": 0}
 
-Name = Annotated[str, Predicate(lambda name: NAME.fullmatch(name) is not None), doc("letters, digits, _ and -")]
-Sentence = Annotated[str, Predicate(lambda text: text.strip() != ""), doc("a text that is not empty")]
+Name = Annotated[
+    str, Predicate(lambda name: NAME.fullmatch(name) is not None), doc("letters, digits, _ and -")
+]
+Sentence = Annotated[
+    str, Predicate(lambda text: text.strip() != ""), doc("a text that is not empty")
+]
 Settings = dict[str, Any]
 
 
 @dataclass(frozen=True)
 class LeastEffect:
-    """The least effect that matters: a difference of the metric, or (``relative``) a fraction of the baseline."""
+    """The least effect that matters: a difference of the metric, or (``relative``) a fraction of
+    the baseline."""
 
     size: float
     relative: bool
@@ -66,7 +73,8 @@ class LeastEffect:
 class Claim:
     """One claim. Without ``scenes``, it is about all scenes of the file.
 
-    ``not_testable`` says why this file cannot test the claim, for example because the paper's size is out of reach.
+    ``not_testable`` says why this file cannot test the claim, for example because the paper's size
+    is out of reach.
     """
 
     id: Name
@@ -97,8 +105,8 @@ class Claim:
 class ClaimsFile:
     """A checked file of claims.
 
-    ``error_rate`` is the chance that any verdict is false; all tested claims share it. ``seeds`` is the most of each
-    scene and arm. ``size`` describes the paper's own experiments in words.
+    ``error_rate`` is the chance that any verdict is false; all tested claims share it. ``seeds`` is
+    the most of each scene and arm. ``size`` describes the paper's own experiments in words.
     """
 
     name: Name
@@ -112,7 +120,8 @@ class ClaimsFile:
     size: str = ""
 
     def words(self, claim: Claim, scene: str, arm: str) -> list[str]:
-        """The settings of a claim's trials with this scene and arm, as command-line words without seed and name."""
+        """The settings of a claim's trials with this scene and arm, as command-line words without
+        seed and name."""
         chosen = self.settings | self.scenes[scene] | self.arms[arm] | claim.split | claim.budget
         return [f"{key}={value_text(value)}" for key, value in chosen.items()]
 
@@ -122,7 +131,8 @@ class ClaimsFile:
         return plan_looks(self.seeds)
 
     def question(self, claim: Claim, scenes: Mapping[str, tuple[str, str]]) -> Question:
-        """The claim as a question; ``scenes`` has the keys of baseline's and arm's trials by scene."""
+        """The claim as a question; ``scenes`` has the keys of baseline's and arm's trials by
+        scene."""
         return Question(
             metric=claim.metric,
             sign=claim.sign,
@@ -136,11 +146,14 @@ class ClaimsFile:
         )
 
     def _arm(self, name: str) -> Arm:
-        return Arm("", name, tuple((key, value_text(value)) for key, value in self.arms[name].items()))
+        return Arm(
+            "", name, tuple((key, value_text(value)) for key, value in self.arms[name].items())
+        )
 
 
 def read_claims(path: Path) -> ClaimsFile:
-    """Read and check a file of claims; raises InputError, one line that says where the fault is and how to fix it."""
+    """Read and check a file of claims; raises InputError, one line that says where the fault is and
+    how to fix it."""
     try:
         content = read_yaml(resolved(path))
     except FileNotFoundError:
@@ -177,7 +190,8 @@ def parse_claims(content: object) -> ClaimsFile:
 
 
 def read_least(value: float | str, where: str) -> LeastEffect:
-    """Read ``0.005``, or ``10%`` of the baseline's value; raises InputError unless it is a number above 0."""
+    """Read ``0.005``, or ``10%`` of the baseline's value; raises InputError unless it is a number
+    above 0."""
     text = str(value).strip()
     relative = text.endswith("%")
     try:
@@ -204,11 +218,15 @@ def _require(cls: type, values: Iterable[str], where: str) -> None:
     for one in fields(cls):
         required = one.default is one.default_factory  # both are dataclasses.MISSING
         if required and one.name not in given:
-            raise InputError(f"{where}{'.' if where else ''}{one.name} is not given: a claim needs it (docs/claims.md)")
+            raise InputError(
+                f"{where}{'.' if where else ''}{one.name} is not given: a claim needs it "
+                "(docs/claims.md)"
+            )
 
 
 def _named_settings(groups: Mapping[str, Any], where: str, group: str) -> dict[str, Settings]:
-    """The settings of scenes or arms by name. A name without settings is a choice of the settings group ``group``."""
+    """The settings of scenes or arms by name. A name without settings is a choice of the settings
+    group ``group``."""
     if not groups:
         raise InputError(f"{where} must name at least one, as {where}: {{courtyard: {{}}}}")
     by_name = {}
@@ -216,7 +234,10 @@ def _named_settings(groups: Mapping[str, Any], where: str, group: str) -> dict[s
         if not NAME.fullmatch(str(name)):
             raise InputError(f"{where}: {name!r} must be a name of letters, digits, _ and -")
         if settings is not None and not isinstance(settings, dict):
-            raise InputError(f"{where}.{name} must be a mapping of settings, as {{{group}: {name}}}, got {settings!r}")
+            raise InputError(
+                f"{where}.{name} must be a mapping of settings, as {{{group}: {name}}}, got "
+                f"{settings!r}"
+            )
         _check_settings(settings or {}, f"{where}.{name}")
         by_name[str(name)] = dict(settings or {group: str(name)})
     return by_name
@@ -230,9 +251,15 @@ def _check_settings(settings: Mapping[str, Any], where: str) -> None:
             raise InputError(f"{where}: {key} is set by the plan itself: leave it out")
         # A file of claims may come from a stranger, so it cannot allow the import of other code.
         if key.lstrip("+~") == PERMISSIONS:
-            raise InputError(f"{where}: no file can allow code to run: type {PERMISSIONS}=[…] after the file's name")
+            raise InputError(
+                f"{where}: no file can allow code to run: type {PERMISSIONS}=[…] after the file's "
+                "name"
+            )
         if isinstance(value, dict):
-            raise InputError(f"{where}.{key} must be one value: write nested settings with dots, as {key}.NAME: …")
+            raise InputError(
+                f"{where}.{key} must be one value: write nested settings with dots, as "
+                f"{key}.NAME: …"
+            )
 
 
 def _check_claim(claim: Claim, file: ClaimsFile) -> None:
@@ -242,7 +269,8 @@ def _check_claim(claim: Claim, file: ClaimsFile) -> None:
     for role, name, known in named:
         if name not in known:
             raise InputError(
-                f"{where}: the file has no {role} {name!r}{did_you_mean(name, known)} (there are {', '.join(known)})"
+                f"{where}: the file has no {role} {name!r}{did_you_mean(name, known)} (there are "
+                f"{', '.join(known)})"
             )
     if claim.baseline == claim.arm:
         raise InputError(f"{where}: {claim.arm} is compared with itself: name two arms")
@@ -256,13 +284,18 @@ def _check_claim(claim: Claim, file: ClaimsFile) -> None:
 def _check_metric(claim: Claim, file: ClaimsFile) -> None:
     where, names = f"claim {claim.id}", askable_names()
     own = f"eval.extra.{claim.metric}."
-    if claim.metric not in names and not any(key.lstrip("+").startswith(own) for key in file.settings):
+    if claim.metric not in names and not any(
+        key.lstrip("+").startswith(own) for key in file.settings
+    ):
         raise InputError(
-            f"{where}: {claim.metric!r} is not a metric{did_you_mean(claim.metric, names)} (choose {', '.join(names)}; "
+            f"{where}: {claim.metric!r} is not a metric{did_you_mean(claim.metric, names)} "
+            f"(choose {', '.join(names)}; "
             f"one of your own by settings: {{{own}_target_: mine.MyMetric}})"
         )
     effect = claim.effect
     if asked_quantity(claim.metric).cost and not effect.relative:
-        raise InputError(f"{where}: least of {claim.metric} must be a part, such as 10%, got {effect}")
+        raise InputError(
+            f"{where}: least of {claim.metric} must be a part, such as 10%, got {effect}"
+        )
     if claim.metric in ("ssim", "flip") and not effect.relative and effect.size >= 1:
         raise InputError(f"{where}: least {effect} is more than {claim.metric} can differ by")

@@ -1,8 +1,8 @@
 """A gate: is a new version of a trainer worse than the baseline version?
 
-It is one question in planned looks (`gsbench.claims.stopping`). The new version passes, is worse, or is undecided after
-all allowed seeds. It passes if it is better, if any difference is too small to matter, or if it is shown not to be
-worse by the least difference that matters.
+It is one question in planned looks (`gsbench.claims.stopping`). The new version passes, is worse,
+or is undecided after all allowed seeds. It passes if it is better, if any difference is too small
+to matter, or if it is shown not to be worse by the least difference that matters.
 """
 
 import math
@@ -21,7 +21,8 @@ from gsbench.eval.facts import known_keys
 from gsbench.runs.experiments import ERROR_RATE, Declaration, Question, declared_now, trial_key
 from gsbench.words import counted, did_you_mean, listed
 
-BASELINE, NEW = "baseline", "new"  # replace the configuration hash in trials' keys, since versions may share settings
+# replace the configuration hash in trials' keys, since versions may share settings
+BASELINE, NEW = "baseline", "new"
 PASSED, WORSE, NOT_DECIDED = "passed", "worse", "undecided"
 
 ReadTrials = Callable[[], Iterable[TrialResult]]
@@ -29,16 +30,21 @@ ReadTrials = Callable[[], Iterable[TrialResult]]
 
 @dataclass(frozen=True)
 class Gate:
-    """A declared question about two versions, with functions that read each version's finished trials."""
+    """A declared question about two versions, with functions that read each version's finished
+    trials."""
 
     declaration: Declaration
     baseline: ReadTrials
     new: ReadTrials
 
     def judged(self) -> list[Verdict]:
-        """The verdict so far. It is final also once the new version is not worse: a gate needs no more."""
+        """The verdict so far. It is final also once the new version is not worse: a gate needs no
+        more."""
         trials = [*_as_version(BASELINE, self.baseline()), *_as_version(NEW, self.new())]
-        return [replace(one, final=one.final or result_of(one) == PASSED) for one in judge(trials, self.declaration)]
+        return [
+            replace(one, final=one.final or result_of(one) == PASSED)
+            for one in judge(trials, self.declaration)
+        ]
 
 
 def declare_gate(
@@ -49,16 +55,20 @@ def declare_gate(
     values: Mapping[str, Any],
     error_rate: float = ERROR_RATE,
 ) -> Declaration:
-    """The declaration of a gate about ``metric`` on ``scenes``, each with the names of both arms, such as ``sfm-adc``.
+    """The declaration of a gate about ``metric`` on ``scenes``, each with the names of both arms,
+    such as ``sfm-adc``.
 
-    ``least`` is text such as ``0.1`` or ``10%``; None takes the metric's usual least difference. Seeds are added in the
-    order of ``seeds``. ``values`` is a trial's configuration, which may define the user's own metrics. Raises
-    InputError, one line, for a metric that cannot be judged, and for too few seeds.
+    ``least`` is text such as ``0.1`` or ``10%``; None takes the metric's usual least difference.
+    Seeds are added in the order of ``seeds``. ``values`` is a trial's configuration, which may
+    define the user's own metrics. Raises InputError, one line, for a metric that cannot be judged,
+    and for too few seeds.
     """
     own = values["eval"].get("extra") or {}
     metrics = (*known_keys(), *COSTS, *own)
     if metric not in metrics:
-        raise InputError(f"--metric {metric}: there is no such metric{did_you_mean(metric, metrics)}")
+        raise InputError(
+            f"--metric {metric}: there is no such metric{did_you_mean(metric, metrics)}"
+        )
     sign, usual = -1, None  # less is better of counts and times
     if metric not in COSTS:
         facts = facts_for(metric, values)
@@ -66,12 +76,16 @@ def declare_gate(
     if not sign:
         raise InputError(f"--metric {metric}: nobody said whether more or less of it is better")
     if least is None and usual is None:
-        raise InputError(f"{metric} has no usual least difference that matters: give --least, such as 0.1 or 10%")
+        raise InputError(
+            f"{metric} has no usual least difference that matters: give --least, such as 0.1 or 10%"
+        )
     size = read_least(str(usual) if least is None else least, "--least")
     if metric in COSTS and not size.relative:
         raise InputError(f"--least of {metric} must be a part, such as 10%, got {size}")
     if len(seeds) < FIRST_LOOK:
-        raise InputError(f"a gate needs at least {FIRST_LOOK} seeds, and there is {len(seeds)}: allow more")
+        raise InputError(
+            f"a gate needs at least {FIRST_LOOK} seeds, and there is {len(seeds)}: allow more"
+        )
     question = Question(
         metric=metric,
         sign=sign,
@@ -102,19 +116,31 @@ def result_of(verdict: Verdict) -> str:
 
 
 def describe(verdict: Verdict) -> str:
-    """The result in a sentence: ``worse in PSNR (dB): −1.20 (95 % interval over all looks −1.50 to −0.90); …``"""
+    """The result in a sentence: ``worse in PSNR (dB): −1.20 (95 % interval over all looks −1.50 to
+    −0.90); …``"""
     answer, question = verdict.answer, verdict.question
     if verdict.untestable:
-        same = f"equal to the last bit in all {counted(len(verdict.pairs.trials) // 2, 'pair')} of trials"
+        same = (
+            f"equal to the last bit in all {counted(len(verdict.pairs.trials) // 2, 'pair')} "
+            "of trials"
+        )
         return f"{PASSED}: {same}" if verdict.equal else f"not testable: {verdict.untestable}"
     if answer is None or answer.interval is None:
         return f"{NOT_DECIDED}: {'; '.join(('trials are missing', *verdict.notes))}"
     least = f"{100 * question.least:g} %" if question.relative else f"{question.least:g}"  # type: ignore[operator]
-    words = {SUPPORTED: f"{PASSED}, better", TOO_SMALL: f"{PASSED}, any difference is below {least}", REFUTED: WORSE}
-    word = words.get(verdict.outcome, f"{PASSED}, not worse by {least}" if _not_worse(verdict) else NOT_DECIDED)
+    words = {
+        SUPPORTED: f"{PASSED}, better",
+        TOO_SMALL: f"{PASSED}, any difference is below {least}",
+        REFUTED: WORSE,
+    }
+    word = words.get(
+        verdict.outcome, f"{PASSED}, not worse by {least}" if _not_worse(verdict) else NOT_DECIDED
+    )
     return (
-        f"{word} in {verdict.quantity.name}: {verdict.shown(answer.mean)} ({100 * (1 - answer.level):.3g} % interval "
-        f"over all looks {verdict.shown_interval(answer.interval)}) on {counted(len(verdict.pairs.rows), 'scene')}, "
+        f"{word} in {verdict.quantity.name}: {verdict.shown(answer.mean)} "
+        f"({100 * (1 - answer.level):.3g} % interval "
+        f"over all looks {verdict.shown_interval(answer.interval)}) on "
+        f"{counted(len(verdict.pairs.rows), 'scene')}, "
         f"with {verdict.pairs.seeds} of at most {counted(len(question.seeds), 'seed')}"
         + "".join(f"; {note}" for note in verdict.notes)
     )
@@ -126,22 +152,31 @@ def deviations(baseline: Sequence[TrialResult], new: Sequence[TrialResult]) -> l
     kinds = [sorted({trial.machine or "not recorded" for trial in own}) for own in (baseline, new)]
     if kinds[0] != kinds[1]:
         lines.append(
-            f"deviation: the baseline ran on another kind of machine ({listed(kinds[0])}) than the new trials "
-            f"({listed(kinds[1])}); this alone changes last digits and, after long training, results"
+            f"deviation: the baseline ran on another kind of machine ({listed(kinds[0])}) than "
+            "the new trials "
+            f"({listed(kinds[1])}); this alone changes last digits and, after long training, "
+            "results"
         )
-    libraries = {name for trial in (*baseline, *new) for name in trial.record.versions} - {"gsbench"}
+    libraries = {name for trial in (*baseline, *new) for name in trial.record.versions} - {
+        "gsbench"
+    }
     for name in sorted(libraries):
-        versions = [sorted({trial.record.versions.get(name, "none") for trial in own}) for own in (baseline, new)]
+        versions = [
+            sorted({trial.record.versions.get(name, "none") for trial in own})
+            for own in (baseline, new)
+        ]
         if versions[0] != versions[1]:
             lines.append(
-                f"deviation: the baseline was made with {name} {listed(versions[0])}, the new trials with "
+                f"deviation: the baseline was made with {name} {listed(versions[0])}, the new "
+                "trials with "
                 f"{listed(versions[1])}"
             )
     return lines
 
 
 def _not_worse(verdict: Verdict) -> bool:
-    """Return whether the interval excludes a loss that matters, and the verdict does not rest on outlying trials."""
+    """Return whether the interval excludes a loss that matters, and the verdict does not rest on
+    outlying trials."""
     if verdict.interval is None or verdict.least is None or verdict.rests_on_outlying:
         return False
     sign = verdict.question.sign
@@ -158,7 +193,8 @@ SPARE = 2  # undecided commits that the search skips before it ends with a range
 
 
 def most_steps(count: int) -> int:
-    """The most gates of a bisection of ``count`` commits: that of the last commit, the halvings, and `SPARE`.
+    """The most gates of a bisection of ``count`` commits: that of the last commit, the halvings,
+    and `SPARE`.
 
     Examples:
         >>> most_steps(1), most_steps(12)
@@ -168,11 +204,12 @@ def most_steps(count: int) -> int:
 
 
 def first_worse(count: int, result: Callable[[int], str | None]) -> tuple[int, int] | None:
-    """(last good, first worse) of the commits 0 to ``count``; commits between the two remain unknown.
+    """(last good, first worse) of the commits 0 to ``count``; commits between the two remain
+    unknown.
 
-    Commit 0 is good, and quality is assumed to change once. ``result`` gives a commit's result against commit 0:
-    ``PASSED``, ``WORSE``, ``NOT_DECIDED``, or None if it does not train, which is no step. Returns None if the last
-    commit is not worse.
+    Commit 0 is good, and quality is assumed to change once. ``result`` gives a commit's result
+    against commit 0: ``PASSED``, ``WORSE``, ``NOT_DECIDED``, or None if it does not train, which is
+    no step. Returns None if the last commit is not worse.
 
     Examples:
         >>> first_worse(12, lambda commit: WORSE if commit >= 7 else PASSED)

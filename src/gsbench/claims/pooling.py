@@ -1,9 +1,11 @@
-"""Pooling results of many laboratories: the mean of their effects, with an interval whose error rate is known.
+"""Pooling results of many laboratories: the mean of their effects, with an interval whose error
+rate is known.
 
-A study is one archive's mean difference of two arms in one metric, over its pairs of trials (docs/verdict.md).
-Student's t tests the mean of studies, each with the same weight. Weights from the studies' standard errors would treat
-estimates from two or three seeds as exact: 7 to 10 % of the intervals of usual random-effects methods then miss the
-mean. Studies are pooled only if their protocols agree.
+A study is one archive's mean difference of two arms in one metric, over its pairs of trials
+(docs/verdict.md). Student's t tests the mean of studies, each with the same weight. Weights from
+the studies' standard errors would treat estimates from two or three seeds as exact: 7 to 10 % of
+the intervals of usual random-effects methods then miss the mean. Studies are pooled only if their
+protocols agree.
 """
 
 import math
@@ -30,10 +32,11 @@ MIN_STUDIES = 2
 
 @dataclass(frozen=True)
 class Study:
-    """One archive's difference of two arms in one metric, with its ``interval`` (None for a single pair).
+    """One archive's difference of two arms in one metric, with its ``interval`` (None for a single
+    pair).
 
-    Only studies with the same ``protocol`` are pooled. ``budget`` says what limited the growth of its arms; "" if that
-    is unknown.
+    Only studies with the same ``protocol`` are pooled. ``budget`` says what limited the growth of
+    its arms; "" if that is unknown.
     """
 
     name: str
@@ -71,7 +74,9 @@ def pool(studies: Sequence[Study]) -> Pooled:
     """
     names = [study.name for study in studies]
     if twice := sorted({name for name in names if names.count(name) > 1}):
-        raise InputError(f"{twice[0]} is given twice: results that are counted twice look surer than they are")
+        raise InputError(
+            f"{twice[0]} is given twice: results that are counted twice look surer than they are"
+        )
     refusal = ""
     if len(studies) < MIN_STUDIES:
         refusal = f"a mean needs {MIN_STUDIES} studies, and there are {len(studies)}"
@@ -86,7 +91,11 @@ def markdown_table(pooled: Pooled) -> list[str]:
     """The studies as lines of a Markdown table."""
     lines = ["| study | difference | 95 % interval | protocol |", "|---|---|---|---|"]
     for study in pooled.studies:
-        interval = "unknown" if study.interval is None else f"{study.interval.low:+.4g} to {study.interval.high:+.4g}"
+        interval = (
+            "unknown"
+            if study.interval is None
+            else f"{study.interval.low:+.4g} to {study.interval.high:+.4g}"
+        )
         lines.append(f"| {study.name} | {study.effect:+.4g} | {interval} | {study.protocol} |")
     return lines
 
@@ -98,15 +107,19 @@ def describe(pooled: Pooled) -> list[str]:
         return [f"no mean: {pooled.refusal}"]
     interval, further = test.interval(), pooled.prediction
     lines = [
-        f"mean {test.mean:+.4g} (95 % interval {interval.low:+.4g} to {interval.high:+.4g}, p {test.p:.3g}) "
+        f"mean {test.mean:+.4g} (95 % interval {interval.low:+.4g} to {interval.high:+.4g}, p "
+        f"{test.p:.3g}) "
         f"of {len(pooled.studies)} studies, each with the same weight",
         f"studies differ by a deviation of {pooled.deviation:.3g}; a further one would lie between "
         f"{further.low:+.4g} and {further.high:+.4g}",
     ]
     if len({study.budget for study in pooled.studies}) > 1:
-        budgets = "; ".join(f"{study.name}: {study.budget or 'not known'}" for study in pooled.studies)
+        budgets = "; ".join(
+            f"{study.name}: {study.budget or 'not known'}" for study in pooled.studies
+        )
         lines.append(
-            f"caution: the budgets differ ({budgets}): a difference at equal counts and one at free counts answer two "
+            f"caution: the budgets differ ({budgets}): a difference at equal counts and one at "
+            "free counts answer two "
             "questions, and this mean answers neither"
         )
     return lines
@@ -114,7 +127,8 @@ def describe(pooled: Pooled) -> list[str]:
 
 @dataclass(frozen=True)
 class PooledQuestion:
-    """The question to pool: the names that ``arm`` and ``baseline`` may have in the archives, and the metric's key.
+    """The question to pool: the names that ``arm`` and ``baseline`` may have in the archives, and
+    the metric's key.
 
     Only trials whose settings have the values of ``where`` count.
     """
@@ -128,7 +142,8 @@ class PooledQuestion:
 def pool_sources(
     sources: Sequence[Path], wanted: PooledQuestion, protocol: str | None = None
 ) -> tuple[Pooled, list[str], list[str]]:
-    """Pool all studies in ``sources``: (their mean, notes on them, a line for each source or study that is left out).
+    """Pool all studies in ``sources``: (their mean, notes on them, a line for each source or study
+    that is left out).
 
     Raises InputError if no study is left.
     """
@@ -143,7 +158,10 @@ def pool_sources(
             faults.append(f"left out: {error}")
             continue
         if twice := marks & seen.keys():
-            faults.append(f"left out: {source} has trials that {seen[min(twice)]} has, and they would count twice")
+            faults.append(
+                f"left out: {source} has trials that {seen[min(twice)]} has, and they would count "
+                "twice"
+            )
             continue
         seen |= dict.fromkeys(marks, source)
         notes += archive_notes
@@ -151,7 +169,9 @@ def pool_sources(
             if protocol is not None and study.protocol != protocol:
                 notes.append(f"{study.name}: not asked for, it is by {study.protocol}")
             elif study.interval is None:
-                faults.append(f"left out: {study.name} has one pair of trials: nothing tells how sure it is")
+                faults.append(
+                    f"left out: {study.name} has one pair of trials: nothing tells how sure it is"
+                )
             else:
                 studies.append(study)
     if not studies:
@@ -159,11 +179,14 @@ def pool_sources(
     return pool(studies), notes, faults
 
 
-def read_studies(path: Path, question: PooledQuestion, name: str) -> tuple[list[Study], list[str], set[str]]:
-    """The studies in the archive ``path``, one or more for each protocol; their labels begin with ``name``.
+def read_studies(
+    path: Path, question: PooledQuestion, name: str
+) -> tuple[list[Study], list[str], set[str]]:
+    """The studies in the archive ``path``, one or more for each protocol; their labels begin with
+    ``name``.
 
-    Also returns notes on them, and a mark of each trial (`_mark`), so that none is counted twice. Raises InputError,
-    one line, if there is no study.
+    Also returns notes on them, and a mark of each trial (`_mark`), so that none is counted twice.
+    Raises InputError, one line, if there is no study.
     """
     studies, notes = [], list[str]()
     with tempfile.TemporaryDirectory() as folder:
@@ -173,16 +196,27 @@ def read_studies(path: Path, question: PooledQuestion, name: str) -> tuple[list[
         for protocol, own in by_protocol:
             groups = _group_into_studies(own, _arm_pairs(own, question, path))
             for arms in groups:
-                qualifiers = [protocol] * (len(by_protocol) > 1) + [arms[0][0].init] * (len(groups) > 1)
+                qualifiers = [protocol] * (len(by_protocol) > 1) + [arms[0][0].init] * (
+                    len(groups) > 1
+                )
                 label = f"{name} ({', '.join(qualifiers)})" if qualifiers else name
-                questions = [Question(metric=question.metric, baseline=one, arm=other) for one, other in arms]
+                questions = [
+                    Question(metric=question.metric, baseline=one, arm=other) for one, other in arms
+                ]
                 pairs_by_arms = [pair(own, asked) for asked in questions]
                 together = Pairs(tuple(row for pairs in pairs_by_arms for row in pairs.rows))
                 if not together.rows:
-                    reason = next((f" ({line})" for pairs in pairs_by_arms for line in pairs.left_out), "")
-                    raise InputError(f"{path}: no trials can be paired in {question.metric}{reason}")
+                    reason = next(
+                        (f" ({line})" for pairs in pairs_by_arms for line in pairs.left_out), ""
+                    )
+                    raise InputError(
+                        f"{path}: no trials can be paired in {question.metric}{reason}"
+                    )
                 test = t_test(together.differences)
-                mean, interval = float(together.differences.mean()), None if test is None else test.interval()
+                mean, interval = (
+                    float(together.differences.mean()),
+                    None if test is None else test.interval(),
+                )
                 studies.append(Study(label, mean, interval, protocol, _budgets(own, arms)))
                 for (baseline, arm), pairs in zip(arms, pairs_by_arms, strict=True):
                     count = sum(len(row.seeds) for row in pairs.rows)
@@ -194,14 +228,19 @@ def read_studies(path: Path, question: PooledQuestion, name: str) -> tuple[list[
         return studies, notes, set(map(_mark, trials))
 
 
-def _group_into_studies(trials: Sequence[TrialResult], pairs: Sequence[tuple[Arm, Arm]]) -> list[list[tuple[Arm, Arm]]]:
-    """All pairs of arms as one study if each scene has one initialiser; else each pair as its own study."""
+def _group_into_studies(
+    trials: Sequence[TrialResult], pairs: Sequence[tuple[Arm, Arm]]
+) -> list[list[tuple[Arm, Arm]]]:
+    """All pairs of arms as one study if each scene has one initialiser; else each pair as its own
+    study."""
     scenes = [{trial.scene for trial in trials if trial.arm in pair} for pair in pairs]
     disjoint = sum(map(len, scenes)) == len(set().union(*scenes))
     return [list(pairs)] if disjoint else [[pair] for pair in pairs]
 
 
-def _arm_pairs(trials: Sequence[TrialResult], question: PooledQuestion, path: Path) -> list[tuple[Arm, Arm]]:
+def _arm_pairs(
+    trials: Sequence[TrialResult], question: PooledQuestion, path: Path
+) -> list[tuple[Arm, Arm]]:
     """The pair (baseline, arm) of each initialiser that has both.
 
     A name of an arm is its densifier, its densifier with its variant, or its full name.
@@ -210,7 +249,9 @@ def _arm_pairs(trials: Sequence[TrialResult], question: PooledQuestion, path: Pa
 
     def named(init: str, names: Sequence[str]) -> list[Arm]:
         own = [arm for arm in arms if arm.init == init]
-        return [arm for arm in own if {str(replace(arm, init="")), arm.densify, str(arm)} & {*names}]
+        return [
+            arm for arm in own if {str(replace(arm, init="")), arm.densify, str(arm)} & {*names}
+        ]
 
     pairs = []
     for init in sorted({arm.init for arm in arms}):
@@ -218,14 +259,16 @@ def _arm_pairs(trials: Sequence[TrialResult], question: PooledQuestion, path: Pa
         if len(baselines) > 1 or len(others) > 1:
             several = baselines if len(baselines) > 1 else others
             raise InputError(
-                f"{path}: the name fits {' and '.join(map(str, several))}: choose trials with --where "
+                f"{path}: the name fits {' and '.join(map(str, several))}: choose trials with "
+                "--where "
                 "KEY=VALUE, or give the whole name of one"
             )
         if baselines and others:
             pairs.append((baselines[0], others[0]))
     if not pairs:
         raise InputError(
-            f"{path} has no pair of {' or '.join(question.arm)} and {' or '.join(question.baseline)} (there are "
+            f"{path} has no pair of {' or '.join(question.arm)} and "
+            f"{' or '.join(question.baseline)} (there are "
             f"{', '.join(map(str, arms))})"
         )
     return pairs
@@ -234,18 +277,28 @@ def _arm_pairs(trials: Sequence[TrialResult], question: PooledQuestion, path: Pa
 def _budgets(trials: Sequence[TrialResult], pairs: Sequence[tuple[Arm, Arm]]) -> str:
     """``20,000 Gaussians (governor)``: the limits on growth in these pairs of arms."""
     arms = {arm for pair in pairs for arm in pair}
-    return " or ".join(sorted({budget_words(trial) or "not known" for trial in trials if trial.arm in arms}))
+    return " or ".join(
+        sorted({budget_words(trial) or "not known" for trial in trials if trial.arm in arms})
+    )
 
 
 def _size(trials: Sequence[TrialResult]) -> str:
-    """The iterations, view sizes and gsbench versions, in which pooled trials may differ, for the reader to judge."""
-    sizes = sorted({f"{size[0]}×{size[1]}" for trial in trials if (size := trial.record.resolution)})
+    """The iterations, view sizes and gsbench versions, in which pooled trials may differ, for the
+    reader to judge."""
+    sizes = sorted(
+        {f"{size[0]}×{size[1]}" for trial in trials if (size := trial.record.resolution)}
+    )
     steps = sorted({f"{trial.record.iterations:,}" for trial in trials})
     versions = sorted({trial.record.versions.get("gsbench", "?") for trial in trials})
-    return f"{' or '.join(steps)} iterations, {' or '.join(sizes)} px, gsbench {' or '.join(versions)}"
+    return (
+        f"{' or '.join(steps)} iterations, {' or '.join(sizes)} px, gsbench {' or '.join(versions)}"
+    )
 
 
 def _mark(trial: TrialResult) -> str:
-    """A hash that distinguishes a trial from all others, even from a repetition: that takes other seconds."""
+    """A hash that distinguishes a trial from all others, even from a repetition: that takes other
+    seconds."""
     record = trial.record
-    return sha256_of([trial.config_hash, trial.seed, record.hashes, record.seconds, dict(trial.metrics)])
+    return sha256_of(
+        [trial.config_hash, trial.seed, record.hashes, record.seconds, dict(trial.metrics)]
+    )

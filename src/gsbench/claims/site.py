@@ -1,6 +1,8 @@
-"""A static site from archives of results: a first page with all verdicts, and a report of each archive.
+"""A static site from archives of results: a first page with all verdicts, and a report of each
+archive.
 
-Archives may come from strangers: their texts are escaped in pages, and never used in names of files.
+Archives may come from strangers: their texts are escaped in pages, and never used in names of
+files.
 """
 
 import base64
@@ -31,9 +33,11 @@ INDEX, REPORTS = "index.html", "reports"
 
 
 def write_site(archives: Sequence[Path], out: Path, title: str, scratch: Path) -> list[str]:
-    """Write the site into the folder ``out``; return a line for each archive that is left out, with the reason.
+    """Write the site into the folder ``out``; return a line for each archive that is left out, with
+    the reason.
 
-    Archives are unpacked into the empty folder ``scratch``. Raises InputError if no archive can be shown.
+    Archives are unpacked into the empty folder ``scratch``. Raises InputError if no archive can be
+    shown.
     """
     sections: list[dict[str, Any]] = []
     left_out: list[str] = []
@@ -53,7 +57,13 @@ def write_site(archives: Sequence[Path], out: Path, title: str, scratch: Path) -
     script = files("gsbench.claims").joinpath("site.js").read_text(encoding="utf-8")
     # The page's Content-Security-Policy runs no script but the one with this hash.
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
-    values = {"title": title, "sections": sections, "left_out": left_out, "script": script, "script_hash": digest}
+    values = {
+        "title": title,
+        "sections": sections,
+        "left_out": left_out,
+        "script": script,
+        "script_hash": digest,
+    }
     page = fill("site.html.j2", "gsbench.claims", **values)
     (out / INDEX).write_text(page, encoding="utf-8")
     return left_out
@@ -62,8 +72,8 @@ def write_site(archives: Sequence[Path], out: Path, title: str, scratch: Path) -
 def _section(experiment: Experiment, key: str) -> dict[str, Any]:
     """An experiment's section of the first page; ``key`` is for names of files and anchors.
 
-    It has the verdicts on declared claims, a line on each compared pair of arms, and a table of arms × scenes for each
-    quantity.
+    It has the verdicts on declared claims, a line on each compared pair of arms, and a table of
+    arms × scenes for each quantity.
     """
     trials, notes = experiment.trials, list[str]()
     claims: list[Verdict] = []
@@ -86,16 +96,25 @@ def _section(experiment: Experiment, key: str) -> dict[str, Any]:
         "protocol": ", ".join(sorted({trial.record.protocol for trial in trials})),
         "iterations": ", ".join(map(str, sorted({trial.record.iterations for trial in trials}))),
         "machine": ", ".join(sorted({trial.machine or "not recorded" for trial in trials})),
-        "gsbench": ", ".join(sorted({trial.record.versions.get("gsbench", "unknown") for trial in trials})),
+        "gsbench": ", ".join(
+            sorted({trial.record.versions.get("gsbench", "unknown") for trial in trials})
+        ),
     }
     lines = [headline(one) for one in judged]
     ranks = [rank_plot(one) for one in rank_all(arms, choose_quantities(arms))] if pairs else []
-    shown = {"facts": list(facts.items()), "claims": claims, "lines": lines, "tables": tables, "notes": notes}
+    shown = {
+        "facts": list(facts.items()),
+        "claims": claims,
+        "lines": lines,
+        "tables": tables,
+        "notes": notes,
+    }
     return {"name": experiment.name, "key": key, "ranks": ranks} | shown
 
 
 def _claims(experiment: Experiment) -> list[Verdict]:
-    """The verdicts on declared claims, as `gsbench check --from` gives them, without those of gates."""
+    """The verdicts on declared claims, as `gsbench check --from` gives them, without those of
+    gates."""
     declared = [one for one in read_declarations(experiment.folder) if one.kind == "claims"]
     if not declared:
         return []
@@ -111,11 +130,17 @@ def _by_quantity(table: Table) -> Iterator[Table]:
         group = slice(start, start + count)
         start += count
         columns = tuple(replace(column, group="") for column in table.columns[group])
-        rows = tuple(replace(row, entries=row.entries[group], rule_above=False) for row in table.rows)
+        rows = tuple(
+            replace(row, entries=row.entries[group], rule_above=False) for row in table.rows
+        )
         yield replace(table, title=name, columns=columns, rows=rows, notes=())
 
 
 def _unique_key(name: str, taken: set[str]) -> str:
     """A key in lower case that is not ``taken``: file systems may not distinguish capitals."""
     plain = re.sub(r"[^a-z0-9_-]+", "-", name.lower()).strip("-") or "experiment"
-    return next(key for n in range(1, len(taken) + 2) if (key := plain if n == 1 else f"{plain}-{n}") not in taken)
+    return next(
+        key
+        for n in range(1, len(taken) + 2)
+        if (key := plain if n == 1 else f"{plain}-{n}") not in taken
+    )

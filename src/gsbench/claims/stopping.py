@@ -1,4 +1,5 @@
-"""Adding seeds in planned looks until every question is decided, for checks and for sweeps that stop when decided.
+"""Adding seeds in planned looks until every question is decided, for checks and for sweeps that
+stop when decided.
 
 In such a sweep, each compared pair of arms is a question about ``eval.primary``.
 """
@@ -26,17 +27,32 @@ from gsbench.runs.layout import SEED
 from gsbench.runs.trial_record import TrialRecord
 from gsbench.words import counted
 
-NO_RESULTS: dict[str, Any] = {"raster": "", "protocol": "", "iterations": 0, "num_init_points": None}
-NO_RESULTS |= {"num_gaussians": 0, "peak_memory_mb": None, "metrics": {}, "unavailable": {}, "seconds": {}}
+NO_RESULTS: dict[str, Any] = {
+    "raster": "",
+    "protocol": "",
+    "iterations": 0,
+    "num_init_points": None,
+}
+NO_RESULTS |= {
+    "num_gaussians": 0,
+    "peak_memory_mb": None,
+    "metrics": {},
+    "unavailable": {},
+    "seconds": {},
+}
 NO_RESULTS |= {"hashes": {}, "versions": {}}
 
 log = logging.getLogger(__name__)
 
-KeyAndSeed = tuple[str, int]  # a trial's key (its folder within the experiment without the seed) and its seed
+# a trial's key (its folder within the experiment without the seed) and its seed
+KeyAndSeed = tuple[str, int]
 
 
-def trials_of_look(declaration: Declaration, indices: Sequence[int], seeds: int) -> list[KeyAndSeed]:
-    """The trials that the questions at ``indices`` need for their first ``seeds`` seeds, in the order of seeds."""
+def trials_of_look(
+    declaration: Declaration, indices: Sequence[int], seeds: int
+) -> list[KeyAndSeed]:
+    """The trials that the questions at ``indices`` need for their first ``seeds`` seeds, in the
+    order of seeds."""
     questions = [declaration.questions[k] for k in indices]
     needed = [
         (question.seeds[rank], rank, key)
@@ -45,21 +61,27 @@ def trials_of_look(declaration: Declaration, indices: Sequence[int], seeds: int)
         for both in question.scenes.values()
         for key in both
     ]
-    return list(dict.fromkeys((key, seed) for seed, _, key in sorted(needed, key=lambda one: one[1])))
+    return list(
+        dict.fromkeys((key, seed) for seed, _, key in sorted(needed, key=lambda one: one[1]))
+    )
 
 
 def run_looks(
-    declaration: Declaration, judged: Callable[[], list[Verdict]], run: Callable[[list[KeyAndSeed]], object]
+    declaration: Declaration,
+    judged: Callable[[], list[Verdict]],
+    run: Callable[[list[KeyAndSeed]], object],
 ) -> list[Verdict]:
     """Add seeds look by look until all questions are decided, and return the verdicts.
 
-    ``judged`` gives the verdicts so far, ``run`` runs trials unless they are done. A question whose trials failed gets
-    no further seeds; the others continue.
+    ``judged`` gives the verdicts so far, ``run`` runs trials unless they are done. A question whose
+    trials failed gets no further seeds; the others continue.
     """
     stuck: set[int] = set()
     verdicts = judged()
     for seeds in declaration.looks:
-        undecided = [k for k, verdict in enumerate(verdicts) if not verdict.final and k not in stuck]
+        undecided = [
+            k for k, verdict in enumerate(verdicts) if not verdict.final and k not in stuck
+        ]
         if not undecided:
             break
         if needed := trials_of_look(declaration, undecided, seeds):
@@ -87,23 +109,32 @@ class SweepInLooks:
         """A line about the looks for a dry run."""
         questions, looks = self.declaration.questions, self.declaration.looks
         indices = range(len(questions))
-        first, most = (len(trials_of_look(self.declaration, indices, seeds)) for seeds in (looks[0], looks[-1]))
+        first, most = (
+            len(trials_of_look(self.declaration, indices, seeds)) for seeds in (looks[0], looks[-1])
+        )
         return (
-            f"stops when decided, by {questions[0].metric} and a least difference of {questions[0].least:g}: "
-            f"{counted(len(questions), 'pair')} of arms, looks at {', '.join(map(str, looks))} seeds, "
+            f"stops when decided, by {questions[0].metric} and a least difference of "
+            f"{questions[0].least:g}: "
+            f"{counted(len(questions), 'pair')} of arms, looks at {', '.join(map(str, looks))} "
+            "seeds, "
             f"{first} trials until the first, {most} at most"
         )
 
 
 def plan_sweep(trials: Sequence[Trial]) -> SweepInLooks:
-    """Plan the looks of a sweep's trials; raises InputError, one line, if the sweep cannot be run in looks."""
+    """Plan the looks of a sweep's trials; raises InputError, one line, if the sweep cannot be run
+    in looks."""
     homes = {trial.files.home for trial in trials}
     metrics = {trial.values["eval"].get("primary") for trial in trials}
     if len(homes) > 1 or len(metrics) > 1:
-        raise InputError("launch.stop_when_decided: all trials of the sweep need one name and one eval.primary")
+        raise InputError(
+            "launch.stop_when_decided: all trials of the sweep need one name and one eval.primary"
+        )
     (home,), (metric,) = homes, metrics
     if metric is None:
-        raise InputError("launch.stop_when_decided needs the metric that decides, as eval.primary=psnr")
+        raise InputError(
+            "launch.stop_when_decided needs the metric that decides, as eval.primary=psnr"
+        )
     values = trials[0].values
     facts = facts_for(metric, values)
     least = values["launch"]["least_difference"] or facts.worthwhile
@@ -116,15 +147,27 @@ def plan_sweep(trials: Sequence[Trial]) -> SweepInLooks:
     seeds = _seeds(expected)
     chosen = choose_pairs(sorted({trial.arm for trial in expected}))
     if not chosen:
-        raise InputError("launch.stop_when_decided compares arms, and this sweep has one: give two densifiers")
+        raise InputError(
+            "launch.stop_when_decided compares arms, and this sweep has one: give two densifiers"
+        )
     questions = []
     for baseline, arm in chosen:
         scenes = _scenes(expected, baseline, arm)
         if not scenes:
-            raise InputError(f"launch.stop_when_decided: {arm} and {baseline} have no scene in common")
+            raise InputError(
+                f"launch.stop_when_decided: {arm} and {baseline} have no scene in common"
+            )
         sign, least = facts.direction, float(least)
         questions.append(
-            Question(metric=metric, sign=sign, least=least, baseline=baseline, arm=arm, scenes=scenes, seeds=seeds)
+            Question(
+                metric=metric,
+                sign=sign,
+                least=least,
+                baseline=baseline,
+                arm=arm,
+                scenes=scenes,
+                seeds=seeds,
+            )
         )
     declaration = declared_now(questions=tuple(questions), looks=plan_looks(len(seeds)))
     by_key = {(one.key, one.seed): trial for one, trial in zip(expected, trials, strict=True)}
@@ -132,7 +175,8 @@ def plan_sweep(trials: Sequence[Trial]) -> SweepInLooks:
 
 
 def headline(verdict: Verdict) -> str:
-    """A pair's verdict in a sentence: ``better in PSNR on this scene: +0.120 (…), with 2 of at most 6 seeds``"""
+    """A pair's verdict in a sentence: ``better in PSNR on this scene: +0.120 (…), with 2 of at most
+    6 seeds``"""
     question = verdict.question
     against = f"{question.arm} against {question.baseline}"
     if verdict.interval is None:
@@ -143,7 +187,8 @@ def headline(verdict: Verdict) -> str:
 
 
 def _expected(trial: Trial) -> TrialResult:
-    """A trial that has not run as a `TrialResult` without results, so that arms can be paired beforehand."""
+    """A trial that has not run as a `TrialResult` without results, so that arms can be paired
+    beforehand."""
     values, folder = trial.values, trial.folder
     record = TrialRecord(
         status="complete",  # the only status that the type allows; no file has this record
@@ -155,23 +200,30 @@ def _expected(trial: Trial) -> TrialResult:
         **NO_RESULTS,
     )
     result = TrialResult(folder, folder.name.partition(SEED)[0], record)
-    return replace(result, settings=Configurations({result.key: flatten(yaml.safe_load(trial.yaml))}))
+    return replace(
+        result, settings=Configurations({result.key: flatten(yaml.safe_load(trial.yaml))})
+    )
 
 
 def facts_for(metric: str, values: Mapping[str, Any]) -> MetricFacts:
-    """The facts of a metric of trials with the configuration ``values``; raises InputError for an unknown metric."""
+    """The facts of a metric of trials with the configuration ``values``; raises InputError for an
+    unknown metric."""
     shipped = find_metric(metric)
     if shipped is not None:
         return shipped
-    from gsbench.pipeline.parts import build_metrics  # here, since only a user's own metric needs it
+    # here, since only a user's own metric needs it
+    from gsbench.pipeline.parts import build_metrics
 
     return facts_of(metric, build_metrics(values["eval"], values["allow_targets"])[metric])
 
 
 def _seeds(trials: Sequence[TrialResult]) -> tuple[int, ...]:
-    """The seeds of all scenes and arms, in the order of the sweep; raises InputError if they differ."""
+    """The seeds of all scenes and arms, in the order of the sweep; raises InputError if they
+    differ."""
     groups = group_by(trials, lambda trial: (trial.scene, trial.arm))
-    seeds = {key: tuple(dict.fromkeys(trial.seed for trial in group)) for key, group in groups.items()}
+    seeds = {
+        key: tuple(dict.fromkeys(trial.seed for trial in group)) for key, group in groups.items()
+    }
     first = next(iter(seeds.values()))
     for (scene, arm), own in seeds.items():
         if own != first:
@@ -181,7 +233,8 @@ def _seeds(trials: Sequence[TrialResult]) -> tuple[int, ...]:
             )
     if len(first) < FIRST_LOOK:
         raise InputError(
-            f"launch.stop_when_decided needs at least {FIRST_LOOK} seeds, as seed=0,1,2,3: the most it adds"
+            f"launch.stop_when_decided needs at least {FIRST_LOOK} seeds, as seed=0,1,2,3: the "
+            "most it adds"
         )
     return first
 
@@ -190,7 +243,9 @@ def _scenes(trials: Sequence[TrialResult], baseline: Arm, arm: Arm) -> dict[str,
     """The keys of both arms' trials on each scene that has both."""
     scenes = {}
     for scene, group in group_by(trials, lambda trial: trial.scene).items():
-        baseline_keys, arm_keys = ({trial.key for trial in group if trial.arm == side} for side in (baseline, arm))
+        baseline_keys, arm_keys = (
+            {trial.key for trial in group if trial.arm == side} for side in (baseline, arm)
+        )
         if len(baseline_keys) == len(arm_keys) == 1:
             scenes[scene] = baseline_keys.pop(), arm_keys.pop()
     return scenes

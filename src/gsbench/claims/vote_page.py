@@ -1,6 +1,8 @@
-"""The page on which people compare renders blindly: which views it shows, its pictures, and its key.
+"""The page on which people compare renders blindly: which views it shows, its pictures, and its
+key.
 
-The page is a folder of one HTML file and pictures. It works from a file, sends nothing, and has no names of arms.
+The page is a folder of one HTML file and pictures. It works from a file, sends nothing, and has no
+names of arms.
 """
 
 import base64
@@ -28,22 +30,27 @@ from gsbench.runs.votes import BLURRED, PHOTOGRAPH, Chosen, Kind, RoundKey, Show
 PAGE, PICTURES = "index.html", "pictures"
 SHOWN_AGAIN = 10  # every tenth pair is shown a second time, with its sides swapped
 MIN_TRAPS, PAIRS_PER_TRAP = 4, 8
-TRAPS_PER_MISTAKE = 6  # one of six traps may fail; of four or five none, which one guesser in sixteen passes
+# one of six traps may fail; of four or five none, which one guesser in sixteen passes
+TRAPS_PER_MISTAKE = 6
 BLUR = 0.008  # of the longest side: the deviation (px) of a trap's blur, 3 px for a picture of 400
 MIN_BLUR = 2.0  # px
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A view of two arms that may be shown, with the mean difference (8-bit levels) of its renders."""
+    """A view of two arms that may be shown, with the mean difference (8-bit levels) of its
+    renders."""
 
     trials: TrialPair
     view: str
     difference: float
 
 
-def find_candidates(trials: Sequence[TrialResult], one: Arm, other: Arm) -> dict[str, list[Candidate]]:
-    """Every test view of two arms by scene, for one seed of each view; seeds take turns over the views.
+def find_candidates(
+    trials: Sequence[TrialResult], one: Arm, other: Arm
+) -> dict[str, list[Candidate]]:
+    """Every test view of two arms by scene, for one seed of each view; seeds take turns over the
+    views.
 
     Raises InputError if the arms have no pair of trials with pictures.
     """
@@ -57,7 +64,10 @@ def find_candidates(trials: Sequence[TrialResult], one: Arm, other: Arm) -> dict
             difference = float(absolute_error(first, second).mean())
             candidates.setdefault(scene, []).append(Candidate(pair, view, difference))
     if not candidates:
-        raise InputError(f"{one} and {other} have no pair of trials of one scene and seed, so nothing can be compared")
+        raise InputError(
+            f"{one} and {other} have no pair of trials of one scene and seed, so nothing can be "
+            "compared"
+        )
     return candidates
 
 
@@ -66,9 +76,12 @@ def choose_views(
 ) -> list[tuple[Candidate, Chosen]]:
     """Choose at most ``count`` views, spread equally over scenes.
 
-    Half of a scene's views are those with the most different renders, the others are chosen at random.
+    Half of a scene's views are those with the most different renders, the others are chosen at
+    random.
     """
-    left_over = {scene: len(by_scene[scene]) for scene in rng.sample(sorted(by_scene), len(by_scene))}
+    left_over = {
+        scene: len(by_scene[scene]) for scene in rng.sample(sorted(by_scene), len(by_scene))
+    }
     wanted = dict.fromkeys(left_over, 0)
     while sum(wanted.values()) < count and any(left_over.values()):
         # The scene with the fewest chosen views that has more.
@@ -85,12 +98,17 @@ def choose_views(
 
 
 def make_round(
-    trials: Sequence[TrialResult], arms: Sequence[Arm], pairs: int, people: int, out: Path, rng: random.Random
+    trials: Sequence[TrialResult],
+    arms: Sequence[Arm],
+    pairs: int,
+    people: int,
+    out: Path,
+    rng: random.Random,
 ) -> RoundKey:
     """Write the page of a new round into the new folder ``out``, and return its key.
 
-    ``arms`` begin with the baseline; every two are compared. ``rng`` chooses views, order and sides, so it must not be
-    guessable. Raises InputError if arms cannot be compared.
+    ``arms`` begin with the baseline; every two are compared. ``rng`` chooses views, order and
+    sides, so it must not be guessable. Raises InputError if arms cannot be compared.
     """
     shown: list[tuple[Showing, Candidate]] = []
     combinations = list(itertools.combinations(arms, 2))
@@ -101,7 +119,9 @@ def make_round(
         swapped = rng.sample([False, True] * ((len(chosen) + 1) // 2), len(chosen))
         for (candidate, how), swap in zip(chosen, swapped, strict=True):
             sides = (other, one) if swap else (one, other)
-            shown.append((_showing("pair", candidate, str(sides[0]), str(sides[1]), how), candidate))
+            shown.append(
+                (_showing("pair", candidate, str(sides[0]), str(sides[1]), how), candidate)
+            )
     traps = max(MIN_TRAPS, len(shown) // PAIRS_PER_TRAP)
     again = rng.sample(shown, max(1, len(shown) // SHOWN_AGAIN))
     views = [rng.choice(shown)[1] for _ in range(traps)]
@@ -111,10 +131,14 @@ def make_round(
         shown.append((_showing("trap", candidate, left, right), candidate))
     rng.shuffle(shown)
     for first, candidate in again:
-        swapped_showing = replace(first, id=_new_id(), kind="again", left=first.right, right=first.left, of=first.id)
+        swapped_showing = replace(
+            first, id=_new_id(), kind="again", left=first.right, right=first.left, of=first.id
+        )
         # In the last third, and so far from its first showing as that allows.
         before = next(place for place, (one, _) in enumerate(shown) if one is first) + 1
-        shown.insert(rng.randint(max(before, 2 * len(shown) // 3), len(shown)), (swapped_showing, candidate))
+        shown.insert(
+            rng.randint(max(before, 2 * len(shown) // 3), len(shown)), (swapped_showing, candidate)
+        )
     key = RoundKey(
         salt=secrets.token_hex(32),
         time=time.strftime(STAMP, time.gmtime()),
@@ -131,7 +155,9 @@ def _new_id() -> str:
     return secrets.token_hex(6)
 
 
-def _showing(kind: Kind, candidate: Candidate, left: str, right: str, chosen: Chosen = "") -> Showing:
+def _showing(
+    kind: Kind, candidate: Candidate, left: str, right: str, chosen: Chosen = ""
+) -> Showing:
     trial = candidate.trials[0]
     return Showing(
         id=_new_id(),
@@ -145,14 +171,19 @@ def _showing(kind: Kind, candidate: Candidate, left: str, right: str, chosen: Ch
     )
 
 
-def _write_page(key: RoundKey, candidates: Sequence[Candidate], out: Path, rng: random.Random) -> None:
+def _write_page(
+    key: RoundKey, candidates: Sequence[Candidate], out: Path, rng: random.Random
+) -> None:
     (out / PICTURES).mkdir(parents=True)
     entries: dict[str, dict[str, str]] = {}
     places = list(enumerate(key.showings))
     rng.shuffle(places)  # times of files tell no order
     for place, showing in places:
         pictures = _pictures(showing, candidates[place])
-        names = {what: f"{PICTURES}/{_new_id()}.png" for what in rng.sample(sorted(pictures), len(pictures))}
+        names = {
+            what: f"{PICTURES}/{_new_id()}.png"
+            for what in rng.sample(sorted(pictures), len(pictures))
+        }
         for what, name in names.items():
             # Saved from the pixels alone, so no text or time of the trial's file comes along.
             Image.fromarray(pictures[what]).save(out / name, optimize=True)
@@ -168,7 +199,9 @@ def _write_page(key: RoundKey, candidates: Sequence[Candidate], out: Path, rng: 
 def _pictures(showing: Showing, candidate: Candidate) -> dict[str, Pixels]:
     """The photograph and the pictures of both sides, [H, W, 3] uint8."""
     *renders, truth = read_compared(*candidate.trials, candidate.view)
-    sides = {str(trial.arm): render for trial, render in zip(candidate.trials, renders, strict=True)}
+    sides = {
+        str(trial.arm): render for trial, render in zip(candidate.trials, renders, strict=True)
+    }
     sides[PHOTOGRAPH] = truth
     if showing.kind == "trap":
         blur = ImageFilter.GaussianBlur(max(MIN_BLUR, BLUR * max(truth.shape)))

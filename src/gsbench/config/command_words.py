@@ -1,4 +1,5 @@
-"""The words of a command line, checked before Hydra composes anything: a wrong word is refused with a reason."""
+"""The words of a command line, checked before Hydra composes anything: a wrong word is refused with
+a reason."""
 
 import re
 import shlex
@@ -21,18 +22,42 @@ from gsbench.words import did_you_mean
 
 GROUPS = ("scene", "init", "densify", "raster", "train", "eval", "tracking", "launch", "experiment")
 EXTERNAL_FOLDER = "external"  # subfolder of a group for other programs; glob(*) does not list it
-IN_TRIAL_PATH = ("name", "seed")  # not in the configuration's hash, but in the path of the trial's folder
-OPTIONS = ("-m", "--multirun", "--dry-run", "--config-dir", "--cfg", "--info", "--help", "--version")
-MAIN_CONFIG_OPTIONS = ("--config-name", "-cn", "--config-path", "-cp")  # of Hydra: they replace the main configuration
+# not in the configuration's hash, but in the path of the trial's folder
+IN_TRIAL_PATH = ("name", "seed")
+OPTIONS = (
+    "-m",
+    "--multirun",
+    "--dry-run",
+    "--config-dir",
+    "--cfg",
+    "--info",
+    "--help",
+    "--version",
+)
+# of Hydra: they replace the main configuration
+MAIN_CONFIG_OPTIONS = ("--config-name", "-cn", "--config-path", "-cp")
 # Settings that are texts, by the last part of their keys.
-TEXTS = ("name", "runs", "path", "images", "sparse", "masks", "train_list", "test_list", "weights", "uri", "version")
+TEXTS = (
+    "name",
+    "runs",
+    "path",
+    "images",
+    "sparse",
+    "masks",
+    "train_list",
+    "test_list",
+    "weights",
+    "uri",
+    "version",
+)
 MAX_POINTS = 1_000_000  # values of one list; more would fill the memory
 MAX_BRACKETS = 40  # open at once in a word, since Hydra's parser recurses into them
 KEY = re.compile(r"[+~]*\w+([./]\w+)*")
 
 
 def parse(argv: Sequence[str]) -> tuple[list[str], bool, bool]:
-    """The overrides, whether to expand lists (``-m``), and whether to only list the trials (``--dry-run``)."""
+    """The overrides, whether to expand lists (``-m``), and whether to only list the trials
+    (``--dry-run``)."""
     overrides: list[str] = []
     folders: list[Path] = []
     multirun = dry_run = False
@@ -48,13 +73,18 @@ def parse(argv: Sequence[str]) -> tuple[list[str], bool, bool]:
             name = word.partition("=")[2] or next(words, "NAME")
             name = "NAME" if "-cp" in word or "path" in word else name
             raise InputError(
-                f"{word}: gsbench's main configuration is its own: write yours to FOLDER/experiment/{name}.yaml, and "
+                f"{word}: gsbench's main configuration is its own: write yours to "
+                f"FOLDER/experiment/{name}.yaml, and "
                 f"give --config-dir FOLDER +experiment={name}"
             )
         elif word.startswith("-"):
             group = word.lstrip("-").partition("=")[0]
             is_setting = group.partition(".")[0] in GROUPS
-            near = f"; a setting has no dashes: {group}=…" if is_setting else did_you_mean(word, OPTIONS)
+            near = (
+                f"; a setting has no dashes: {group}=…"
+                if is_setting
+                else did_you_mean(word, OPTIONS)
+            )
             raise InputError(
                 f"{word} is not an option{near} "
                 "(there are -m, --dry-run, --config-dir FOLDER, --cfg job, --info, --help)"
@@ -65,11 +95,15 @@ def parse(argv: Sequence[str]) -> tuple[list[str], bool, bool]:
 
 
 def search_path(folders: Sequence[Path], overrides: Sequence[str]) -> list[str]:
-    """The word ``hydra.searchpath=…`` that ``--config-dir`` stands for, in a list; empty without folders."""
+    """The word ``hydra.searchpath=…`` that ``--config-dir`` stands for, in a list; empty without
+    folders."""
     if not folders:
         return []
     if len(folders) > 1 or any(word.startswith("hydra.searchpath=") for word in overrides):
-        raise InputError("--config-dir names one folder: for several, give hydra.searchpath=[file://A,file://B] alone")
+        raise InputError(
+            "--config-dir names one folder: for several, give "
+            "hydra.searchpath=[file://A,file://B] alone"
+        )
     if folders[0] == Path():
         raise InputError("--config-dir needs a folder")
     if not folders[0].is_dir():
@@ -82,16 +116,23 @@ def check_words(words: Sequence[str]) -> None:
     """Raise InputError for the first word that has no effect or that Hydra cannot take."""
     experiments = [word for word in words if word.startswith("+experiment=")]
     if len(experiments) > 1:
-        raise InputError(f"{' '.join(experiments)}: two experiments are two sweeps: give a command for each")
+        raise InputError(
+            f"{' '.join(experiments)}: two experiments are two sweeps: give a command for each"
+        )
     for word in words:
         override, key = parse_word(word), key_of(word)
-        if key.startswith(("hydra.", "hydra/")):  # the rest about them is checked after composition (config/trust.py)
+        # the rest about them is checked after composition (config/trust.py)
+        if key.startswith(("hydra.", "hydra/")):
             if override.is_sweep_override():
-                raise InputError(f"{word}: Hydra's own settings apply to all trials, so choose one value")
+                raise InputError(
+                    f"{word}: Hydra's own settings apply to all trials, so choose one value"
+                )
         elif key == "experiment" or key.startswith(("experiment/", "experiment@", "experiment.")):
             _check_experiment_word(word, override)
         elif "@" in key:
-            raise InputError(f"{word!r}: a group has one place, so leave out the @ and what follows it")
+            raise InputError(
+                f"{word!r}: a group has one place, so leave out the @ and what follows it"
+            )
         elif override.is_delete():
             check_removal(override)
         elif key in GROUPS and not _is_choice(override):
@@ -103,7 +144,8 @@ def check_words(words: Sequence[str]) -> None:
 def check_text(word: str) -> None:
     """Raise InputError for a text that Hydra would read as a number and write differently.
 
-    ``name=1_1`` would become 11, and ``name=1e3`` 1000.0, so results would land in a folder that nobody named.
+    ``name=1_1`` would become 11, and ``name=1e3`` 1000.0, so results would land in a folder that
+    nobody named.
     """
     key, _, values = word.partition("=")
     for text in map(str.strip, values.split(",")):
@@ -113,27 +155,38 @@ def check_text(word: str) -> None:
             except ValueError:
                 continue
             if number != text:
-                raise InputError(f"{word!r}: {text} would be read as the number {number}: type '{key}=\"{text}\"'")
+                raise InputError(
+                    f"{word!r}: {text} would be read as the number {number}: type "
+                    f"'{key}=\"{text}\"'"
+                )
             break
 
 
 def check_removal(override: Override) -> None:
-    """Raise InputError for a word that removes anything but an option of a class, which may have other options."""
+    """Raise InputError for a word that removes anything but an option of a class, which may have
+    other options."""
     group, dot, _ = bare_key(override.get_key_element()).partition(".")
     if not dot or group not in (*COMPONENTS, "raster"):
-        raise InputError(f"{override.input_line!r}: a setting cannot be removed: give it another value")
+        raise InputError(
+            f"{override.input_line!r}: a setting cannot be removed: give it another value"
+        )
 
 
 def typed_permissions(words: Sequence[str]) -> tuple[str, ...]:
-    """The names that a command line allows by ``allow_targets=[…]``; if given twice, the last counts."""
+    """The names that a command line allows by ``allow_targets=[…]``; if given twice, the last
+    counts."""
     allowed: tuple[str, ...] = ()
     for word in words:
         override = parse_word(word)
         if key_of(word) != PERMISSIONS or override.is_sweep_override():
             continue
         names: Any = override.value()
-        if not isinstance(names, list) or not all(isinstance(name, str) and name and "$" not in name for name in names):
-            raise InputError(f"{word}: {PERMISSIONS} is a list of names, such as {PERMISSIONS}=[mine]")
+        if not isinstance(names, list) or not all(
+            isinstance(name, str) and name and "$" not in name for name in names
+        ):
+            raise InputError(
+                f"{word}: {PERMISSIONS} is a list of names, such as {PERMISSIONS}=[mine]"
+            )
         allowed = tuple(names)
     return allowed
 
@@ -156,10 +209,14 @@ def check_search_path(words: Sequence[str], allowed: Sequence[str]) -> None:
                 continue
             package = path.replace("/", ".")
             if scheme != "pkg":
-                raise InputError(f"hydra.searchpath: {place} is neither a folder (file://…) nor a package (pkg://…)")
+                raise InputError(
+                    f"hydra.searchpath: {place} is neither a folder (file://…) nor a package (pkg://…)"
+                )
             if not is_allowed(package, (PACKAGE, *allowed)):
                 advice = permission_advice([package.split(".")[0]], allowed)
-                raise InputError(f"hydra.searchpath: {place} imports a package; if you trust it, {advice}")
+                raise InputError(
+                    f"hydra.searchpath: {place} imports a package; if you trust it, {advice}"
+                )
 
 
 @cache
@@ -169,14 +226,18 @@ def parse_word(word: str) -> Override:
         raise InputError(f"{word!r} is not a setting like key=value")
     open_at_once = accumulate(((letter in "[{(") - (letter in "]})") for letter in word), initial=0)
     if max(open_at_once) > MAX_BRACKETS:
-        raise InputError(f"{word[:40]!r}… opens more than {MAX_BRACKETS} brackets within each other")
+        raise InputError(
+            f"{word[:40]!r}… opens more than {MAX_BRACKETS} brackets within each other"
+        )
     try:
         override = OverridesParser.create().parse_override(word)
     except ValueError as error:  # such as a number with more digits than Python converts
         raise InputError(f"{word[:40]!r}… is not a setting like key=value ({error})") from None
     except HydraException as error:
         reason = re.sub(r",? expecting .*", "", str(error).splitlines()[0])
-        raise InputError(f"{word!r} is not a setting like key=value ({reason}){_quoted(word)}") from error
+        raise InputError(
+            f"{word!r} is not a setting like key=value ({reason}){_quoted(word)}"
+        ) from error
     if not override.key_or_group.strip():
         raise InputError(f"{word!r} names no setting")
     return override
@@ -196,11 +257,14 @@ def value_text(value: object) -> str:
     """A plain value as a word's value."""
     if isinstance(value, list):
         return f"[{','.join(map(value_text, value))}]"
-    return "null" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
+    return (
+        "null" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
+    )
 
 
 def hint_for(word: str) -> str:
-    """A hint for a word that is no setting: ``; did you mean scene=photos?`` for a choice, or how to choose in a group.
+    """A hint for a word that is no setting: ``; did you mean scene=photos?`` for a choice, or how
+    to choose in a group.
 
     Empty for any other word.
     """
@@ -212,20 +276,27 @@ def hint_for(word: str) -> str:
 
 
 def _quoted(word: str) -> str:
-    """A hint that quotes the word's value, for a value with characters that mean something to Hydra."""
+    """A hint that quotes the word's value, for a value with characters that mean something to
+    Hydra."""
     key, _, value = word.partition("=")
     if not KEY.fullmatch(key):
         return ""
     function = re.fullmatch(r"(\w+)\((.*)\)", value)
     if function and function.group(1) != "glob":
         return ""  # in quotes it would be a text, not a list of values
-    start, value, end = (f"{key}=glob(", function.group(2), ")") if function else (f"{key}=", value, "")
+    start, value, end = (
+        (f"{key}=glob(", function.group(2), ")") if function else (f"{key}=", value, "")
+    )
     quoted = f"{start}'{value}'{end}" if '"' in value else f'{start}"{value}"{end}'
-    return f"; special characters need their own quotes inside those of the shell: {shlex.quote(quoted)}"
+    return (
+        "; special characters need their own quotes inside those of the shell: "
+        f"{shlex.quote(quoted)}"
+    )
 
 
 def check_single(words: Sequence[str], advice: str) -> None:
-    """`check_words`, and raise InputError with the ``advice`` for a word that lists several values."""
+    """`check_words`, and raise InputError with the ``advice`` for a word that lists several
+    values."""
     check_words(words)
     if swept := [word for word in words if is_sweep(word)]:
         raise InputError(f"{swept[0]} lists several values: {advice}")
@@ -237,7 +308,8 @@ def is_sweep(word: str) -> bool:
 
 
 def check_sweep(override: Override) -> None:
-    """Raise InputError for a sweep that has no list of values, or whose values would all give the same trial."""
+    """Raise InputError for a sweep that has no list of values, or whose values would all give the
+    same trial."""
     if not override.is_discrete_sweep():
         key = bare_key(override.get_key_element())
         raise InputError(
@@ -248,7 +320,8 @@ def check_sweep(override: Override) -> None:
 
 
 def grid_points(overrides: Sequence[Override]) -> list[list[str]]:
-    """The words of every point of the grid that ``overrides`` span. If two set one key, the later counts."""
+    """The words of every point of the grid that ``overrides`` span. If two set one key, the later
+    counts."""
     choices: dict[str, list[str]] = {}
     for override in overrides:
         key = override.get_key_element()
@@ -264,12 +337,15 @@ def grid_points(overrides: Sequence[Override]) -> list[list[str]]:
             if len(choices[key]) > MAX_POINTS:
                 raise InputError(f"{override.input_line} lists more than {MAX_POINTS:,} values")
         else:
-            choices[key] = [key if override.is_delete() else f"{key}={override.get_value_element_as_str()}"]
+            choices[key] = [
+                key if override.is_delete() else f"{key}={override.get_value_element_as_str()}"
+            ]
     return [list(point) for point in product(*choices.values())]
 
 
 def is_interval(override: Override) -> bool:
-    """Return whether a word gives an interval in which a value is searched, instead of a list of values."""
+    """Return whether a word gives an interval in which a value is searched, instead of a list of
+    values."""
     return override.is_sweep_override() and not override.is_discrete_sweep()
 
 
@@ -277,7 +353,9 @@ def check_makes_trials(override: Override) -> None:
     """Raise InputError for a setting whose values would all give the same trial."""
     key = bare_key(override.get_key_element())
     if not makes_other_trials(key):
-        raise InputError(f"{override.input_line}: {key} does not make a different trial, so choose one value")
+        raise InputError(
+            f"{override.input_line}: {key} does not make a different trial, so choose one value"
+        )
 
 
 def makes_other_trials(key: str) -> bool:
@@ -304,7 +382,9 @@ def searched_folders(words: Sequence[str]) -> list[Path]:
     """The user's folders that ``hydra.searchpath`` among ``words`` names."""
     values = [parse_word(word).value() for word in words if word.startswith("hydra.searchpath=")]
     places = [str(place) for value in values if isinstance(value, list) for place in value]
-    return [Path(place.removeprefix("file://")) for place in places if not place.startswith("pkg://")]
+    return [
+        Path(place.removeprefix("file://")) for place in places if not place.startswith("pkg://")
+    ]
 
 
 def _check_experiment_word(word: str, override: Override) -> None:
@@ -312,9 +392,12 @@ def _check_experiment_word(word: str, override: Override) -> None:
     if several and word.startswith("+experiment="):
         raise InputError(f"{word}: two experiments are two sweeps: give a command for each")
     if several or not word.startswith("+experiment=") or not _is_choice(override):
-        raise InputError(f"{word}: write +experiment=NAME (choose: {', '.join(options('experiment'))})")
+        raise InputError(
+            f"{word}: write +experiment=NAME (choose: {', '.join(options('experiment'))})"
+        )
 
 
 def _is_choice(override: Override) -> bool:
-    """Return whether the value can choose in a group: a name, a list of names, or the group's settings ({a: 1})."""
+    """Return whether the value can choose in a group: a name, a list of names, or the group's
+    settings ({a: 1})."""
     return override.is_sweep_override() or isinstance(override.value(), str | int | float | dict)

@@ -1,4 +1,5 @@
-"""Hydra's part: the configuration of a command line, checked as a whole, and the trials that it describes.
+"""Hydra's part: the configuration of a command line, checked as a whole, and the trials that it
+describes.
 
 Also gsbench as an app of Hydra's, and Hydra's errors in one line.
 """
@@ -9,7 +10,13 @@ import re
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext, redirect_stderr, suppress
+from contextlib import (
+    AbstractContextManager,
+    contextmanager,
+    nullcontext,
+    redirect_stderr,
+    suppress,
+)
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from itertools import chain
@@ -29,7 +36,13 @@ from omegaconf.errors import OmegaConfBaseException
 from gsbench.config import command_words
 from gsbench.config.command_words import GROUPS, options, parse_word
 from gsbench.config.schema import Config, checked_values, register_schemas
-from gsbench.config.trust import HYDRAS_CALLBACKS, MADE_NODES, PERMISSIONS, check_composed, check_permissions
+from gsbench.config.trust import (
+    HYDRAS_CALLBACKS,
+    MADE_NODES,
+    PERMISSIONS,
+    check_composed,
+    check_permissions,
+)
 from gsbench.errors import GsbenchError, InputError
 from gsbench.parsing import MAX_VALUES
 from gsbench.runs.keys import targets_in
@@ -40,9 +53,13 @@ from gsbench.system.own_modules import allow_modules
 from gsbench.words import did_you_mean
 
 CONFIG_NAME = "config"  # conf/config.yaml
-# Hydra 1.3 warns unless it is told which version's defaults hold; Hydra 1.4 has one set and warns if it is told.
-VERSION_BASE: dict[str, Any] = {"version_base": "1.3"} if hydra.__version__.startswith("1.3.") else {}
-# From Hydra 1.4 on: within this context it instantiates the named classes only (``mine.*``: all of a module).
+# Hydra 1.3 warns unless it is told which version's defaults hold; Hydra 1.4 has one set and warns
+# if it is told.
+VERSION_BASE: dict[str, Any] = (
+    {"version_base": "1.3"} if hydra.__version__.startswith("1.3.") else {}
+)
+# From Hydra 1.4 on: within this context it instantiates the named classes only (``mine.*``: all of
+# a module).
 WHITELIST: Callable[[Sequence[str]], AbstractContextManager[Any]] = getattr(
     hydra.utils, "execution_whitelist", lambda names: nullcontext()
 )
@@ -52,10 +69,11 @@ HYDRAS_LINE = "Error executing job with overrides"
 
 @dataclass(frozen=True)
 class Trial:
-    """A requested trial: its resolved values, the overrides that gave them, and the folder of its files.
+    """A requested trial: its resolved values, the overrides that gave them, and the folder of its
+    files.
 
-    A trial that is read from its own ``config.yaml`` has no overrides. Raises InputError for values that would run code
-    or programs that their ``allow_targets`` does not name.
+    A trial that is read from its own ``config.yaml`` has no overrides. Raises InputError for values
+    that would run code or programs that their ``allow_targets`` does not name.
     """
 
     values: dict[str, Any]
@@ -81,12 +99,15 @@ class Trial:
 
 
 def compose_whole(words: Sequence[str], modules: str | None = None) -> DictConfig:
-    """Compose the configuration of ``words``, Hydra's node ``hydra`` included, and check what it may run.
+    """Compose the configuration of ``words``, Hydra's node ``hydra`` included, and check what it
+    may run.
 
-    Words that list several values are left out. From here on Python finds the modules that ``words`` allow in the
-    folder ``modules`` (default: the current one). Raises InputError, one line. Call it within `hydra_ready`.
+    Words that list several values are left out. From here on Python finds the modules that
+    ``words`` allow in the folder ``modules`` (default: the current one). Raises InputError, one
+    line. Call it within `hydra_ready`.
     """
-    # The order matters: Hydra imports packages of the search path while it composes, so they are checked first.
+    # The order matters: Hydra imports packages of the search path while it composes, so they are
+    # checked first.
     allowed = command_words.typed_permissions(words)
     command_words.check_search_path(words, allowed)
     check_files(command_words.searched_folders(words))
@@ -95,37 +116,52 @@ def compose_whole(words: Sequence[str], modules: str | None = None) -> DictConfi
         # Hydra only warns of a folder in its search path that does not exist.
         warnings.filterwarnings("error", message=r".* is not available\.", module="hydra")
         single = [word for word in words if not command_words.is_sweep(word)]
-        return enforce_permissions(hydra.compose(CONFIG_NAME, single, return_hydra_config=True), allowed)
+        return enforce_permissions(
+            hydra.compose(CONFIG_NAME, single, return_hydra_config=True), allowed
+        )
 
 
 def check_files(folders: Sequence[Path]) -> None:
     """Refuse a file of the user's ``folders`` whose YAML aliases stand for too many values.
 
-    A few lines of nested aliases can stand for billions of values ("billion laughs"), and Hydra would expand them.
+    A few lines of nested aliases can stand for billions of values ("billion laughs"), and Hydra
+    would expand them.
     """
-    for file in (file for folder in folders for depth in ("", "*/", "*/*/") for file in folder.glob(f"{depth}*.yaml")):
+    for file in (
+        file
+        for folder in folders
+        for depth in ("", "*/", "*/*/")
+        for file in folder.glob(f"{depth}*.yaml")
+    ):
         try:
             text = file.read_text(encoding="utf-8") if file.is_file() else ""
             # The loader in Python raises RecursionError for deep nesting; that in C would crash.
-            count = _expanded_size(yaml.compose(text, Loader=yaml.SafeLoader), {}) if "*" in text else 0
-        except (OSError, ValueError, RecursionError, yaml.YAMLError):  # Hydra reports it if it reads the file
+            count = (
+                _expanded_size(yaml.compose(text, Loader=yaml.SafeLoader), {}) if "*" in text else 0
+            )
+        # Hydra reports it if it reads the file
+        except (OSError, ValueError, RecursionError, yaml.YAMLError):
             continue
         if count > MAX_VALUES:
             raise InputError(f"{file}: its aliases stand for more than {MAX_VALUES:,} values")
 
 
 def _expanded_size(node: yaml.Node | None, sizes: dict[int, int]) -> int:
-    """The number of values in a YAML node after each alias is replaced by what it names. ``sizes`` are those known."""
+    """The number of values in a YAML node after each alias is replaced by what it names. ``sizes``
+    are those known."""
     if id(node) not in sizes:
         sizes[id(node)] = 1  # counts where an alias stands for a mapping or list that contains it
         children = node.value if isinstance(node, yaml.CollectionNode) else []
-        parts = chain.from_iterable(child if isinstance(child, tuple) else [child] for child in children)
+        parts = chain.from_iterable(
+            child if isinstance(child, tuple) else [child] for child in children
+        )
         sizes[id(node)] = 1 + sum(_expanded_size(part, sizes) for part in parts)
     return sizes[id(node)]
 
 
 def enforce_permissions(config: DictConfig, allowed: Sequence[str]) -> DictConfig:
-    """Refuse a composed configuration that would run what is not ``allowed``, and set its ``allow_targets`` to that.
+    """Refuse a composed configuration that would run what is not ``allowed``, and set its
+    ``allow_targets`` to that.
 
     Setting it discards what a file says of ``allow_targets``.
     """
@@ -138,13 +174,18 @@ def enforce_permissions(config: DictConfig, allowed: Sequence[str]) -> DictConfi
 def check_permitted(config: DictConfig, allowed: Sequence[str]) -> None:
     """`check_composed`, with Hydra's nodes as the installed packages write them."""
     choices = config.hydra.runtime.choices if "hydra" in config else {}
-    words = [f"{group}={choice}" for group, choice in sorted(choices.items()) if str(group).startswith(MADE_GROUPS)]
+    words = [
+        f"{group}={choice}"
+        for group, choice in sorted(choices.items())
+        if str(group).startswith(MADE_GROUPS)
+    ]
     check_composed(config, allowed, installed_nodes(tuple(words)))
 
 
 @cache
 def installed_nodes(words: tuple[str, ...]) -> Mapping[str, Any]:
-    """Hydra's node for the choices ``words``, from installed packages only; choices from a user's folder are left out.
+    """Hydra's node for the choices ``words``, from installed packages only; choices from a user's
+    folder are left out.
 
     It also has what gsbench's own ``conf/config.yaml`` sets.
     """
@@ -155,7 +196,12 @@ def installed_nodes(words: tuple[str, ...]) -> Mapping[str, Any]:
             if len(words) < 2:
                 return installed_nodes(())
             # One by one: a choice that no package has must not take the others along.
-            return {name: node for word in words for name, node in installed_nodes((word,)).items() if name in word}
+            return {
+                name: node
+                for word in words
+                for name, node in installed_nodes((word,)).items()
+                if name in word
+            }
         return OmegaConf.to_container(config.hydra, resolve=False)  # type: ignore[return-value]
 
 
@@ -193,11 +239,13 @@ def options_text(folders: Sequence[Path] = ()) -> str:
 
 # ---- the trials of a sweep
 #
-# Hydra takes a tenth of a second for a composition, and a sweep may have ten thousand trials. So what trials share is
-# composed once. Hydra applies values after the files that groups choose. Trials that choose the same files share their
-# composition, and trials that differ only in the seed share the resolved values too.
+# Hydra takes a tenth of a second for a composition, and a sweep may have ten thousand trials. So
+# what trials share is composed once. Hydra applies values after the files that groups choose.
+# Trials that choose the same files share their composition, and trials that differ only in the seed
+# share the resolved values too.
 
-ADDED = ("hydra.mode", "hydra.sweeper.grids")  # settings that `gsbench.app.command` adds to the typed ones
+# settings that `gsbench.app.command` adds to the typed ones
+ADDED = ("hydra.mode", "hydra.sweeper.grids")
 SEED = re.compile(r"seed=(\d+)")
 # The seed, or a setting of a group, except settings that name a class (``_target_``).
 PLAIN_KEY = re.compile(r"seed|(?!hydra\b)[a-zA-Z]\w*(\.[a-zA-Z]\w*)+")
@@ -207,8 +255,11 @@ MAY_READ_SEED = re.compile(r"\$\{[^}]*(seed|\$\{)")
 READS_HYDRA = re.compile(r"\$\{\s*hydra\b")
 
 
-def compose_jobs(loader: ConfigLoader, sweep: DictConfig, jobs: Sequence[Sequence[str]], first: int = 0) -> list[Trial]:
-    """The trials of ``jobs``, each the list of its words; ``sweep`` is the configuration of the whole sweep.
+def compose_jobs(
+    loader: ConfigLoader, sweep: DictConfig, jobs: Sequence[Sequence[str]], first: int = 0
+) -> list[Trial]:
+    """The trials of ``jobs``, each the list of its words; ``sweep`` is the configuration of the
+    whole sweep.
 
     ``first`` is the number of the first job, for ``${hydra:job.num}``.
     """
@@ -221,7 +272,9 @@ def compose_jobs(loader: ConfigLoader, sweep: DictConfig, jobs: Sequence[Sequenc
         seeds = [int(match.group(1)) for word in words if (match := SEED.fullmatch(word))]
         without_seed = tuple(word for word in words if not SEED.fullmatch(word))
         if seeds and without_seed in by_settings:
-            trials.append(replace(with_seed(by_settings[without_seed], seeds[-1]), overrides=overrides))
+            trials.append(
+                replace(with_seed(by_settings[without_seed], seeds[-1]), overrides=overrides)
+            )
             continue
         values = _plain_values(words)
         files = (*(word for word in words if word.partition("=")[0] not in values), *values)
@@ -232,7 +285,9 @@ def compose_jobs(loader: ConfigLoader, sweep: DictConfig, jobs: Sequence[Sequenc
                     OmegaConf.update(composed, key, value)
             else:
                 command_words.check_search_path(words, allowed)
-                composed = enforce_permissions(loader.load_sweep_config(sweep, list(words)), allowed)
+                composed = enforce_permissions(
+                    loader.load_sweep_config(sweep, list(words)), allowed
+                )
                 with read_write(composed), open_dict(composed):
                     composed.hydra.job.num, composed.hydra.job.id = number, f"job_id_for_{number}"
                     HydraConfig.instance().set_config(composed)
@@ -248,7 +303,8 @@ def compose_jobs(loader: ConfigLoader, sweep: DictConfig, jobs: Sequence[Sequenc
 
 
 def resolve_times(sweep: DictConfig) -> None:
-    """Resolve the settings of a sweep once, so that ``${now:…}`` is the same time for all its trials."""
+    """Resolve the settings of a sweep once, so that ``${now:…}`` is the same time for all its
+    trials."""
     for key in [str(key) for key in sweep if key != "hydra"]:
         with suppress(OmegaConfBaseException):  # such as a setting that only the words of a job set
             if OmegaConf.is_config(sweep[key]):
@@ -262,7 +318,8 @@ def typed_words(overrides: DictConfig) -> tuple[list[str], list[str]]:
 
 
 def with_seed(trial: Trial, seed: int) -> Trial:
-    """The same trial with another seed. Only for a trial whose other settings do not read the seed."""
+    """The same trial with another seed. Only for a trial whose other settings do not read the
+    seed."""
     seed = check_values(Config, {"seed": seed}, "")["seed"]
     words = tuple(f"seed={seed}" if word.startswith("seed=") else word for word in trial.overrides)
     return replace(trial, values=trial.values | {"seed": seed}, overrides=words)
@@ -273,9 +330,17 @@ def _plain_values(words: Sequence[str]) -> Mapping[str, Any]:
     values = [_key_and_value(word) for word in words]
     keys = [key.lstrip("+~") for key, _ in values if "." in key]
     parents = {key[:dot] for key in keys for dot in range(len(key)) if key[dot] == "."}
-    if len(set(keys)) < len(keys) or parents & set(keys) or any(isinstance(value, dict) for _, value in values):
+    if (
+        len(set(keys)) < len(keys)
+        or parents & set(keys)
+        or any(isinstance(value, dict) for _, value in values)
+    ):
         return {}
-    plain = {key: value for key, value in values if PLAIN_KEY.fullmatch(key) and isinstance(value, int | float | str)}
+    plain = {
+        key: value
+        for key, value in values
+        if PLAIN_KEY.fullmatch(key) and isinstance(value, int | float | str)
+    }
     return {key: value for key, value in plain.items() if "$" not in str(value)}
 
 
@@ -303,12 +368,20 @@ def hydra_ready() -> Iterator[None]:
         HydraConfig.instance().cfg = None
 
 
-def run_main(task: Callable[[Any], Any], argv: Sequence[str], config: DictConfig | None = None) -> None:
-    """Run ``task`` as an app of ``hydra.main`` with the words ``argv``; raises what ``task`` raises.
+def run_main(
+    task: Callable[[Any], Any], argv: Sequence[str], config: DictConfig | None = None
+) -> None:
+    """Run ``task`` as an app of ``hydra.main`` with the words ``argv``; raises what ``task``
+    raises.
 
-    Hydra may instantiate its own callbacks, and of the checked ``config`` the allowed ones and the chosen plug-ins.
+    Hydra may instantiate its own callbacks, and of the checked ``config`` the allowed ones and the
+    chosen plug-ins.
     """
-    names = [] if config is None else [*config[PERMISSIONS], *(target for _, target in targets_in(plugins_of(config)))]
+    names = (
+        []
+        if config is None
+        else [*config[PERMISSIONS], *(target for _, target in targets_in(plugins_of(config)))]
+    )
     names = [name for name in names if all(part.isidentifier() for part in name.split("."))]
     register_schemas()
     saved_argv, sys.argv = sys.argv, ["gsbench", *argv]
@@ -328,11 +401,15 @@ def run_main(task: Callable[[Any], Any], argv: Sequence[str], config: DictConfig
 
 def plugins_of(config: DictConfig) -> dict[str, Any]:
     """The nodes of a configuration of which Hydra makes the launcher and the sweeper."""
-    return {key: OmegaConf.to_container(config.hydra[key], resolve=False) for key in ("launcher", "sweeper")}
+    return {
+        key: OmegaConf.to_container(config.hydra[key], resolve=False)
+        for key in ("launcher", "sweeper")
+    }
 
 
 class _WithoutHydrasLine:
-    """Standard error without the line that Hydra writes before it raises a job's error. gsbench prints that error."""
+    """Standard error without the line that Hydra writes before it raises a job's error. gsbench
+    prints that error."""
 
     def __init__(self, stream: Any) -> None:
         self._stream = stream
@@ -347,9 +424,14 @@ class _WithoutHydrasLine:
 # ---- errors
 
 MAX_MESSAGE = 400  # characters of a Hydra error that `explain` does not recognise
-HINTS = {  # for a choice that does not exist, by group: the word may name a user's class or a missing plug-in
-    **{group: f"; a class of your own is named by {group}._target_" for group in ("densify", "init", "raster")},
-    "hydra/launcher": "; other launchers are separate packages; launch=serial, local or slurm need none",
+# for a choice that does not exist, by group: the word may name a user's class or a missing plug-in
+HINTS = {
+    **{
+        group: f"; a class of your own is named by {group}._target_"
+        for group in ("densify", "init", "raster")
+    },
+    "hydra/launcher": "; other launchers are separate packages; launch=serial, local or slurm "
+    "need none",
     "hydra/sweeper": "; gsbench has its own; a search is an interval and hydra.sweeper.tune.points",
 }
 
@@ -376,16 +458,26 @@ def explain(error: BaseException, overrides: Sequence[str]) -> str:
     override = re.search(r"Could not override '([^']+)'", text)
     unknown = re.search(r"Key '([^']+)' (?:is not in struct|not in '[^']+')", text)
     if unknown:
-        return _unknown_setting(unknown.group(1), override.group(1) if override else None, text, overrides)
+        return _unknown_setting(
+            unknown.group(1), override.group(1) if override else None, text, overrides
+        )
     group = re.search(
-        r"Could not override '([\w/]+)'\.?\s*(?:Did you mean to override|No match in the defaults list)", text
+        r"Could not override '([\w/]+)'\.?\s*(?:Did you mean to override|No match in the defaults "
+        r"list)",
+        text,
     )
     if group:
         word = group.group(1)
         keys = [*GROUPS, *_keys_below("", overrides)]
-        return f"{word} is not a group or setting{did_you_mean(word, keys)} (groups: {', '.join(GROUPS)})"
+        return (
+            f"{word} is not a group or setting{did_you_mean(word, keys)} (groups: "
+            f"{', '.join(GROUPS)})"
+        )
     missing = re.search(
-        r"Could not find '([^']+)'.*?Available options in '([^']+)':\s*(.*?)(?:\n\n|Config search|$)", text, re.S
+        r"Could not find '([^']+)'.*?Available options in '([^']+)':\s*(.*?)(?:\n\n|Config "
+        r"search|$)",
+        text,
+        re.S,
     )
     if missing:
         wanted, name = missing.group(1), missing.group(2)
@@ -405,17 +497,24 @@ def explain(error: BaseException, overrides: Sequence[str]) -> str:
 
 
 def _unknown_setting(bad: str, given: str | None, text: str, overrides: Sequence[str]) -> str:
-    """The error for an unknown key ``bad``. ``given`` is the command line's whole key; None for a key in a file."""
+    """The error for an unknown key ``bad``. ``given`` is the command line's whole key; None for a
+    key in a file."""
     if given and given.startswith("hydra.sweeper.params."):
-        return f"{given}: params are for files of experiments; type {given.partition('params.')[2]}=… itself, with -m"
+        return (
+            f"{given}: params are for files of experiments; type "
+            f"{given.partition('params.')[2]}=… itself, with -m"
+        )
     if bad in ("grids", "tune"):
         what = "joins grids" if bad == "grids" else "tunes arms"
-        return f"hydra.sweeper.{bad}: gsbench's own sweeper alone {what}, so leave out hydra/sweeper"
+        return (
+            f"hydra.sweeper.{bad}: gsbench's own sweeper alone {what}, so leave out hydra/sweeper"
+        )
     key = given or bad
     parent = key[: key.rindex(bad)].rstrip(".") if bad in key else key.rpartition(".")[0]
     where = re.search(r"In '([^']+)'", text)
     file = ""
-    # A YAML file's folder is the group. In an experiment's file, Hydra's full_key says where the key stands.
+    # A YAML file's folder is the group. In an experiment's file, Hydra's full_key says where the
+    # key stands.
     if where and not given:
         group, _, name = where.group(1).rpartition("/")
         full = re.search(r"full_key: ([\w.]+)", text)
@@ -423,9 +522,14 @@ def _unknown_setting(bad: str, given: str | None, text: str, overrides: Sequence
         file, parent = f" in {group}/{name}.yaml", key.rpartition(".")[0]
     keys = _keys_below(parent, overrides)
     is_users_class = any(word.startswith(f"{parent}._target_=") for word in overrides)
-    hint = f"; a key that only your class has is added with a plus: +{key}=…" if is_users_class else ""
+    hint = (
+        f"; a key that only your class has is added with a plus: +{key}=…" if is_users_class else ""
+    )
     near = _belongs_to(parent, bad) or did_you_mean(bad, keys) or _groups_with(key)
-    return f"{key} is not a setting{file}{near}{hint} ({parent or 'top level'} has: {', '.join(keys) or 'no settings'})"
+    return (
+        f"{key} is not a setting{file}{near}{hint} ({parent or 'top level'} has: "
+        f"{', '.join(keys) or 'no settings'})"
+    )
 
 
 def _groups_with(key: str) -> str:
@@ -436,12 +540,17 @@ def _groups_with(key: str) -> str:
 
 
 def _belongs_to(group: str, key: str) -> str:
-    """``; it belongs to densify=volumetric`` if other choices of a group have the setting; else nothing."""
+    """``; it belongs to densify=volumetric`` if other choices of a group have the setting; else
+    nothing."""
     if group not in GROUPS:
         return ""
     key_line = re.compile(rf"^{re.escape(key)}:", re.M)
-    files = {name: Path(conf_dir(), group, f"{name}.yaml") for name in options(group) if "/" not in name}
-    choices = [name for name, file in files.items() if key_line.search(file.read_text(encoding="utf-8"))]
+    files = {
+        name: Path(conf_dir(), group, f"{name}.yaml") for name in options(group) if "/" not in name
+    }
+    choices = [
+        name for name, file in files.items() if key_line.search(file.read_text(encoding="utf-8"))
+    ]
     return f"; it belongs to {group}={' or '.join(choices[:3])}" if choices else ""
 
 
@@ -455,14 +564,20 @@ def _chain(error: BaseException | None) -> list[str]:
 
 
 def _keys_below(parent: str, overrides: Sequence[str]) -> list[str]:
-    """The settings below ``parent``, with the group choices among ``overrides`` if these compose."""
+    """The settings below ``parent``, with the group choices among ``overrides`` if these
+    compose."""
     groups = (*GROUPS, "hydra/launcher", "hydra/sweeper")
-    choices = [word for word in overrides if re.fullmatch(r"[\w/]+=[\w/-]+", word) and word.split("=")[0] in groups]
+    choices = [
+        word
+        for word in overrides
+        if re.fullmatch(r"[\w/]+=[\w/-]+", word) and word.split("=")[0] in groups
+    ]
     with hydra_ready():
         try:
             config = hydra.compose(CONFIG_NAME, choices, return_hydra_config=True)
         except Exception:  # noqa: BLE001 - a choice itself may be wrong
             config = hydra.compose(CONFIG_NAME, [], return_hydra_config=True)
     node = OmegaConf.select(config, parent) if parent else config
-    hidden = "_target_" if parent.startswith("hydra") else "hydra"  # Hydra's plug-ins are chosen by name, not by class
+    # Hydra's plug-ins are chosen by name, not by class
+    hidden = "_target_" if parent.startswith("hydra") else "hydra"
     return [str(key) for key in node if key != hidden] if isinstance(node, DictConfig) else []

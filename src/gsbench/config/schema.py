@@ -1,7 +1,8 @@
 """The schema of the configuration and its checks. Loads neither torch nor the library packages.
 
-Each field's annotation says what values its key takes (see `gsbench.settings`). Rules between the keys of a group are
-in its ``__post_init__``. Hydra gets only names and defaults, so that one mechanism checks every value.
+Each field's annotation says what values its key takes (see `gsbench.settings`). Rules between the
+keys of a group are in its ``__post_init__``. Hydra gets only names and defaults, so that one
+mechanism checks every value.
 """
 
 import dataclasses
@@ -55,7 +56,8 @@ DeviceName = Annotated[
 
 @dataclass
 class ComponentConfig:
-    """The keys that ``init`` and ``densify`` have in common. Their other keys are the options of the class."""
+    """The keys that ``init`` and ``densify`` have in common. Their other keys are the options of
+    the class."""
 
     name: FolderName
     _target_: TargetName
@@ -66,9 +68,11 @@ class TrackingConfig:
     name: str = MISSING
     enabled: bool = True
     sink: Literal["mlflow", "tensorboard", "wandb"] = "mlflow"
-    uri: Address | None = None  # null: $MLFLOW_TRACKING_URI, else sqlite in the runs folder; W&B: $WANDB_BASE_URL
+    # null: $MLFLOW_TRACKING_URI, else sqlite in the runs folder; W&B: $WANDB_BASE_URL
+    uri: Address | None = None
     flush_seconds: PositiveFloat = 10.0
-    patience_seconds: NonNegativeFloat = 30.0  # waiting for a slow tracker at the end; `gsbench sync` sends the rest
+    # waiting for a slow tracker at the end; `gsbench sync` sends the rest
+    patience_seconds: NonNegativeFloat = 30.0
     images: NonNegativeInt = 4  # test renders mirrored per trial
     model: bool = False  # keep the PLY as an artifact (MLflow, W&B)
 
@@ -79,45 +83,66 @@ class TrackingConfig:
 @dataclass
 class LaunchConfig:
     name: Literal["serial", "local", "slurm"] = MISSING
-    parallel: PositiveInt | Literal["auto"] = 1  # trials at once; auto: as this machine's cores, memory and GPUs allow
-    timeout_min: PositiveInt | None = None  # minutes until a trial is stopped with a checkpoint and queued again
-    stop_when_decided: bool = False  # look at eval.primary seed by seed; decided pairs of arms get no further seeds
-    least_difference: PositiveFloat | None = None  # least difference of eval.primary that matters; null: the usual one
-    wait: bool = True  # Slurm, as all below: wait until all trials have ended; false: submit them and leave
+    # trials at once; auto: as this machine's cores, memory and GPUs allow
+    parallel: PositiveInt | Literal["auto"] = 1
+    # minutes until a trial is stopped with a checkpoint and queued again
+    timeout_min: PositiveInt | None = None
+    # look at eval.primary seed by seed; decided pairs of arms get no further seeds
+    stop_when_decided: bool = False
+    # least difference of eval.primary that matters; null: the usual one
+    least_difference: PositiveFloat | None = None
+    # Slurm, as all below: wait until all trials have ended; false: submit them and leave
+    wait: bool = True
     max_requeues: NonNegativeInt = 20  # how often a trial that ran out of time is queued again
-    signal_seconds: PositiveInt = 120  # a trial is told this long before its time limit to save a checkpoint
+    # a trial is told this long before its time limit to save a checkpoint
+    signal_seconds: PositiveInt = 120
     cpus_per_trial: PositiveInt | None = None
     gpus_per_trial: NonNegativeInt = 0
     mem_gb: PositiveInt | None = None  # null: the cluster's default
     partition: str | None = None
     account: str | None = None
     qos: str | None = None
-    setup: list[str] = field(default_factory=list)  # shell lines before the trial, such as "module load cuda"
-    sbatch: dict[str, Any] = field(default_factory=dict)  # further options of sbatch, such as {constraint: a100}
+    # shell lines before the trial, such as "module load cuda"
+    setup: list[str] = field(default_factory=list)
+    # further options of sbatch, such as {constraint: a100}
+    sbatch: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         check_settings(self, "launch")
         if self.name != "slurm" and not self.wait:
-            raise InputError(f"launch.wait=false leaves the trials to Slurm, so it needs launch=slurm, not {self.name}")
-        if self.stop_when_decided and not self.wait:
-            raise InputError("launch.stop_when_decided looks at results between seeds, so launch.wait must be true")
-        if self.name == "slurm" and self.timeout_min is not None and self.signal_seconds >= 60 * self.timeout_min:
             raise InputError(
-                f"launch.signal_seconds must be below launch.timeout_min ({self.timeout_min} minutes), "
+                "launch.wait=false leaves the trials to Slurm, so it needs launch=slurm, not "
+                f"{self.name}"
+            )
+        if self.stop_when_decided and not self.wait:
+            raise InputError(
+                "launch.stop_when_decided looks at results between seeds, so launch.wait must be "
+                "true"
+            )
+        if (
+            self.name == "slurm"
+            and self.timeout_min is not None
+            and self.signal_seconds >= 60 * self.timeout_min
+        ):
+            raise InputError(
+                f"launch.signal_seconds must be below launch.timeout_min ({self.timeout_min} "
+                "minutes), "
                 f"got {self.signal_seconds}: a trial would be told to stop as soon as it starts"
             )
 
 
 @dataclass
 class Config:
-    """The root. ``init`` and ``densify`` take any keys, because a user's own class has its own options."""
+    """The root. ``init`` and ``densify`` take any keys, because a user's own class has its own
+    options."""
 
     name: ExperimentName = "default"
     seed: Annotated[int, Interval(ge=0, le=MAX_INTEGER)] = 0
     device: DeviceName = "auto"
     threads: Threads | Literal["auto"] = "auto"
     runs: PathName = MISSING
-    allow_targets: list[str] = field(default_factory=list)  # what may run beside gsbench; only the command line sets it
+    # names of what may run beside gsbench; only the command line sets them
+    allow_targets: list[str] = field(default_factory=list)
     scene: SceneConfig = field(default_factory=SceneConfig)
     init: Any = MISSING
     densify: Any = MISSING
@@ -138,7 +163,8 @@ COMPONENTS = ("init", "densify")  # groups whose keys are the options of a class
 
 @cache
 def register_schemas() -> None:
-    """Register the schemas with Hydra. Those of groups go under ``schema/``, so that they are no choices."""
+    """Register the schemas with Hydra. Those of groups go under ``schema/``, so that they are no
+    choices."""
     store = ConfigStore.instance()
     store.store(name="config_schema", node=_names_and_defaults(Config))
     for group, schema in GROUP_SCHEMAS.items():
@@ -147,7 +173,8 @@ def register_schemas() -> None:
 
 @cache
 def _names_and_defaults(schema: type) -> type:
-    """A dataclass for Hydra with the fields of ``schema`` but no types, since `checked_values` checks the values."""
+    """A dataclass for Hydra with the fields of ``schema`` but no types, since `checked_values`
+    checks the values."""
     fields: list[tuple[str, Any, Any]] = []
     for entry in dataclasses.fields(schema):
         factory: Any = entry.default_factory
@@ -160,18 +187,26 @@ def _names_and_defaults(schema: type) -> type:
 
 
 def checked_values(config: DictConfig) -> dict[str, Any]:
-    """The resolved values of a composed configuration without Hydra's node, converted (``1e3``) and checked.
+    """The resolved values of a composed configuration without Hydra's node, converted (``1e3``) and
+    checked.
 
-    The classes that ``init`` and ``densify`` name check their options themselves, when they are made. Raises InputError
-    naming the key.
+    The classes that ``init`` and ``densify`` name check their options themselves, when they are
+    made. Raises InputError naming the key.
     """
     values = plain(config)
-    for place, key, value in entries_of(values):  # also options of components, which their classes check later
+    # also options of components, which their classes check later
+    for place, key, value in entries_of(values):
         if isinstance(value, int) and abs(value) > MAX_INTEGER:
-            raise InputError(f"{'.'.join((*place, key))}={value} is not a whole number of 64 bits: give a nearer one")
+            raise InputError(
+                f"{'.'.join((*place, key))}={value} is not a whole number of 64 bits: give a "
+                "nearer one"
+            )
     for group in (*GROUP_SCHEMAS, *COMPONENTS):
         if not isinstance(values.get(group), dict):
-            raise InputError(f"{group} must be chosen, as {group}=NAME (see gsbench --help), got {values.get(group)!r}")
+            raise InputError(
+                f"{group} must be chosen, as {group}=NAME (see gsbench --help), got "
+                f"{values.get(group)!r}"
+            )
     for group, schema in GROUP_SCHEMAS.items():
         given = values[group]
         if given.get("_target_") is not None:  # the other keys are options of the user's class
@@ -181,13 +216,23 @@ def checked_values(config: DictConfig) -> dict[str, Any]:
     root = {key: value for key, value in values.items() if key not in (*GROUP_SCHEMAS, *COMPONENTS)}
     values |= check_values(Config, root, "")
     for group in COMPONENTS:
-        check_values(ComponentConfig, {key: values[group].get(key) for key in ("name", "_target_")}, group)
-    scene, train, densify, launch = values["scene"], values["train"], values["densify"], values["launch"]
+        check_values(
+            ComponentConfig, {key: values[group].get(key) for key in ("name", "_target_")}, group
+        )
+    scene, train, densify, launch = (
+        values["scene"],
+        values["train"],
+        values["densify"],
+        values["launch"],
+    )
     if late := [step for step in values["eval"]["at"] if step > train["iterations"]]:
-        raise InputError(f"eval.at names iteration {late[0]}, and train.iterations is {train['iterations']}")
+        raise InputError(
+            f"eval.at names iteration {late[0]}, and train.iterations is {train['iterations']}"
+        )
     if scene["transparent"] == "white" and train["background"] != [1, 1, 1]:
         raise InputError(
-            "scene.transparent=white: the model must be rendered over white, too: add train.background=[1,1,1]"
+            "scene.transparent=white: the model must be rendered over white, too: add "
+            "train.background=[1,1,1]"
         )
     if train["iterations"] == 0 and densify.get("_target_") != NO_DENSIFIER:
         raise InputError("train.iterations=0 trains nothing, so nothing grows: add densify=none")
@@ -201,11 +246,18 @@ def checked_values(config: DictConfig) -> dict[str, Any]:
 def check_external(values: Mapping[str, Any]) -> None:
     """Raise InputError for settings that another program cannot follow."""
     if values["eval"]["at"]:
-        raise InputError("eval.at: another program shows its model only at the end: leave eval.at empty")
+        raise InputError(
+            "eval.at: another program shows its model only at the end: leave eval.at empty"
+        )
     if values["train"]["max_seconds"] is not None:
-        raise InputError("train.max_seconds: another program cannot be stopped early: give it fewer train.iterations")
+        raise InputError(
+            "train.max_seconds: another program cannot be stopped early: give it fewer "
+            "train.iterations"
+        )
     if values["train"]["resolution_schedule"] != "none":
-        raise InputError("train.resolution_schedule: another program has its own sizes: leave it at none")
+        raise InputError(
+            "train.resolution_schedule: another program has its own sizes: leave it at none"
+        )
 
 
 def plain(values: Any) -> Any:
@@ -216,7 +268,9 @@ def plain(values: Any) -> Any:
     if isinstance(values, DictConfig):
         own = OmegaConf.masked_copy(values, [str(key) for key in values if key != "hydra"])
         OmegaConf.copy_cache(values, own)  # keeps ${now:…} the same for all trials of a sweep
-        return plain(OmegaConf.to_container(own, resolve=True, throw_on_missing=True, enum_to_str=True))
+        return plain(
+            OmegaConf.to_container(own, resolve=True, throw_on_missing=True, enum_to_str=True)
+        )
     if isinstance(values, dict):
         return {key: plain(value) for key, value in values.items()}
     return [plain(value) for value in values] if isinstance(values, list | tuple) else values

@@ -1,1 +1,2 @@
-"""Public data sets: the catalogue, and fetching the wanted parts of their archives. Loads no torch."""
+"""Public data sets: the catalogue, and fetching the wanted parts of their archives. Loads no
+torch."""

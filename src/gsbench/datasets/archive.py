@@ -1,7 +1,9 @@
-"""Fetching scenes from zip archives, local or on a server: selecting the wanted members and checking each.
+"""Fetching scenes from zip archives, local or on a server: selecting the wanted members and
+checking each.
 
-From an archive on a server only the directory and the wanted members are read, each with its own request (remotezip).
-The missing folders of a scene appear in the data folder once all of them are complete.
+From an archive on a server only the directory and the wanted members are read, each with its own
+request (remotezip). The missing folders of a scene appear in the data folder once all of them are
+complete.
 """
 
 import lzma
@@ -31,7 +33,8 @@ class DamagedMemberError(Exception):
 def open_archive_at(where: str, policy: RetryPolicy) -> Iterator[zipfile.ZipFile]:
     """Open the archive at an address, which is read by ranges, or at a path of this machine.
 
-    Raises `InputError` if it cannot be read or is not an archive, or if its server only sends whole files.
+    Raises `InputError` if it cannot be read or is not an archive, or if its server only sends whole
+    files.
     """
     if "://" in where:
         with _remote(where, policy) as archive:
@@ -54,13 +57,17 @@ def _remote(url: str, policy: RetryPolicy) -> Iterator[zipfile.ZipFile]:
 
     def once() -> zipfile.ZipFile:
         try:
-            return remotezip.RemoteZip(url, session=session, timeout=policy.timeout, headers=USER_AGENT)
+            return remotezip.RemoteZip(
+                url, session=session, timeout=policy.timeout, headers=USER_AGENT
+            )
         except remotezip.RangeNotSupported:
             raise InputError(
-                f"{url}: the server sends whole files only: get the file into a folder, and give --mirror FOLDER"
+                f"{url}: the server sends whole files only: get the file into a folder, and give "
+                "--mirror FOLDER"
             ) from None
         except remotezip.RemoteIOError as error:
-            raise (error.__context__ or error) from None  # remotezip keeps only the text of the cause
+            # remotezip keeps only the text of the cause
+            raise (error.__context__ or error) from None
         except remotezip.RemoteZipError as error:
             raise zipfile.BadZipFile(str(error)) from None
 
@@ -76,7 +83,8 @@ def _remote(url: str, policy: RetryPolicy) -> Iterator[zipfile.ZipFile]:
 
 
 def open_archive(file: IO[bytes], where: str) -> zipfile.ZipFile:
-    """Open the zip archive in ``file``; raises `InputError` naming ``where`` if it is no archive or is truncated."""
+    """Open the zip archive in ``file``; raises `InputError` naming ``where`` if it is no archive or
+    is truncated."""
     try:
         return zipfile.ZipFile(file)
     except (zipfile.BadZipFile, NotImplementedError, ValueError, struct.error) as error:
@@ -84,7 +92,9 @@ def open_archive(file: IO[bytes], where: str) -> zipfile.ZipFile:
 
 
 def _no_archive(where: str, error: Exception) -> InputError:
-    return InputError(f"{where} is not a complete zip archive ({error}): give another address with --mirror")
+    return InputError(
+        f"{where} is not a complete zip archive ({error}): give another address with --mirror"
+    )
 
 
 def wanted_members(
@@ -92,7 +102,8 @@ def wanted_members(
 ) -> dict[str, zipfile.ZipInfo]:
     """The members in the folders ``wanted`` below ``folder``, by their names below it, sorted.
 
-    Raises `InputError` if a wanted folder is empty, or if a name would lead out of the scene's folder.
+    Raises `InputError` if a wanted folder is empty, or if a name would lead out of the scene's
+    folder.
     """
     members: dict[str, zipfile.ZipInfo] = {}
     for info in archive.infolist():
@@ -102,18 +113,28 @@ def wanted_members(
         if not any(name.startswith(f"{part}/") for part in wanted) or "/." in f"/{name}":
             continue  # hidden files, including "..", are never wanted
         if "\\" in name or "//" in name or ":" in name or PurePosixPath(name).is_absolute():
-            raise InputError(f"{where}: the member {info.filename!r} has an unsafe name: give another --mirror")
+            raise InputError(
+                f"{where}: the member {info.filename!r} has an unsafe name: give another --mirror"
+            )
         if len(name.encode("utf-8", "surrogatepass")) > MAX_NAME_BYTES or not name.isprintable():
             raise InputError(
-                f"{where}: the member {name!r:.80} has a name that no file can have: give another --mirror"
+                f"{where}: the member {name!r:.80} has a name that no file can have: give another "
+                "--mirror"
             )
         members[name] = info
     for name in members:
-        if folder_of := next((str(above) for above in PurePosixPath(name).parents if str(above) in members), None):
-            raise InputError(f"{where}: {folder_of} is a file and a folder in one: give another --mirror")
+        if folder_of := next(
+            (str(above) for above in PurePosixPath(name).parents if str(above) in members), None
+        ):
+            raise InputError(
+                f"{where}: {folder_of} is a file and a folder in one: give another --mirror"
+            )
     for part in wanted:
         if not any(name.startswith(f"{part}/") for name in members):
-            raise InputError(f"{where} has no files below {folder}/{part}: it is not the archive that was expected")
+            raise InputError(
+                f"{where} has no files below {folder}/{part}: it is not the archive that was "
+                "expected"
+            )
     return dict(sorted(members.items()))
 
 
@@ -131,8 +152,11 @@ def is_complete(path: Path, size: int, crc: int) -> bool:
     return checksum == crc
 
 
-def extract(archive: zipfile.ZipFile, member: zipfile.ZipInfo, target: Path, advance: Callable[[int], None]) -> None:
-    """Write the member to ``target``, which appears only if size and CRC-32 are right; ``advance`` gets byte counts.
+def extract(
+    archive: zipfile.ZipFile, member: zipfile.ZipInfo, target: Path, advance: Callable[[int], None]
+) -> None:
+    """Write the member to ``target``, which appears only if size and CRC-32 are right; ``advance``
+    gets byte counts.
 
     Raises `DamagedMemberError`, `InputError` for an unknown compression, and errors of the network.
     """
@@ -155,12 +179,23 @@ def extract(archive: zipfile.ZipFile, member: zipfile.ZipInfo, target: Path, adv
         raise _cause(error, member) from error
 
 
-# Errors that zipfile and its decompressors raise for damaged bytes; the last two come from LZMA's filter.
-DAMAGE = (zipfile.BadZipFile, zlib.error, struct.error, lzma.LZMAError, EOFError, ValueError, IndexError, TypeError)
+# Errors that zipfile and its decompressors raise for damaged bytes; the last two come from LZMA's
+# filter.
+DAMAGE = (
+    zipfile.BadZipFile,
+    zlib.error,
+    struct.error,
+    lzma.LZMAError,
+    EOFError,
+    ValueError,
+    IndexError,
+    TypeError,
+)
 
 
 def _cause(error: Exception, member: zipfile.ZipInfo) -> Exception:
-    """The error that `extract` raises for ``error``: an error of gsbench for a known cause, else the error itself."""
+    """The error that `extract` raises for ``error``: an error of gsbench for a known cause, else
+    the error itself."""
     from remotezip import RemoteIOError, RemoteZipError
 
     if isinstance(error, InputError | DamagedMemberError):
@@ -168,11 +203,16 @@ def _cause(error: Exception, member: zipfile.ZipInfo) -> Exception:
     if isinstance(error, RemoteIOError):
         cause = error.__context__
         return cause if isinstance(cause, Exception) else error
-    # An OSError with EINVAL is a seek before the start of the file; bzip2 raises one without a number.
-    if isinstance(error, (*DAMAGE, RemoteZipError)) or (isinstance(error, OSError) and error.errno in (None, EINVAL)):
+    # An OSError with EINVAL is a seek before the start of the file; bzip2 raises one without a
+    # number.
+    if isinstance(error, (*DAMAGE, RemoteZipError)) or (
+        isinstance(error, OSError) and error.errno in (None, EINVAL)
+    ):
         return DamagedMemberError(str(error) or type(error).__name__)
     if isinstance(error, NotImplementedError | RuntimeError):
-        return InputError(f"{member.filename} is packed in a way that cannot be read here ({error})")
+        return InputError(
+            f"{member.filename} is packed in a way that cannot be read here ({error})"
+        )
     return error
 
 
@@ -180,16 +220,25 @@ STAGING = ".fetch"  # folder below the data folder for unfinished scenes
 
 
 def missing_parts(data: Path, files: SceneFiles) -> tuple[str, ...]:
-    """The folders of a scene that are not in the folder ``data``. An existing folder is complete."""
+    """The folders of a scene that are not in the folder ``data``. An existing folder is
+    complete."""
     return tuple(part for part in files.parts if not (data / files.folder / part).exists())
 
 
 def fetch_scene(
-    archive: zipfile.ZipFile, folder: str, where: str, data: Path, files: SceneFiles, policy: RetryPolicy, say: Progress
+    archive: zipfile.ZipFile,
+    folder: str,
+    where: str,
+    data: Path,
+    files: SceneFiles,
+    policy: RetryPolicy,
+    say: Progress,
 ) -> str:
-    """Fetch the missing folders of a scene from ``folder`` of its ``archive``; returns a line about them.
+    """Fetch the missing folders of a scene from ``folder`` of its ``archive``; returns a line about
+    them.
 
-    ``where`` is the archive's address, for errors; ``say`` gets byte counts. The caller holds the lock of ``data``.
+    ``where`` is the archive's address, for errors; ``say`` gets byte counts. The caller holds the
+    lock of ``data``.
     """
     parts, staging = missing_parts(data, files), data / STAGING / files.scene
     members = wanted_members(archive, folder, parts, where)
@@ -197,7 +246,9 @@ def fetch_scene(
         if path.relative_to(staging).as_posix() not in members:
             path.unlink()  # from an earlier fetch of other folders
     missing = {
-        name: info for name, info in members.items() if not is_complete(staging / name, info.file_size, info.CRC)
+        name: info
+        for name, info in members.items()
+        if not is_complete(staging / name, info.file_size, info.CRC)
     }  # members that an interrupted fetch completed are not fetched again
     total, done = sum(info.file_size for info in missing.values()), 0
 
@@ -215,7 +266,8 @@ def fetch_scene(
             except DamagedMemberError as error:
                 if is_last_try:
                     raise FetchError(
-                        f"{where}: {info.filename} arrives damaged ({error}): try again later, or give another address "
+                        f"{where}: {info.filename} arrives damaged ({error}): try again later, or "
+                        "give another address "
                         "with --mirror"
                     ) from error
     for part in parts:  # each by one rename, so that no folder of images is ever incomplete
@@ -223,4 +275,7 @@ def fetch_scene(
         shutil.move(staging / part, data / files.folder / part)
     shutil.rmtree(staging, ignore_errors=True)
     size = sum(info.file_size for info in members.values())
-    return f"{counted(len(members), 'file')}, {readable_bytes(size)}, in {data / files.folder} ({', '.join(parts)})"
+    return (
+        f"{counted(len(members), 'file')}, {readable_bytes(size)}, in {data / files.folder} "
+        f"({', '.join(parts)})"
+    )

@@ -1,4 +1,5 @@
-"""The catalogue of public data sets (``catalog.yaml``): archives of scenes, and the files of a scene to fetch."""
+"""The catalogue of public data sets (``catalog.yaml``): archives of scenes, and the files of a
+scene to fetch."""
 
 import os
 import re
@@ -50,7 +51,8 @@ class PublicDataset:
 
 @dataclass(frozen=True)
 class SceneFiles:
-    """Folders that conf/scene/<scene>.yaml needs: ``parts`` in ``folder``, which is below the data folder."""
+    """Folders that conf/scene/<scene>.yaml needs: ``parts`` in ``folder``, which is below the data
+    folder."""
 
     scene: str
     folder: str
@@ -62,7 +64,9 @@ def wanted_files(scene: str, images: str | None = None) -> SceneFiles:
     settings = yaml.safe_load((conf_dir() / "scene" / f"{scene}.yaml").read_text(encoding="utf-8"))
     match = SCENE_PATH.fullmatch(settings["path"])
     if match is None:
-        raise InputError(f"conf/scene/{scene}.yaml does not lie below ${DATA_VARIABLE}: it cannot be fetched")
+        raise InputError(
+            f"conf/scene/{scene}.yaml does not lie below ${DATA_VARIABLE}: it cannot be fetched"
+        )
     parts = (images or settings.get("images") or "images", settings.get("sparse") or "sparse/0")
     return SceneFiles(scene, match["folder"], parts)
 
@@ -72,7 +76,9 @@ def read_catalog() -> dict[str, PublicDataset]:
     content: dict[str, Any] = yaml.safe_load(CATALOG_FILE.read_text(encoding="utf-8"))
     datasets = {}
     for name, entry in content.items():
-        archives = tuple(Archive(one["url"], one.get("size", ""), one["scenes"]) for one in entry.pop("archives"))
+        archives = tuple(
+            Archive(one["url"], one.get("size", ""), one["scenes"]) for one in entry.pop("archives")
+        )
         datasets[name] = PublicDataset(name=name, archives=archives, **entry)
     return datasets
 
@@ -94,13 +100,17 @@ def _catalogued_scenes() -> dict[str, tuple[str, str]]:
 
 
 def how_to_get(scenes: Iterable[tuple[str, Path]]) -> str:
-    """Advice for missing scenes, given as (scene, folder): the commands that fetch those in the catalogue."""
+    """Advice for missing scenes, given as (scene, folder): the commands that fetch those in the
+    catalogue."""
     wanted = defaultdict(list)
     for scene, folder in scenes:
         dataset, catalogued = _catalogued_scenes().get(scene, ("", ""))
         if dataset and folder.expanduser().absolute() == (data_dir() / catalogued).absolute():
             wanted[dataset].append(scene)
-    commands = [f"`gsbench fetch {dataset} {' '.join(sorted(names))}`" for dataset, names in sorted(wanted.items())]
+    commands = [
+        f"`gsbench fetch {dataset} {' '.join(sorted(names))}`"
+        for dataset, names in sorted(wanted.items())
+    ]
     if not commands:
         return f"set scene.path, or {DATA_VARIABLE} for a known scene"
     return f"{' and '.join(commands)} {'brings' if len(commands) == 1 else 'bring'} what is missing"

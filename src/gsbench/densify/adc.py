@@ -16,11 +16,14 @@ from gsbench.events import Cause
 from gsbench.raster.base import RenderOutput
 from gsbench.settings import OpenFraction, Switch
 
-MAX_CHILDREN = 64  # of one split: more is a mistake in the settings, and would fill the memory in one round
+# of one split: more is a mistake in the settings, and would fill the memory in one round
+MAX_CHILDREN = 64
 OPACITY_RESET = Switch(
-    {"opacity_reset_interval": NEVER}, "opacity resets, and the pruning by size that follows the first"
+    {"opacity_reset_interval": NEVER},
+    "opacity resets, and the pruning by size that follows the first",
 )
-LOCKED_ROUNDS = 5  # rounds after an opacity reset in which the governor does not raise ``cull``; our choice
+# rounds after an opacity reset in which the governor does not raise ``cull``; our choice
+LOCKED_ROUNDS = 5
 
 
 class Grown(NamedTuple):
@@ -33,10 +36,11 @@ class Grown(NamedTuple):
 
 @dataclass
 class ADC(Budgeted):
-    """Clone small Gaussians, split large ones, and prune faint and huge ones (Kerbl et al. 2023, section 5).
+    """Clone small Gaussians, split large ones, and prune faint and huge ones (Kerbl et al. 2023,
+    section 5).
 
-    A Gaussian grows if its gradient in NDC units, averaged over the iterations in which it was visible, reaches
-    ``gradient_threshold``. Sizes are fractions of the scene extent.
+    A Gaussian grows if its gradient in NDC units, averaged over the iterations in which it was
+    visible, reaches ``gradient_threshold``. Sizes are fractions of the scene extent.
 
     Examples:
         To try an idea, override one rule. This class never prunes:
@@ -58,8 +62,12 @@ class ADC(Budgeted):
 
     SWITCHES: ClassVar[Mapping[str, Switch]] = {
         "opacity_reset": OPACITY_RESET,
-        "absolute_gradient": Switch({"gradient": "signed"}, "the absolute gradient, in which pixels do not cancel"),
-        "revised_opacity": Switch({"revised_opacity": False}, "children that share their parent's opacity"),
+        "absolute_gradient": Switch(
+            {"gradient": "signed"}, "the absolute gradient, in which pixels do not cancel"
+        ),
+        "revised_opacity": Switch(
+            {"revised_opacity": False}, "children that share their parent's opacity"
+        ),
     }
 
     prunes_by_size: ClassVar[bool] = True
@@ -67,13 +75,16 @@ class ADC(Budgeted):
     gradient: Literal["signed", "absolute"] = "signed"  # absolute: AbsGS, arXiv 2404.10484
     gradient_threshold: PositiveFloat = 2e-4
     threshold_inclusive: bool = True  # >= as 3DGS; False: > as gsplat
-    split_size: PositiveFloat = 0.01  # a larger Gaussian is split, else cloned ("percent_dense" of 3DGS)
+    # a larger Gaussian is split, else cloned ("percent_dense" of 3DGS)
+    split_size: PositiveFloat = 0.01
     split_children: Annotated[int, Interval(ge=2, le=MAX_CHILDREN)] = 2
     split_shrink: Annotated[float, Ge(1)] = 1.6  # children's scales are divided by it (0.8 x 2)
-    revised_opacity: bool = False  # children of clones and splits share their parent's opacity (arXiv 2404.06109)
+    # children of clones and splits share their parent's opacity (arXiv 2404.06109)
+    revised_opacity: bool = False
     prune_opacity: Annotated[float, Interval(ge=0, lt=1)] = 0.005
     prune_size: PositiveFloat = 0.1  # after the first opacity reset
-    prune_screen_radius: PositiveFloat | None = None  # px; 3DGS has 20, but zeroes the radii first, so it never acts
+    # px; 3DGS has 20, but zeroes the radii first, so it never acts
+    prune_screen_radius: PositiveFloat | None = None
     opacity_reset_interval: PositiveInt = 3000
     opacity_reset_value: OpenFraction = 0.01
 
@@ -91,7 +102,9 @@ class ADC(Budgeted):
 
     def screen_gradient(self, render: RenderOutput) -> Tensor:
         """Length of the gradient by each projected mean, [N] NDC."""
-        gradient = render.screen_gradient_abs if self.gradient == "absolute" else render.screen_points.grad
+        gradient = (
+            render.screen_gradient_abs if self.gradient == "absolute" else render.screen_points.grad
+        )
         if gradient is None:
             raise RuntimeError("observe needs the screen gradient: call it after backward")
         return gradient.norm(dim=-1)
@@ -104,32 +117,38 @@ class ADC(Budgeted):
             rules.append(self.skip_round)
         elif self.due(step):
             rules += [*self.governing(), self.grow_by_gradient, self.prune, self.reset_statistics]
-        # As in 3DGS: with a white background, opacities are also reset once at the start of the window.
+        # As in 3DGS: with a white background, opacities are also reset once at the start of the
+        # window.
         periodic = step % self.opacity_reset_interval == 0
-        if step < self.stop and (periodic or (self.context.white_background and step == self.start)):
+        if step < self.stop and (
+            periodic or (self.context.white_background and step == self.start)
+        ):
             rules.append(self.reset_opacity)
         return rules
 
     def mean_gradient(self) -> Tensor:
-        """Mean gradient [N] NDC over the iterations in which a Gaussian was visible; 0 if it never was."""
+        """Mean gradient [N] NDC over the iterations in which a Gaussian was visible; 0 if it never
+        was."""
         return self.statistics["gradient_sum"] / self.statistics["visible_count"].clamp_min(1)
 
     def candidates(self, refinement: Refinement) -> tuple[Tensor, Tensor]:
-        """Two masks [N]: Gaussians whose mean gradient reaches the threshold; Gaussians to split rather than clone."""
+        """Two masks [N]: Gaussians whose mean gradient reaches the threshold; Gaussians to split
+        rather than clone."""
         log_scales = refinement.gaussians.values.log_scales
         large = log_scales.amax(-1) > math.log(self.split_size * self.context.extent)
         return self.reaches(self.mean_gradient(), self.gradient_threshold), large
 
     def reaches(self, mean: Tensor, threshold: float) -> Tensor:
-        """Mask [N] of the Gaussians whose ``mean`` gradient [N] reaches a growth ``threshold`` times
-        ``strictness``."""
+        """Mask [N] of the Gaussians whose ``mean`` gradient [N] reaches a growth ``threshold``
+        times ``strictness``."""
         limit = threshold * self.strictness
         return mean >= limit if self.threshold_inclusive else mean > limit
 
     def choose(self, refinement: Refinement, candidates: Tensor, gain: int) -> tuple[Tensor, int]:
         """Choose the ``candidates`` [N] with the largest mean gradients, as many as the cap admits.
 
-        Each candidate adds ``gain`` Gaussians. Returns a mask [N] and the number of refused candidates.
+        Each candidate adds ``gain`` Gaussians. Returns a mask [N] and the number of refused
+        candidates.
         """
         return admit(candidates, self.mean_gradient(), gain, self.allowance(refinement))
 
@@ -150,13 +169,17 @@ class ADC(Budgeted):
         return int(grown.number[~pruned].sum())
 
     def grow_by_gradient(self, refinement: Refinement) -> None:
-        """Clone small Gaussians and split large ones if their mean gradient reaches the threshold."""
+        """Clone small Gaussians and split large ones if their mean gradient reaches the
+        threshold."""
         gaussians, event = refinement.gaussians, refinement.event
         over, large = self.candidates(refinement)
         selected, blocked = self.choose(refinement, over, self.split_children - 1)
         event.blocked_by_cap += blocked
-        event.cloned += self.clone(refinement, selected & ~large, revised_opacity=self.revised_opacity)
-        # Cloning appended Gaussians: extend the mask to them. A clone is not split in its first round, as in 3DGS.
+        event.cloned += self.clone(
+            refinement, selected & ~large, revised_opacity=self.revised_opacity
+        )
+        # Cloning appended Gaussians: extend the mask to them. A clone is not split in its first
+        # round, as in 3DGS.
         not_split = selected.new_zeros(len(gaussians) - len(selected))
         to_split = torch.cat([selected & large, not_split])
         event.split_gradient += self.split(
@@ -173,7 +196,8 @@ class ADC(Budgeted):
         return opacity_logits.sigmoid() < self.prune_opacity * self.cull
 
     def huge(self, step: int, log_scales: Tensor) -> Tensor:
-        """Mask [N] of the Gaussians to prune by size: none until the first opacity reset has passed."""
+        """Mask [N] of the Gaussians to prune by size: none until the first opacity reset has
+        passed."""
         if not self.prunes_by_size or step <= self.opacity_reset_interval:
             return log_scales.new_zeros(len(log_scales), dtype=torch.bool)
         huge = log_scales.amax(-1) > math.log(self.prune_size * self.context.extent)
@@ -182,14 +206,21 @@ class ADC(Budgeted):
         return huge
 
     def may_cull(self, step: int) -> bool:
-        """Return False in the first rounds after an opacity reset: then nearly all opacities are low."""
+        """Return False in the first rounds after an opacity reset: then nearly all opacities are
+        low."""
         since_reset = step % self.opacity_reset_interval
-        return step <= self.opacity_reset_interval or not 0 < since_reset <= LOCKED_ROUNDS * self.interval
+        return (
+            step <= self.opacity_reset_interval
+            or not 0 < since_reset <= LOCKED_ROUNDS * self.interval
+        )
 
     def prune(self, refinement: Refinement) -> None:
         """Remove faint Gaussians and, after the first opacity reset, huge ones."""
         values = refinement.gaussians.values
-        faint, huge = self.faint(values.opacity_logits), self.huge(refinement.step, values.log_scales)
+        faint, huge = (
+            self.faint(values.opacity_logits),
+            self.huge(refinement.step, values.log_scales),
+        )
         self.remove(refinement, faint, huge)
 
     def reset_opacity(self, refinement: Refinement) -> None:
@@ -198,7 +229,8 @@ class ADC(Budgeted):
         refinement.event.opacity_reset = True
 
     def limit_opacity(self, refinement: Refinement, ceiling: float) -> None:
-        """Lower all opacities above ``ceiling`` to it. The moments of all opacities become zero, as in 3DGS."""
+        """Lower all opacities above ``ceiling`` to it. The moments of all opacities become zero, as
+        in 3DGS."""
         limit = math.log(ceiling / (1 - ceiling))
         logits = refinement.gaussians.values.opacity_logits.detach().clamp_max(limit)
         refinement.gaussians.overwrite("opacity_logits", logits)

@@ -11,7 +11,15 @@ from pydantic import NonNegativeInt, PositiveFloat, PositiveInt
 from torch import Tensor
 
 from gsbench.densify.adc import ADC, OPACITY_RESET, Grown
-from gsbench.densify.base import NEVER, Refinement, Rule, Statistic, faded, quantile, standard_normal
+from gsbench.densify.base import (
+    NEVER,
+    Refinement,
+    Rule,
+    Statistic,
+    faded,
+    quantile,
+    standard_normal,
+)
 from gsbench.densify.budget import admit
 from gsbench.errors import InputError
 from gsbench.events import Cause
@@ -22,20 +30,24 @@ from gsbench.settings import OpenFraction, Switch
 
 @dataclass
 class AbsGS(ADC):
-    """ADC with two gradients and a ceiling on opacities, as in the code of Ye et al. (arXiv 2404.10484).
+    """ADC with two gradients and a ceiling on opacities, as in the code of Ye et al. (arXiv
+    2404.10484).
 
-    Small Gaussians are cloned if their signed mean gradient reaches ``gradient_threshold``. Large ones are split if
-    their absolute mean gradient, in which the pixels of a Gaussian do not cancel, reaches ``split_threshold``. Every
-    ``ceiling_interval`` iterations, all opacities above ``opacity_ceiling`` are lowered to it, so that no Gaussian
-    hides all that is behind it.
+    Small Gaussians are cloned if their signed mean gradient reaches ``gradient_threshold``. Large
+    ones are split if their absolute mean gradient, in which the pixels of a Gaussian do not cancel,
+    reaches ``split_threshold``. Every ``ceiling_interval`` iterations, all opacities above
+    ``opacity_ceiling`` are lowered to it, so that no Gaussian hides all that is behind it.
     """
 
-    STATISTICS: ClassVar[dict[str, torch.dtype]] = {"absolute_sum": torch.float32}  # NDC, since the last refinement
+    # NDC, since the last refinement
+    STATISTICS: ClassVar[dict[str, torch.dtype]] = {"absolute_sum": torch.float32}
     needs_absolute_gradient = True
 
     SWITCHES: ClassVar[Mapping[str, Switch]] = {
         "opacity_ceiling": Switch({"ceiling_interval": NEVER}, "the ceiling on opacities"),
-        "small_split_size": Switch({"split_size": ADC.split_size}, "the smaller size above which a Gaussian is split"),
+        "small_split_size": Switch(
+            {"split_size": ADC.split_size}, "the smaller size above which a Gaussian is split"
+        ),
         "opacity_reset": OPACITY_RESET,
     }
 
@@ -48,10 +60,13 @@ class AbsGS(ADC):
         super().observe(step, render)
         if step < self.stop:
             assert render.screen_gradient_abs is not None  # because of needs_absolute_gradient
-            self.statistics["absolute_sum"] += torch.where(render.visible, render.screen_gradient_abs.norm(dim=-1), 0.0)
+            self.statistics["absolute_sum"] += torch.where(
+                render.visible, render.screen_gradient_abs.norm(dim=-1), 0.0
+            )
 
     def mean_absolute_gradient(self) -> Tensor:
-        """Absolute mean gradient [N] NDC over the iterations in which a Gaussian was visible; 0 if it never was."""
+        """Absolute mean gradient [N] NDC over the iterations in which a Gaussian was visible; 0 if
+        it never was."""
         return self.statistics["absolute_sum"] / self.statistics["visible_count"].clamp_min(1)
 
     def rules(self, refinement: Refinement) -> list[Rule]:
@@ -63,13 +78,17 @@ class AbsGS(ADC):
 
     def candidates(self, refinement: Refinement) -> tuple[Tensor, Tensor]:
         over, large = super().candidates(refinement)
-        return torch.where(large, self.reaches(self.mean_absolute_gradient(), self.split_threshold), over), large
+        return torch.where(
+            large, self.reaches(self.mean_absolute_gradient(), self.split_threshold), over
+        ), large
 
     def choose(self, refinement: Refinement, candidates: Tensor, gain: int) -> tuple[Tensor, int]:
         """Choose the candidates farthest above the threshold that applies to them."""
         _, large = self.candidates(refinement)
         signed = self.mean_gradient() / self.gradient_threshold
-        excess = torch.where(large, self.mean_absolute_gradient() / self.split_threshold, signed)  # [N]
+        excess = torch.where(
+            large, self.mean_absolute_gradient() / self.split_threshold, signed
+        )  # [N]
         return admit(candidates, excess, gain, self.allowance(refinement))
 
     def lower_opacity(self, refinement: Refinement) -> None:
@@ -81,10 +100,11 @@ class AbsGS(ADC):
 class PixelGS(ADC):
     """ADC with the growth condition of Zhang et al. (arXiv 2403.15530).
 
-    The mean gradient is sum_k m_ik f_ik |g_ik| / sum_k m_ik, where m_ik is the number of pixels that Gaussian i is
-    blended into in view k, g_ik its gradient and z_ik its depth there. So views that see only an edge of a large
-    Gaussian no longer lower its mean. The factor f_ik = min(1, (z_ik / (``near_fraction`` extent))^2) reduces growth
-    near cameras. Only growth uses this mean; the optimiser's gradients are not changed.
+    The mean gradient is sum_k m_ik f_ik |g_ik| / sum_k m_ik, where m_ik is the number of pixels
+    that Gaussian i is blended into in view k, g_ik its gradient and z_ik its depth there. So views
+    that see only an edge of a large Gaussian no longer lower its mean. The factor f_ik = min(1,
+    (z_ik / (``near_fraction`` extent))^2) reduces growth near cameras. Only growth uses this mean;
+    the optimiser's gradients are not changed.
     """
 
     STATISTICS: ClassVar[dict[str, torch.dtype]] = {
@@ -116,17 +136,19 @@ class PixelGS(ADC):
         return (depths / (self.near_fraction * self.context.extent)).square().clamp_max(1)
 
     def mean_gradient(self) -> Tensor:
-        """Mean gradient [N] NDC over the views since the last refinement, weighted by pixels; 0 without pixels."""
+        """Mean gradient [N] NDC over the views since the last refinement, weighted by pixels; 0
+        without pixels."""
         return self.statistics["weighted_gradient_sum"] / self.statistics["pixel_sum"].clamp_min(1)
 
 
 @dataclass
 class QuantileADC(ADC):
-    """ADC with a growth rate, after the AdaptiveStrategy proposed for gsplat (its pull request 941).
+    """ADC with a growth rate, after the AdaptiveStrategy proposed for gsplat (its pull request
+    941).
 
-    In each round the Gaussians with the largest mean gradients grow, as many as raise the count by ``growth_rate``.
-    Gaussians that no view has seen do not grow. The ``prune_share`` with the lowest opacities are pruned, and huge
-    Gaussians are pruned as in ADC.
+    In each round the Gaussians with the largest mean gradients grow, as many as raise the count by
+    ``growth_rate``. Gaussians that no view has seen do not grow. The ``prune_share`` with the
+    lowest opacities are pruned, and huge Gaussians are pruned as in ADC.
     """
 
     growth_rate: PositiveFloat = 0.05
@@ -141,10 +163,16 @@ class QuantileADC(ADC):
         return largest & (mean > 0), large
 
     def forecast(self, refinement: Refinement) -> int:
-        # The opacity threshold is a quantile over all Gaussians after growth, so each child needs its own entry.
+        # The opacity threshold is a quantile over all Gaussians after growth, so each child needs
+        # its own entry.
         grown = self.grown(refinement)
-        index = torch.arange(len(grown.number), device=grown.number.device).repeat_interleave(grown.number)
-        pruned = self.faint(grown.opacity_logits[index]) | self.huge(refinement.step, grown.log_scales)[index]
+        index = torch.arange(len(grown.number), device=grown.number.device).repeat_interleave(
+            grown.number
+        )
+        pruned = (
+            self.faint(grown.opacity_logits[index])
+            | self.huge(refinement.step, grown.log_scales)[index]
+        )
         return len(index) - int(pruned.sum())
 
     def faint(self, opacity_logits: Tensor) -> Tensor:
@@ -165,28 +193,35 @@ class Saddles(NamedTuple):
 
 @dataclass
 class SteepGS(ADC):
-    """ADC that splits a candidate only where a split lowers the loss (Wang et al., CVPR 2025, arXiv 2505.05587).
+    """ADC that splits a candidate only where a split lowers the loss (Wang et al., CVPR 2025, arXiv
+    2505.05587).
 
-    Replace a Gaussian by two halves at small offsets +-d. To second order the loss changes by d S d / 2, where S is the
-    splitting matrix: the sum over pixels of (d loss / d s) times the second derivative of s by the mean, with s the
-    opacity times the density at the pixel. So a split lowers the loss only if S has a negative eigenvalue, and most
-    along the eigenvector of the least eigenvalue. Halves of equal weight are best.
+    Replace a Gaussian by two halves at small offsets +-d. To second order the loss changes by d S d
+    / 2, where S is the splitting matrix: the sum over pixels of (d loss / d s) times the second
+    derivative of s by the mean, with s the opacity times the density at the pixel. So a split
+    lowers the loss only if S has a negative eigenvalue, and most along the eigenvector of the least
+    eigenvalue. Halves of equal weight are best.
 
-    A candidate of ADC grows only if the least eigenvalue of its S, averaged over the iterations in which it was
-    visible, is below ``eigenvalue_threshold``, in units of the loss per squared scene extent (None: no condition). Two
-    children replace it, on either side along the eigenvector, with ``opacity_factor`` times its opacity. If it is
-    large, their scales are divided by ``split_shrink``, and each offset has the length of a draw from the parent's
-    density. If it is small, their scales are the parent's, and the offset is the present learning rate of the means.
-    Under a cap, the least eigenvalues come first. ``split_children`` and ``revised_opacity`` have no effect.
+    A candidate of ADC grows only if the least eigenvalue of its S, averaged over the iterations in
+    which it was visible, is below ``eigenvalue_threshold``, in units of the loss per squared scene
+    extent (None: no condition). Two children replace it, on either side along the eigenvector, with
+    ``opacity_factor`` times its opacity. If it is large, their scales are divided by
+    ``split_shrink``, and each offset has the length of a draw from the parent's density. If it is
+    small, their scales are the parent's, and the offset is the present learning rate of the means.
+    Under a cap, the least eigenvalues come first. ``split_children`` and ``revised_opacity`` have
+    no effect.
     """
 
     STATISTICS: ClassVar[Mapping[str, torch.dtype | Statistic]] = {
-        "splitting_sum": Statistic(torch.float32, (3, 3))  # per world unit squared, since the last refinement
+        # per world unit squared, since the last refinement
+        "splitting_sum": Statistic(torch.float32, (3, 3))
     }
     needs_splitting_matrix = True
 
     SWITCHES: ClassVar[Mapping[str, Switch]] = {
-        "saddle": Switch({"eigenvalue_threshold": None}, "the condition that a split lowers the loss"),
+        "saddle": Switch(
+            {"eigenvalue_threshold": None}, "the condition that a split lowers the loss"
+        ),
         "halving": Switch({"opacity_factor": 1.0}, "halves of half the opacity"),
         "opacity_reset": OPACITY_RESET,
     }
@@ -200,10 +235,11 @@ class SteepGS(ADC):
             self.statistics["splitting_sum"] += render.require_splitting_matrix()
 
     def steepest(self, where: Tensor) -> tuple[Tensor, Tensor]:
-        """The least eigenvalue [S] of the mean splitting matrix of the S Gaussians at the mask ``where`` [N], and its
-        eigenvector [S, 3].
+        """The least eigenvalue [S] of the mean splitting matrix of the S Gaussians at the mask
+        ``where`` [N], and its eigenvector [S, 3].
 
-        Eigenvalues are in units of the loss per squared extent. The largest component of each eigenvector is positive.
+        Eigenvalues are in units of the loss per squared extent. The largest component of each
+        eigenvector is positive.
         """
         seen = self.statistics["visible_count"][where].clamp_min(1)  # [S]
         mean = self.statistics["splitting_sum"][where].double() / seen[:, None, None]  # [S, 3, 3]
@@ -232,53 +268,71 @@ class SteepGS(ADC):
         return Grown(
             torch.where(over, 2, 1),
             values.log_scales - math.log(self.split_shrink) * (over & large).unsqueeze(-1),
-            torch.where(over, faded(values.opacity_logits, self.opacity_factor), values.opacity_logits),
+            torch.where(
+                over, faded(values.opacity_logits, self.opacity_factor), values.opacity_logits
+            ),
         )
 
     def grow_by_gradient(self, refinement: Refinement) -> None:
         """Replace each candidate by two halves."""
         gaussians = refinement.gaussians
         saddles = self.saddles(refinement)
-        selected, blocked = admit(saddles.candidates, -saddles.values, 1, self.allowance(refinement))
+        selected, blocked = admit(
+            saddles.candidates, -saddles.values, 1, self.allowance(refinement)
+        )
         indices = selected.nonzero().squeeze(-1)  # [S]
-        parents, is_large = gaussians.values.detach().select(indices), saddles.large[indices].unsqueeze(-1)
+        parents, is_large = (
+            gaussians.values.detach().select(indices),
+            saddles.large[indices].unsqueeze(-1),
+        )
         direction = saddles.directions[indices].to(parents.means)  # [S, 3]
         noise = standard_normal((2 * len(parents), 3), refinement.rng, parents.means)
         lengths = (noise * parents.scales.repeat(2, 1)).norm(dim=-1, keepdim=True)  # [2 S, 1]
         lengths = torch.where(is_large.repeat(2, 1), lengths, gaussians.position_rate)
         children = Gaussians.concatenate([parents, parents])
         children.means = children.means + lengths * torch.cat([direction, -direction])
-        children.log_scales = children.log_scales - math.log(self.split_shrink) * is_large.repeat(2, 1)
+        children.log_scales = children.log_scales - math.log(self.split_shrink) * is_large.repeat(
+            2, 1
+        )
         children.opacity_logits = faded(children.opacity_logits, self.opacity_factor)
         self.edit(refinement, ~selected, children, indices.repeat(2), Cause.SPLIT_GRADIENT)
         refinement.event.split_gradient += len(parents)
         refinement.event.blocked_by_cap += blocked
 
 
-GATHER_ROUNDS = 2  # gradients are gathered from so many rounds before the window (200 iterations in the authors' code)
+# gradients are gathered from so many rounds before the window (200 iterations in the authors' code)
+GATHER_ROUNDS = 2
 
 
 @dataclass
 class ResGS(ADC):
     """ADC with the residual split of Lyu et al. (ICCV 2025, arXiv 2412.07494).
 
-    Each candidate stays, with its opacity multiplied by ``parent_opacity``, and gets one child. The child's mean is
-    drawn from the parent's density, its scales are divided by ``split_shrink``, its opacity is the parent's former one,
-    and its level is the parent's plus one. So the child adds the detail that the parent lacks.
+    Each candidate stays, with its opacity multiplied by ``parent_opacity``, and gets one child. The
+    child's mean is drawn from the parent's density, its scales are divided by ``split_shrink``, its
+    opacity is the parent's former one, and its level is the parent's plus one. So the child adds
+    the detail that the parent lacks.
 
-    The window has phases, which end at the fractions ``phase_ends`` of it, and each phase has ``stages_a_phase`` equal
-    stages. A Gaussian of level l grows in stage s > l at ``gradient_threshold`` times ``level_factor``^(l - s), so that
-    Gaussians of low levels catch up. For ``warm_up`` of the window after the end of a phase, no gradients are gathered
-    and nothing grows. From the fraction ``fade_start`` of the window until iteration ``fade_stop``, all opacities are
-    multiplied by ``fade`` every ``fade_interval`` iterations. There is no opacity reset, and no pruning by size.
+    The window has phases, which end at the fractions ``phase_ends`` of it, and each phase has
+    ``stages_a_phase`` equal stages. A Gaussian of level l grows in stage s > l at
+    ``gradient_threshold`` times ``level_factor``^(l - s), so that Gaussians of low levels catch up.
+    For ``warm_up`` of the window after the end of a phase, no gradients are gathered and nothing
+    grows. From the fraction ``fade_start`` of the window until iteration ``fade_stop``, all
+    opacities are multiplied by ``fade`` every ``fade_interval`` iterations. There is no opacity
+    reset, and no pruning by size.
     """
 
-    STATISTICS: ClassVar[dict[str, torch.dtype]] = {"level": torch.int32}  # how many residual splits made a Gaussian
+    # residual splits that made a Gaussian
+    STATISTICS: ClassVar[dict[str, torch.dtype]] = {"level": torch.int32}
 
     SWITCHES: ClassVar[Mapping[str, Switch]] = {
-        "absolute_gradient": Switch({"gradient": "signed"}, "the absolute gradient, in which pixels do not cancel"),
+        "absolute_gradient": Switch(
+            {"gradient": "signed"}, "the absolute gradient, in which pixels do not cancel"
+        ),
         "fading": Switch({"fade": 1.0}, "opacities that fade"),
-        "levels": Switch({"level_factor": 1.0}, "lower thresholds for those that earlier stages passed over"),
+        "levels": Switch(
+            {"level_factor": 1.0}, "lower thresholds for those that earlier stages passed over"
+        ),
     }
 
     prunes_by_size = False
@@ -302,7 +356,9 @@ class ResGS(ADC):
 
     def iteration_at(self, fraction: float) -> int:
         """The iteration of the round nearest to the given fraction of the window."""
-        return self.start + round(fraction * (self.stop - self.start) / self.interval) * self.interval
+        return (
+            self.start + round(fraction * (self.stop - self.start) / self.interval) * self.interval
+        )
 
     def warming_up(self, step: int) -> bool:
         """Return whether ``step`` is in the pause after the end of a phase."""
@@ -316,7 +372,8 @@ class ResGS(ADC):
         length = self.iteration_at(self.warm_up) - self.start
         begin = self.start if phase == 0 else ends[phase - 1] + length
         stage_length = max(((*ends, self.stop)[phase] - begin) // self.stages_a_phase, 1)
-        # The authors' loop begins to count one iteration late in the first phase and one early in the others.
+        # The authors' loop begins to count one iteration late in the first phase and one early in
+        # the others.
         offset = 1 if phase == 0 else -1
         done = max(0, (step - begin - offset) // stage_length)
         return self.stages_a_phase * phase + 1 + min(done, self.stages_a_phase)
@@ -326,7 +383,10 @@ class ResGS(ADC):
             super().observe(step, render)
 
     def rules(self, refinement: Refinement) -> list[Rule]:
-        step, rules = refinement.step, [rule for rule in super().rules(refinement) if rule != self.reset_opacity]
+        step, rules = (
+            refinement.step,
+            [rule for rule in super().rules(refinement) if rule != self.reset_opacity],
+        )
         if self.warming_up(step):
             rules = []
         fading = self.iteration_at(self.fade_start) <= step < self.fade_stop
@@ -337,13 +397,16 @@ class ResGS(ADC):
     def candidates(self, refinement: Refinement) -> tuple[Tensor, Tensor]:
         _, large = super().candidates(refinement)
         behind = (self.stage(refinement.step) - self.statistics["level"]).clamp_min(0)  # [N] levels
-        mean = self.mean_gradient() * self.level_factor ** behind.to(torch.float64)  # instead of a lower threshold
+        # instead of a lower threshold
+        mean = self.mean_gradient() * self.level_factor ** behind.to(torch.float64)
         return self.reaches(mean, self.gradient_threshold), large
 
     def forecast(self, refinement: Refinement) -> int:
         values = refinement.gaussians.values
         over, _ = self.candidates(refinement)
-        parents = torch.where(over, faded(values.opacity_logits, self.parent_opacity), values.opacity_logits)
+        parents = torch.where(
+            over, faded(values.opacity_logits, self.parent_opacity), values.opacity_logits
+        )
         children = over & ~self.faint(values.opacity_logits)
         return int((~self.faint(parents)).sum()) + int(children.sum())
 
@@ -376,6 +439,7 @@ class ResGS(ADC):
         self.statistics["level"] = levels
 
     def fade_all(self, refinement: Refinement) -> None:
-        """Multiply all opacities by ``fade``: Gaussians that are not needed become faint and are pruned."""
+        """Multiply all opacities by ``fade``: Gaussians that are not needed become faint and are
+        pruned."""
         logits = refinement.gaussians.values.opacity_logits.detach()
         refinement.gaussians.overwrite("opacity_logits", faded(logits, self.fade))

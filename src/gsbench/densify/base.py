@@ -1,5 +1,6 @@
-"""The contract of a densifier: its hyper-parameters, its saved state, the lineage of every Gaussian, and a record of
-each refinement. At the end stand functions that several densifiers share."""
+"""The contract of a densifier: its hyper-parameters, its saved state, the lineage of every
+Gaussian, and a record of each refinement. At the end stand functions that several densifiers
+share."""
 
 from __future__ import annotations
 
@@ -20,26 +21,35 @@ from gsbench.settings import Switch, check_settings
 
 
 class Lineage:
-    """Identity, parent and cause of every Gaussian that ever existed in a training; always on the CPU.
+    """Identity, parent and cause of every Gaussian that ever existed in a training; always on the
+    CPU.
 
-    ``ids`` [N] are the identities of the present Gaussians. ``parents``, ``causes`` and ``steps`` [T] are the history
-    of all T Gaussians, indexed by identity; the parent of an initial Gaussian is -1.
+    ``ids`` [N] are the identities of the present Gaussians. ``parents``, ``causes`` and ``steps``
+    [T] are the history of all T Gaussians, indexed by identity; the parent of an initial Gaussian
+    is -1.
     """
 
     def __init__(self, num_gaussians: int) -> None:
         self.ids = torch.arange(num_gaussians)  # [N]
         self.initial_count = num_gaussians
-        self._history = [self._entries(torch.full((num_gaussians,), -1), Cause.INITIAL, 0)]  # joined when asked for
+        # joined when asked for
+        self._history = [self._entries(torch.full((num_gaussians,), -1), Cause.INITIAL, 0)]
         self._total = num_gaussians
 
     @staticmethod
     def _entries(parents: Tensor, cause: Cause, step: int) -> dict[str, Tensor]:
-        """The history of Gaussians that were born together, given the identities [A] of their parents."""
+        """The history of Gaussians that were born together, given the identities [A] of their
+        parents."""
         causes = torch.full_like(parents, int(cause), dtype=torch.uint8)
-        return {"parents": parents, "causes": causes, "steps": torch.full_like(parents, step, dtype=torch.int32)}
+        return {
+            "parents": parents,
+            "causes": causes,
+            "steps": torch.full_like(parents, step, dtype=torch.int32),
+        }
 
     def edit(self, keep: Tensor | None, parents: Tensor | None, cause: Cause, step: int) -> None:
-        """Keep the Gaussians at the mask ``keep`` [N], then append a child of each of ``parents`` [A].
+        """Keep the Gaussians at the mask ``keep`` [N], then append a child of each of ``parents``
+        [A].
 
         ``parents`` are indices from before the edit.
         """
@@ -56,10 +66,11 @@ class Lineage:
         return {cause.key: int(counts[cause]) for cause in Cause}
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return ``ids``, ``parents``, ``causes`` and ``steps`` as tensors; ``lineage.npz`` of a trial holds the
-        same."""
+        """Return ``ids``, ``parents``, ``causes`` and ``steps`` as tensors; ``lineage.npz`` of a
+        trial holds the same."""
         return {"ids": self.ids} | {
-            name: torch.cat([entries[name] for entries in self._history]) for name in self._history[0]
+            name: torch.cat([entries[name] for entries in self._history])
+            for name in self._history[0]
         }
 
     @classmethod
@@ -84,20 +95,24 @@ class DensifyContext:
     white_background: bool = False
     device: torch.device = CPU  # of the Gaussians
     views: TrainingViews | None = None
-    # Given a refinement and the cap (None: no cap), returns the count that the training allows after this round.
+    # Given a refinement and the cap (None: no cap), returns the count that the training allows
+    # after this round.
     limit: Callable[[Refinement, int | None], int] | None = None
 
     @property
     def training_views(self) -> TrainingViews:
         """``views``, or RuntimeError if there are none; the trainer always gives them."""
         if self.views is None:
-            raise RuntimeError("this densifier looks at training views: give them as DensifyContext.views")
+            raise RuntimeError(
+                "this densifier looks at training views: give them as DensifyContext.views"
+            )
         return self.views
 
 
 @dataclass
 class Refinement:
-    """One refinement in progress: what its rules read and change, and the event that counts their edits."""
+    """One refinement in progress: what its rules read and change, and the event that counts their
+    edits."""
 
     step: int
     gaussians: TrainableGaussians
@@ -109,7 +124,8 @@ Rule = Callable[[Refinement], None]
 
 
 class Statistic(NamedTuple):
-    """A statistic with several numbers per Gaussian: ``Statistic(torch.float32, (3, 3))`` is [N, 3, 3]."""
+    """A statistic with several numbers per Gaussian: ``Statistic(torch.float32, (3, 3))`` is [N, 3,
+    3]."""
 
     dtype: torch.dtype
     shape: tuple[int, ...] = ()
@@ -118,17 +134,18 @@ class Statistic(NamedTuple):
 class Densifier:
     """Base of all densifiers. By itself it never changes the Gaussians.
 
-    A subclass is a dataclass of hyper-parameters; their annotations say which values are allowed. In every iteration
-    the trainer calls ``regularizer`` before the backward pass, ``observe`` after it, then ``refine``, then the
-    optimiser step, then ``after_step``. A subclass defines:
+    A subclass is a dataclass of hyper-parameters; their annotations say which values are allowed.
+    In every iteration the trainer calls ``regularizer`` before the backward pass, ``observe`` after
+    it, then ``refine``, then the optimiser step, then ``after_step``. A subclass defines:
 
     - ``rules``: what a refinement does;
     - ``STATISTICS``: what it gathers, in addition to the statistics of its base class;
     - ``SWITCHES``: its parts that ``gsbench ablate`` can turn off.
 
-    The state is ``context``, ``lineage`` and ``statistics``. ``statistics`` has one tensor [N] for each name in
-    ``STATISTICS`` ([N, …] for a `Statistic` with a shape), zero at the start, on the device of the Gaussians. Every
-    ``edit`` updates them (new Gaussians get zero), and checkpoints save them.
+    The state is ``context``, ``lineage`` and ``statistics``. ``statistics`` has one tensor [N] for
+    each name in ``STATISTICS`` ([N, …] for a `Statistic` with a shape), zero at the start, on the
+    device of the Gaussians. Every ``edit`` updates them (new Gaussians get zero), and checkpoints
+    save them.
 
     Examples:
         A densifier that clones the nearly opaque Gaussians every ``interval`` iterations:
@@ -142,7 +159,8 @@ class Densifier:
         ...         return [self.grow] if refinement.step % self.interval == 0 else []
         ...
         ...     def grow(self, refinement):
-        ...         opaque = refinement.gaussians.values.opacity_logits.sigmoid() > self.opacity  # [N]
+        ...         opacities = refinement.gaussians.values.opacity_logits.sigmoid()  # [N]
+        ...         opaque = opacities > self.opacity  # [N]
         ...         refinement.event.cloned += self.clone(refinement, opaque)
 
         >>> from gsbench.gaussians.trainable import LearningRates
@@ -161,13 +179,15 @@ class Densifier:
     SWITCHES: ClassVar[Mapping[str, Switch]] = {}
     needs_absolute_gradient: bool = False
     needs_footprint: bool = False  # ``RenderOutput.footprint``, which gsplat does not give
-    needs_splitting_matrix: bool = False  # ``RenderOutput.splitting_probe``, which gsplat does not give
+    # ``RenderOutput.splitting_probe``, which gsplat does not give
+    needs_splitting_matrix: bool = False
 
     context: DensifyContext
     lineage: Lineage
     statistics: dict[str, Tensor]
     strictness: float = 1.0  # factor on the growth thresholds, set by ``cap=governor`` (`Budgeted`)
-    cull: float = 1.0  # factor on the opacity below which Gaussians are pruned, set by ``cap=governor``
+    # factor on the opacity below which Gaussians are pruned, set by ``cap=governor``
+    cull: float = 1.0
 
     def __init_subclass__(cls, **keywords: Any) -> None:
         super().__init_subclass__(**keywords)
@@ -176,12 +196,14 @@ class Densifier:
         cls.STATISTICS = {name: dtype for table in tables for name, dtype in table.items()}
 
     def __post_init__(self) -> None:
-        """Check each hyper-parameter against its annotation. A subclass adds checks that involve several of them."""
+        """Check each hyper-parameter against its annotation. A subclass adds checks that involve
+        several of them."""
         check_settings(self, "densify")
 
     @property
     def most_gaussians(self) -> int | None:
-        """The largest count during training: ``max_gaussians`` if the class has it; None: no limit."""
+        """The largest count during training: ``max_gaussians`` if the class has it; None: no
+        limit."""
         return getattr(self, "max_gaussians", None)
 
     def prepare(self, gaussians: Gaussians) -> Gaussians:
@@ -202,12 +224,16 @@ class Densifier:
         """Gather statistics of iteration ``step`` (1, 2, …) after its backward pass."""
 
     def rules(self, refinement: Refinement) -> list[Rule]:
-        """Return the rules that are due at ``refinement.step``, in order; an empty list if no rule is due."""
+        """Return the rules that are due at ``refinement.step``, in order; an empty list if no rule
+        is due."""
         return []
 
     @torch.no_grad()
-    def refine(self, step: int, gaussians: TrainableGaussians, rng: torch.Generator) -> RefineEvent | None:
-        """Apply the rules that are due. Return the record of what they did, or None if no rule was due."""
+    def refine(
+        self, step: int, gaussians: TrainableGaussians, rng: torch.Generator
+    ) -> RefineEvent | None:
+        """Apply the rules that are due. Return the record of what they did, or None if no rule was
+        due."""
         refinement = Refinement(step, gaussians, rng, RefineEvent(step=step, before=len(gaussians)))
         rules = self.rules(refinement)
         if not rules:
@@ -218,7 +244,8 @@ class Densifier:
         return refinement.event
 
     def after_step(self, step: int, gaussians: TrainableGaussians, rng: torch.Generator) -> None:
-        """Act after the optimiser step of iteration ``step``, for example by adding noise to the means."""
+        """Act after the optimiser step of iteration ``step``, for example by adding noise to the
+        means."""
 
     def edit(
         self,
@@ -228,10 +255,11 @@ class Densifier:
         parents: Tensor | None = None,
         cause: Cause = Cause.INITIAL,
     ) -> None:
-        """Keep the Gaussians at the mask ``keep`` [N] (None: all), then append the Gaussians ``append`` [A].
+        """Keep the Gaussians at the mask ``keep`` [N] (None: all), then append the Gaussians
+        ``append`` [A].
 
-        Optimiser state, lineage and statistics are edited alike. ``parents`` [A] are the indices, from before the edit,
-        of the parents of ``append``.
+        Optimiser state, lineage and statistics are edited alike. ``parents`` [A] are the indices,
+        from before the edit, of the parents of ``append``.
         """
         refinement.gaussians.edit(keep, append)
         self.lineage.edit(keep, parents, cause, refinement.step)
@@ -241,11 +269,16 @@ class Densifier:
             self.statistics[name] = torch.cat([kept, added[name]])
 
     def clone(
-        self, refinement: Refinement, selected: Tensor, cause: Cause = Cause.CLONE, revised_opacity: bool = False
+        self,
+        refinement: Refinement,
+        selected: Tensor,
+        cause: Cause = Cause.CLONE,
+        revised_opacity: bool = False,
     ) -> int:
         """Append a copy of each Gaussian at the mask ``selected`` [N]; return the number of copies.
 
-        With ``revised_opacity``, a Gaussian and its copy together are as opaque as it was before (arXiv 2404.06109).
+        With ``revised_opacity``, a Gaussian and its copy together are as opaque as it was before
+        (arXiv 2404.06109).
         """
         gaussians = refinement.gaussians
         parents = selected.nonzero().squeeze(-1)  # [C]
@@ -268,16 +301,20 @@ class Densifier:
         keep_parent: bool = False,
         sampled: bool = True,
     ) -> int:
-        """Replace each Gaussian at the mask ``selected`` [N] by ``children`` new ones; return by how many the count
-        grew.
+        """Replace each Gaussian at the mask ``selected`` [N] by ``children`` new ones; return by
+        how many the count grew.
 
-        ``child_log_scales`` [S, 3] has one row per selected Gaussian. With ``keep_parent``, parents stay beside their
-        children. The means of children are drawn from the density of their parent (``sampled``), or equal its mean.
+        ``child_log_scales`` [S, 3] has one row per selected Gaussian. With ``keep_parent``, parents
+        stay beside their children. The means of children are drawn from the density of their parent
+        (``sampled``), or equal its mean.
         """
         parents = selected.nonzero().squeeze(-1)  # [S]
-        new = Gaussians.concatenate([refinement.gaussians.values.detach().select(parents)] * children)
+        new = Gaussians.concatenate(
+            [refinement.gaussians.values.detach().select(parents)] * children
+        )
         if sampled:
-            offsets = standard_normal((len(new), 3), refinement.rng, new.means) * new.scales  # along each one's axes
+            # along each one's axes
+            offsets = standard_normal((len(new), 3), refinement.rng, new.means) * new.scales
             new.means = new.means + (new.rotations @ offsets.unsqueeze(-1)).squeeze(-1)
         new.log_scales = child_log_scales.repeat(children, 1)
         if revised_opacity:
@@ -289,7 +326,8 @@ class Densifier:
     def remove(self, refinement: Refinement, faint: Tensor, others: Tensor | None = None) -> None:
         """Remove the Gaussians at the masks ``faint`` [N] and ``others`` [N].
 
-        ``faint`` counts as pruned by opacity, ``others`` as pruned by size; a Gaussian in both counts as ``faint``.
+        ``faint`` counts as pruned by opacity, ``others`` as pruned by size; a Gaussian in both
+        counts as ``faint``.
         """
         pruned = faint if others is None else faint | others
         refinement.event.pruned_opacity += int(faint.sum())
@@ -314,11 +352,18 @@ class Densifier:
         self.context = context
         self.lineage = Lineage.from_state(state["lineage"])
         saved = state["statistics"]
-        self.statistics = {name: saved[name].to(context.device, copy=True) for name in self.STATISTICS}
+        self.statistics = {
+            name: saved[name].to(context.device, copy=True) for name in self.STATISTICS
+        }
 
     def _zeros(self, count: int, device: torch.device) -> dict[str, Tensor]:
-        kinds = {n: Statistic(k) if isinstance(k, torch.dtype) else k for n, k in self.STATISTICS.items()}
-        return {name: torch.zeros(count, *kind.shape, dtype=kind.dtype, device=device) for name, kind in kinds.items()}
+        kinds = {
+            n: Statistic(k) if isinstance(k, torch.dtype) else k for n, k in self.STATISTICS.items()
+        }
+        return {
+            name: torch.zeros(count, *kind.shape, dtype=kind.dtype, device=device)
+            for name, kind in kinds.items()
+        }
 
 
 class NoDensifier(Densifier):
@@ -326,11 +371,12 @@ class NoDensifier(Densifier):
 
 
 def standard_normal(shape: tuple[int, ...], rng: torch.Generator, like: Tensor) -> Tensor:
-    """Draw normal numbers of ``shape``, with the dtype and on the device of ``like``, determined by the CPU generator
-    ``rng``.
+    """Draw normal numbers of ``shape``, with the dtype and on the device of ``like``, determined by
+    the CPU generator ``rng``.
 
-    On another device, a temporary generator there draws the numbers, seeded by ``rng``. So no numbers are uploaded, and
-    the state of ``rng`` is all that a checkpoint must save. The same seed gives other numbers there than on the CPU.
+    On another device, a temporary generator there draws the numbers, seeded by ``rng``. So no
+    numbers are uploaded, and the state of ``rng`` is all that a checkpoint must save. The same seed
+    gives other numbers there than on the CPU.
     """
     if like.device.type == "cpu":
         return torch.randn(shape, generator=rng, dtype=like.dtype)
@@ -343,7 +389,8 @@ MIN_REVISED_OPACITY = 1e-6  # keeps the logit finite
 
 
 def revised_logits(opacity_logits: Tensor) -> Tensor:
-    """Logits of 1 - sqrt(1 - o): two such children, one behind the other, are as opaque as the parent.
+    """Logits of 1 - sqrt(1 - o): two such children, one behind the other, are as opaque as the
+    parent.
 
     From Revising Densification (arXiv 2404.06109).
     """
@@ -357,7 +404,8 @@ def faded(opacity_logits: Tensor, factor: float) -> Tensor:
 
 
 def quantile(ordered: Tensor, q: float) -> float:
-    """The ``q``-quantile of sorted values [N], interpolated linearly (torch.quantile refuses more than 16 M values)."""
+    """The ``q``-quantile of sorted values [N], interpolated linearly (torch.quantile refuses more
+    than 16 M values)."""
     position = q * (len(ordered) - 1)
     low = math.floor(position)
     high = min(low + 1, len(ordered) - 1)

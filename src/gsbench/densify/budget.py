@@ -1,4 +1,5 @@
-"""Caps on the number of Gaussians: their arithmetic, and the base class of densifiers that have one."""
+"""Caps on the number of Gaussians: their arithmetic, and the base class of densifiers that have
+one."""
 
 import math
 from collections.abc import Callable
@@ -20,9 +21,9 @@ BISECTION_STEPS = 40  # of log(factor): the last interval is far below the spaci
 def allowance(num_gaussians: int, max_gaussians: int | None, cap: CapKind) -> int | None:
     """The number of Gaussians that a growth step may add; None: no limit.
 
-    ``soft``: no limit while the count is at most ``max_gaussians``, nothing above it. So one step may overshoot, as the
-    paper's cap does (its counts end at 3.41 to 3.57 M for a cap of 3.4 M). ``hard`` and ``curve``: never above it.
-    ``freeze`` and ``governor``: no limit within a round.
+    ``soft``: no limit while the count is at most ``max_gaussians``, nothing above it. So one step
+    may overshoot, as the paper's cap does (its counts end at 3.41 to 3.57 M for a cap of 3.4 M).
+    ``hard`` and ``curve``: never above it. ``freeze`` and ``governor``: no limit within a round.
     """
     if max_gaussians is None or cap in ("freeze", "governor"):
         return None
@@ -32,7 +33,8 @@ def allowance(num_gaussians: int, max_gaussians: int | None, cap: CapKind) -> in
 
 
 def admit(candidates: Tensor, score: Tensor, gain: int, allowed: int | None) -> tuple[Tensor, int]:
-    """Choose the candidates that the allowance admits, best ``score`` first (ties by index); count those refused.
+    """Choose the candidates that the allowance admits, best ``score`` first (ties by index); count
+    those refused.
 
     ``candidates`` is a mask [N], ``score`` is [N]; each candidate adds ``gain`` Gaussians.
     """
@@ -48,9 +50,11 @@ def admit(candidates: Tensor, score: Tensor, gain: int, allowed: int | None) -> 
 
 
 def find_factor(count: Callable[[float], int], target: int, low: float, high: float) -> float:
-    """Find the factor in [``low``, ``high``] for which ``count`` is nearest to ``target`` without exceeding it.
+    """Find the factor in [``low``, ``high``] for which ``count`` is nearest to ``target`` without
+    exceeding it.
 
-    ``count`` must fall as the factor rises. Returns ``high`` if ``count`` exceeds ``target`` everywhere.
+    ``count`` must fall as the factor rises. Returns ``high`` if ``count`` exceeds ``target``
+    everywhere.
     """
     if count(low) <= target:
         return low
@@ -70,12 +74,14 @@ def find_factor(count: Callable[[float], int], target: int, low: float, high: fl
 PAPER_CAP = 3_400_000  # arXiv 2508.05187 has it for the baseline and for its own rule
 STRICTNESS_LIMITS = (1e-3, 1e3)  # of the factor on the growth thresholds
 CULL_LIMITS = (1.0, 10.0)  # of the factor on the opacity below which Gaussians are pruned
-DEADBAND = 0.01  # a count up to 1 % above its target does not raise ``cull`` (arXiv 2605.16158: "e.g., 1%")
+# a count up to 1 % above its target does not raise ``cull`` (arXiv 2605.16158: "e.g., 1%")
+DEADBAND = 0.01
 
 
 @dataclass
 class Budgeted(Densifier):
-    """Base of densifiers that have rounds of growth and pruning, and a cap on the number of Gaussians.
+    """Base of densifiers that have rounds of growth and pruning, and a cap on the number of
+    Gaussians.
 
     ``cap`` says how ``max_gaussians`` is enforced:
 
@@ -83,12 +89,15 @@ class Budgeted(Densifier):
     - ``freeze``: a round that starts above it neither grows nor prunes;
     - ``hard``: the candidates with the highest scores are taken up to it, never more;
     - ``curve``: as ``hard``, with a limit that rises to it over the window;
-    - ``governor``: thresholds are adjusted so that the count follows that curve and ends at it (`govern`).
+    - ``governor``: thresholds are adjusted so that the count follows that curve and ends at it
+      (`govern`).
 
-    Under ``soft`` and ``hard``, the training may set a limit for each round too (``train.resolution_schedule``).
+    Under ``soft`` and ``hard``, the training may set a limit for each round too
+    (``train.resolution_schedule``).
 
-    A subclass calls `allowance` before it adds Gaussians. To support ``freeze`` and ``governor``, it also overrides
-    `forecast`, and multiplies its growth thresholds by ``strictness`` and its opacity for pruning by ``cull``.
+    A subclass calls `allowance` before it adds Gaussians. To support ``freeze`` and ``governor``,
+    it also overrides `forecast`, and multiplies its growth thresholds by ``strictness`` and its
+    opacity for pruning by ``cull``.
 
     Examples:
         A densifier that clones opaque Gaussians, under any cap:
@@ -122,16 +131,22 @@ class Budgeted(Densifier):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.stop <= self.start:
-            raise InputError(f"densify.stop must be above densify.start ({self.start}), got {self.stop}")
+            raise InputError(
+                f"densify.stop must be above densify.start ({self.start}), got {self.stop}"
+            )
         if self.cap in ("freeze", "curve", "governor") and self.max_gaussians is None:
             raise InputError(f"densify.max_gaussians must be set for densify.cap={self.cap}")
         if self.cap in ("freeze", "governor") and type(self).forecast is Budgeted.forecast:
-            raise InputError(f"densify.cap={self.cap} needs the method forecast, which {type(self).__name__} lacks")
+            raise InputError(
+                f"densify.cap={self.cap} needs the method forecast, which {type(self).__name__} "
+                "lacks"
+            )
 
     def begin(self, gaussians: Gaussians, context: DensifyContext) -> None:
         if self.most_gaussians is not None and self.most_gaussians < len(gaussians):
             raise InputError(
-                f"densify.max_gaussians must be at least the size of the initial cloud ({len(gaussians)}), got "
+                "densify.max_gaussians must be at least the size of the initial cloud "
+                f"({len(gaussians)}), got "
                 f"{self.most_gaussians}"
             )
         super().begin(gaussians, context)
@@ -143,9 +158,10 @@ class Budgeted(Densifier):
     def limit(self, step: int) -> int | None:
         """The limit on the count at iteration ``step``; None: no limit.
 
-        It is ``max_gaussians``, except under ``curve``. That limit rises from n0, the size of the initial cloud, at
-        ``start`` to n = ``max_gaussians`` at ``stop`` along n0 + (n - n0) (2x - x^2), with x the progress of the
-        window. So all arms grow alike and the last refinements are small (the idea of Taming 3DGS, arXiv 2406.15643).
+        It is ``max_gaussians``, except under ``curve``. That limit rises from n0, the size of the
+        initial cloud, at ``start`` to n = ``max_gaussians`` at ``stop`` along n0 + (n - n0) (2x -
+        x^2), with x the progress of the window. So all arms grow alike and the last refinements are
+        small (the idea of Taming 3DGS, arXiv 2406.15643).
         """
         if self.max_gaussians is None or self.cap != "curve":
             return self.max_gaussians
@@ -163,7 +179,8 @@ class Budgeted(Densifier):
         return max(0, most - count) if allowed is None else max(0, min(allowed, most - count))
 
     def forecast(self, refinement: Refinement) -> int:
-        """The count after a round with the present ``strictness`` and ``cull``, if no cap limited growth."""
+        """The count after a round with the present ``strictness`` and ``cull``, if no cap limited
+        growth."""
         raise NotImplementedError
 
     def frozen(self, refinement: Refinement) -> bool:
@@ -177,42 +194,54 @@ class Budgeted(Densifier):
 
     def skip_round(self, refinement: Refinement) -> None:
         """The only rule of a frozen round: record how many Gaussians it would have added."""
-        # With infinite strictness nothing grows: the difference is growth alone, without the effect of pruning.
-        refinement.event.blocked_by_cap += self._forecast_at(refinement) - self._forecast_at(refinement, math.inf)
+        # With infinite strictness nothing grows: the difference is growth alone, without the effect
+        # of pruning.
+        refinement.event.blocked_by_cap += self._forecast_at(refinement) - self._forecast_at(
+            refinement, math.inf
+        )
 
     def govern(self, refinement: Refinement) -> None:
-        """The first rule of a governed round: set ``strictness`` and ``cull`` so that the round ends at the target.
+        """The first rule of a governed round: set ``strictness`` and ``cull`` so that the round
+        ends at the target.
 
-        From Bisht and Kolb, "Smart Target Point Control for Gaussian Splatting Methods" (arXiv 2605.16158):
+        From Bisht and Kolb, "Smart Target Point Control for Gaussian Splatting Methods" (arXiv
+        2605.16158):
 
         - the target is n0 + (n - n0) (2x - x^2) (their eq. 3 to 5);
         - only the growth thresholds and the opacity for pruning are adjusted;
-        - ``cull`` is 1, unless the count is above the target even with the strictest growth; a deadband applies;
+        - ``cull`` is 1, unless the count is above the target even with the strictest growth; a
+          deadband applies;
         - ``cull`` is not raised for some time after an opacity reset (eq. 13).
 
         Ours:
 
         - the curve ends at the last round, x = 1;
         - one factor multiplies all growth thresholds;
-        - that factor is not updated in bounded steps (eq. 8 to 12, whose gains are not stated). Bisection finds the
-          factor for which ``forecast`` meets the target, so short windows work too (10 rounds instead of 144).
+        - that factor is not updated in bounded steps (eq. 8 to 12, whose gains are not stated).
+          Bisection finds the factor for which ``forecast`` meets the target, so short windows work
+          too (10 rounds instead of 144).
         """
         event = refinement.event
         target = self.target(refinement)
         ungoverned = self._forecast_at(refinement)
-        self.strictness = find_factor(lambda s: self._forecast_at(refinement, s), target, *STRICTNESS_LIMITS)
+        self.strictness = find_factor(
+            lambda s: self._forecast_at(refinement, s), target, *STRICTNESS_LIMITS
+        )
         reached = self._forecast_at(refinement, self.strictness)
         if reached > (1 + DEADBAND) * target and self.may_cull(refinement.step):
-            self.cull = find_factor(lambda c: self._forecast_at(refinement, self.strictness, c), target, *CULL_LIMITS)
+            self.cull = find_factor(
+                lambda c: self._forecast_at(refinement, self.strictness, c), target, *CULL_LIMITS
+            )
         event.target, event.strictness, event.cull = target, self.strictness, self.cull
         event.blocked_by_cap += max(0, ungoverned - reached)
 
     def target(self, refinement: Refinement) -> int:
         """The count at which a governed round should end; ``max_gaussians`` in the last round.
 
-        With progress x0 before the round and x after it, the curve closes the share 1 - ((1 - x) / (1 - x0))^2 of its
-        distance to ``max_gaussians``. The target closes the same share of the actual distance. So a count on the curve
-        stays on it, and a count below it catches up gradually.
+        With progress x0 before the round and x after it, the curve closes the share 1 - ((1 - x) /
+        (1 - x0))^2 of its distance to ``max_gaussians``. The target closes the same share of the
+        actual distance. So a count on the curve stays on it, and a count below it catches up
+        gradually.
         """
         assert self.max_gaussians is not None  # __post_init__ asks for it
         last = (self.stop - 1) // self.interval
@@ -222,9 +251,12 @@ class Budgeted(Densifier):
         return count + round((self.max_gaussians - count) * (1 - (left_after / left_before) ** 2))
 
     def may_cull(self, step: int) -> bool:
-        """Return whether the governor may raise ``cull`` now; False soon after opacities were reset."""
+        """Return whether the governor may raise ``cull`` now; False soon after opacities were
+        reset."""
         return True
 
-    def _forecast_at(self, refinement: Refinement, strictness: float = 1.0, cull: float = 1.0) -> int:
+    def _forecast_at(
+        self, refinement: Refinement, strictness: float = 1.0, cull: float = 1.0
+    ) -> int:
         self.strictness, self.cull = strictness, cull
         return self.forecast(refinement)

@@ -1,4 +1,5 @@
-"""Improved-GS and GNS: long-axis splits of candidates drawn by the edges that they cover, and natural selection."""
+"""Improved-GS and GNS: long-axis splits of candidates drawn by the edges that they cover, and
+natural selection."""
 
 import logging
 import math
@@ -25,12 +26,14 @@ REACH = 3.0  # standard deviations at which a Gaussian is taken to end
 
 @dataclass
 class LongAxis(ADC):
-    """ADC that splits all candidates along their longest axis and clones none (Deng et al., arXiv 2508.12313).
+    """ADC that splits all candidates along their longest axis and clones none (Deng et al., arXiv
+    2508.12313).
 
-    With d = ``split_distance`` and s the longest semi-axis, two children replace the parent. They lie at 3 d s on
-    either side of it along that axis. Their longest semi-axis is (1 - d) s, their other axes are the parent's times
-    sqrt(1 - d^2), and their opacity is the parent's times ``opacity_factor``. The split is not random. The options
-    ``split_size``, ``split_children``, ``split_shrink`` and ``revised_opacity`` of ADC have no effect.
+    With d = ``split_distance`` and s the longest semi-axis, two children replace the parent. They
+    lie at 3 d s on either side of it along that axis. Their longest semi-axis is (1 - d) s, their
+    other axes are the parent's times sqrt(1 - d^2), and their opacity is the parent's times
+    ``opacity_factor``. The split is not random. The options ``split_size``, ``split_children``,
+    ``split_shrink`` and ``revised_opacity`` of ADC have no effect.
     """
 
     SWITCHES: ClassVar[Mapping[str, Switch]] = {
@@ -58,7 +61,9 @@ class LongAxis(ADC):
         selected, blocked = self.choose(refinement, over, 1)
         parents = selected.nonzero().squeeze(-1)  # [S]
         parent_values = refinement.gaussians.values.detach().select(parents)
-        children = halves(parent_values, REACH * self.split_distance, *self._factors, self.opacity_factor)
+        children = halves(
+            parent_values, REACH * self.split_distance, *self._factors, self.opacity_factor
+        )
         self.edit(refinement, ~selected, children, parents.repeat(2), Cause.SPLIT_GRADIENT)
         refinement.event.split_gradient += len(parents)
         refinement.event.blocked_by_cap += blocked
@@ -69,11 +74,14 @@ class LongAxis(ADC):
         return 1 - self.split_distance, math.sqrt(1 - self.split_distance**2)
 
 
-def halves(parents: Gaussians, offset: float, longest: float, across: float, opacity: float) -> Gaussians:
-    """Two children of each of ``parents`` [S], [2 S]: first all children on one side, then all on the other.
+def halves(
+    parents: Gaussians, offset: float, longest: float, across: float, opacity: float
+) -> Gaussians:
+    """Two children of each of ``parents`` [S], [2 S]: first all children on one side, then all on
+    the other.
 
-    They lie ``offset`` standard deviations from the parent along its longest axis. ``longest`` multiplies the scale of
-    that axis, ``across`` the other scales, and ``opacity`` the opacity.
+    They lie ``offset`` standard deviations from the parent along its longest axis. ``longest``
+    multiplies the scale of that axis, ``across`` the other scales, and ``opacity`` the opacity.
     """
     axis = parents.log_scales.argmax(-1)  # [S]
     directions = parents.rotations[torch.arange(len(axis), device=axis.device), :, axis]  # [S, 3]
@@ -86,7 +94,8 @@ def halves(parents: Gaussians, offset: float, longest: float, across: float, opa
 
 
 def shrunk(log_scales: Tensor, longest: float, across: float) -> Tensor:
-    """``log_scales`` [N, 3] with the scale of the longest axis times ``longest`` and the others times ``across``."""
+    """``log_scales`` [N, 3] with the scale of the longest axis times ``longest`` and the others
+    times ``across``."""
     index = log_scales.argmax(-1, keepdim=True)
     is_longest = torch.zeros_like(log_scales, dtype=torch.bool).scatter(-1, index, True)
     # torch.where with two Python numbers would compute in float32; a tensor keeps float64.
@@ -94,9 +103,12 @@ def shrunk(log_scales: Tensor, longest: float, across: float) -> Tensor:
     return log_scales + factors[is_longest.long()]
 
 
-# The authors' code has iterations: a round every 100, an opacity reset every 3,000. These are rounds and resets.
-CLOSING_ROUNDS = 5  # the last rounds of the window: cap=root has reached its budget, and the score is the gradient
-CLOSING_FACTOR = 1.5  # divides the threshold in the closing rounds, while there is room below the cap
+# The authors' code has iterations: a round every 100, an opacity reset every 3,000. These are
+# rounds and resets.
+# the last rounds of the window: cap=root has reached its budget, and the score is the gradient
+CLOSING_ROUNDS = 5
+# divides the threshold in the closing rounds, while there is room below the cap
+CLOSING_FACTOR = 1.5
 EARLY_PRUNE = 3  # rounds after the start of training: faint Gaussians are pruned for the first time
 RECOVERY = 3  # rounds after an opacity reset: Gaussians that have recovered least are pruned
 ALL_VIEWS = 4  # rounds after an opacity reset: scores use all views
@@ -105,24 +117,33 @@ RESETS = 3  # RECOVERY and ALL_VIEWS apply until this opacity reset
 
 @dataclass
 class EdgeAware(LongAxis):
-    """The long-axis split, of candidates drawn by the edge-aware score of Deng et al. (arXiv 2508.12313).
+    """The long-axis split, of candidates drawn by the edge-aware score of Deng et al. (arXiv
+    2508.12313).
 
-    Each round draws ``score_views`` training views. The score of a Gaussian in a view is the sum over pixels of (edge
-    strength of the photograph) alpha T, divided by the mean of this sum over the Gaussians; the scores of all views are
-    averaged. In the closing rounds the score is the mean gradient. Gaussians above the gradient threshold with a
-    positive score are drawn without replacement in proportion to it, as many as the cap admits.
+    Each round draws ``score_views`` training views. The score of a Gaussian in a view is the sum
+    over pixels of (edge strength of the photograph) alpha T, divided by the mean of this sum over
+    the Gaussians; the scores of all views are averaged. In the closing rounds the score is the mean
+    gradient. Gaussians above the gradient threshold with a positive score are drawn without
+    replacement in proportion to it, as many as the cap admits.
 
-    ``cap=root`` is the authors' growth control: a limit of ``max_gaussians`` sqrt(x), where x is the progress of the
-    window up to the closing rounds. Faint Gaussians are pruned in each round but the last, huge ones never. Gaussians
-    below ``early_prune_opacity`` are pruned once early, and the ``recovery_share`` with the lowest opacities three
-    rounds after an opacity reset. Gradients are gathered only within the window.
+    ``cap=root`` is the authors' growth control: a limit of ``max_gaussians`` sqrt(x), where x is
+    the progress of the window up to the closing rounds. Faint Gaussians are pruned in each round
+    but the last, huge ones never. Gaussians below ``early_prune_opacity`` are pruned once early,
+    and the ``recovery_share`` with the lowest opacities three rounds after an opacity reset.
+    Gradients are gathered only within the window.
     """
 
     SWITCHES: ClassVar[Mapping[str, Switch]] = {
-        "absolute_gradient": Switch({"gradient": "signed"}, "the absolute gradient, in which pixels do not cancel"),
+        "absolute_gradient": Switch(
+            {"gradient": "signed"}, "the absolute gradient, in which pixels do not cancel"
+        ),
         "fading": Switch({"opacity_factor": 1.0}, "children fainter than their parent"),
-        "early_prune": Switch({"early_prune_opacity": 0.0}, "the pruning of the faint before the first round"),
-        "recovery_prune": Switch({"recovery_share": 0.0}, "the pruning of what did not recover from an opacity reset"),
+        "early_prune": Switch(
+            {"early_prune_opacity": 0.0}, "the pruning of the faint before the first round"
+        ),
+        "recovery_prune": Switch(
+            {"recovery_share": 0.0}, "the pruning of what did not recover from an opacity reset"
+        ),
     }
 
     prunes_by_size = False
@@ -152,7 +173,8 @@ class EdgeAware(LongAxis):
         return rules
 
     def rounds_after_reset(self, step: int) -> float:
-        """Rounds since the last opacity reset (or the start of training); infinity from the last counted reset on."""
+        """Rounds since the last opacity reset (or the start of training); infinity from the last
+        counted reset on."""
         if step >= RESETS * self.opacity_reset_interval:
             return math.inf
         return step % self.opacity_reset_interval / self.interval
@@ -195,7 +217,8 @@ class EdgeAware(LongAxis):
         return edge_scores(views, draw_views(views, count, rng), gaussians, step, by_mean)
 
     def prune_unrecovered(self, refinement: Refinement) -> None:
-        """Remove the ``recovery_share`` with the lowest opacities, which did not recover from the opacity reset."""
+        """Remove the ``recovery_share`` with the lowest opacities, which did not recover from the
+        opacity reset."""
         opacities = refinement.gaussians.values.opacities.detach()
         if len(opacities):
             self.prune_below(refinement, quantile(opacities.sort().values, self.recovery_share))
@@ -207,12 +230,15 @@ class EdgeAware(LongAxis):
 log = logging.getLogger(__name__)
 
 # From the authors' code, whose pressure acts every 50 iterations from iteration 15,000 to 23,000.
-SOFT_SHARE = 1 / 8  # first part of the pressure: its term depends on opacity, and no Gaussian is pruned
+# first part of the pressure: its term depends on opacity, and no Gaussian is pruned
+SOFT_SHARE = 1 / 8
 FIRST_AIM = 0.8  # of the opacity of the last Gaussian within the budget, when the pressure begins
 LOWEST_LOGIT = 20.0  # the pressure drives all opacity logits towards minus this
-MIN_TRANSPARENCY = 0.05  # smallest divisor in the first part: an opacity of .95 weighs 20 times as much as one near 0
+# smallest divisor in the first part: an opacity of .95 weighs 20 times as much as one near 0
+MIN_TRANSPARENCY = 0.05
 HARD_FACTOR = 3.0  # on the pressure after the first part
-BAND, WEAKER, STRONGER = 0.1, 0.8, 1.2  # the weight is changed if the opacity is more than BAND from its aim
+# the weight is changed if the opacity is more than BAND from its aim
+BAND, WEAKER, STRONGER = 0.1, 0.8, 1.2
 CLOSE = 1.05  # times the budget: below this, the excess is removed at once, by a random draw
 RATE_FACTOR = 4.0  # on the learning rate of opacities, until `SOFT_SHARE` after the budget is met
 SELECTION = ("step", "weight", "aim", "met_at")  # the attributes of `GNS` that checkpoints hold
@@ -220,20 +246,23 @@ SELECTION = ("step", "weight", "aim", "met_at")  # the attributes of `GNS` that 
 
 @dataclass
 class GNS(EdgeAware):
-    """Improved-GS up to ``overgrowth`` times the budget, then natural selection (Deng et al., arXiv 2511.16980).
+    """Improved-GS up to ``overgrowth`` times the budget, then natural selection (Deng et al., arXiv
+    2511.16980).
 
-    The pressure lasts ``pressure_length`` of the window's length, from the end of the window. Every half interval, a
-    term in the loss lowers all opacity logits l (opacity o): w (mean of (l + 20) / max(.05, 1 - o))^2 in the first
-    eighth of that time, then 3 w (mean l + 20)^2. The photometric loss counteracts it for Gaussians that the pictures
-    need. After the first eighth, Gaussians below ``selected_opacity`` are pruned.
+    The pressure lasts ``pressure_length`` of the window's length, from the end of the window. Every
+    half interval, a term in the loss lowers all opacity logits l (opacity o): w (mean of (l + 20) /
+    max(.05, 1 - o))^2 in the first eighth of that time, then 3 w (mean l + 20)^2. The photometric
+    loss counteracts it for Gaussians that the pictures need. After the first eighth, Gaussians
+    below ``selected_opacity`` are pruned.
 
-    The weight w starts at ``pressure``. It is adjusted so that the opacity of the last Gaussian within the budget
-    follows an aim, which falls from .8 of its initial value to 0 in seven eighths of the time. When the count is within
-    5 % of the budget, or the time ends, exactly ``max_gaussians`` are kept, drawn by opacity. Meanwhile the learning
-    rate of opacities is four times as high.
+    The weight w starts at ``pressure``. It is adjusted so that the opacity of the last Gaussian
+    within the budget follows an aim, which falls from .8 of its initial value to 0 in seven eighths
+    of the time. When the count is within 5 % of the budget, or the time ends, exactly
+    ``max_gaussians`` are kept, drawn by opacity. Meanwhile the learning rate of opacities is four
+    times as high.
 
-    ``max_gaussians`` is the final count; before, there are up to ``overgrowth`` times as many. If the training ends
-    before the pressure does, the final count is higher, too.
+    ``max_gaussians`` is the final count; before, there are up to ``overgrowth`` times as many. If
+    the training ends before the pressure does, the final count is higher, too.
     """
 
     cap: Literal["root"] = "root"
@@ -247,7 +276,8 @@ class GNS(EdgeAware):
         super().begin(gaussians, context)
         self.step = 0  # last observed iteration
         self.weight = self.pressure
-        self.aim: float | None = None  # initial value of the aimed opacity; None before the pressure
+        # initial value of the aimed opacity; None before the pressure
+        self.aim: float | None = None
         self.met_at: int | None = None  # iteration at which the budget was met
 
     @property
@@ -284,12 +314,20 @@ class GNS(EdgeAware):
         self.adjust_weight(step, gaussians.opacities.detach())
         logits = gaussians.opacity_logits + LOWEST_LOGIT
         if self.in_first_part(step):
-            return self.weight * (logits / (1 - gaussians.opacities).clamp_min(MIN_TRANSPARENCY)).mean().square()
+            return (
+                self.weight
+                * (logits / (1 - gaussians.opacities).clamp_min(MIN_TRANSPARENCY)).mean().square()
+            )
         return HARD_FACTOR * self.weight * logits.mean().square()
 
     def adjust_weight(self, step: int, opacities: Tensor) -> None:
-        """Adjust the weight of the pressure by the opacity of the last Gaussian within the budget."""
-        last = opacities.sort(descending=True).values[min(self.max_gaussians, len(opacities)) - 1].item()
+        """Adjust the weight of the pressure by the opacity of the last Gaussian within the
+        budget."""
+        last = (
+            opacities.sort(descending=True)
+            .values[min(self.max_gaussians, len(opacities)) - 1]
+            .item()
+        )
         if self.aim is None:
             self.aim = FIRST_AIM * last
         elif (step - 1) % (2 * self.pressure_interval) == 0:
@@ -318,11 +356,18 @@ class GNS(EdgeAware):
     def meet_budget(self, refinement: Refinement) -> None:
         """Keep ``max_gaussians`` Gaussians, drawn by opacity, and end the pressure."""
         opacities = refinement.gaussians.values.opacities.detach()
-        kept = draw(torch.ones_like(opacities, dtype=torch.bool), opacities, self.max_gaussians, refinement.rng)
+        kept = draw(
+            torch.ones_like(opacities, dtype=torch.bool),
+            opacities,
+            self.max_gaussians,
+            refinement.rng,
+        )
         if len(opacities) > CLOSE * self.max_gaussians:
             log.warning(
-                "the opacity pressure was too short: it ended with %d Gaussians, and %d of them were removed at "
-                "random; raise densify.pressure_length, or lower densify.interval (the pressure's is half of it)",
+                "the opacity pressure was too short: it ended with %d Gaussians, and %d of them "
+                "were removed at "
+                "random; raise densify.pressure_length, or lower densify.interval (the pressure's "
+                "is half of it)",
                 len(opacities),
                 int((~kept).sum()),
             )
@@ -335,7 +380,9 @@ class GNS(EdgeAware):
         refinement.gaussians.set_rate("opacity_logits", factor * refinement.gaussians.rates.opacity)
 
     def state_dict(self) -> dict[str, Any]:
-        return super().state_dict() | {"selection": {name: getattr(self, name) for name in SELECTION}}
+        return super().state_dict() | {
+            "selection": {name: getattr(self, name) for name in SELECTION}
+        }
 
     def load_state_dict(self, state: dict[str, Any], context: DensifyContext) -> None:
         super().load_state_dict(state, context)

@@ -26,10 +26,12 @@ GATE_STEEPNESS = 100.0  # of the sigmoid that suppresses noise on opaque Gaussia
 
 @dataclass
 class MCMC(Budgeted):
-    """Each refinement moves dead Gaussians onto living ones and adds a few copies, up to ``max_gaussians``.
+    """Each refinement moves dead Gaussians onto living ones and adds a few copies, up to
+    ``max_gaussians``.
 
-    A dead Gaussian has an opacity of at most ``min_opacity``. A Gaussian and its copies get a common opacity and scale,
-    so that the picture stays the same (eq. 9 of the paper). After each step, means get noise. The cap is always exact.
+    A dead Gaussian has an opacity of at most ``min_opacity``. A Gaussian and its copies get a
+    common opacity and scale, so that the picture stays the same (eq. 9 of the paper). After each
+    step, means get noise. The cap is always exact.
     """
 
     SWITCHES: ClassVar[Mapping[str, Switch]] = {
@@ -48,19 +50,24 @@ class MCMC(Budgeted):
     scale_weight: NonNegativeFloat = 0.01  # of the mean scale, in the loss
     initial_opacity: OpenFraction = 0.5
     initial_scale: PositiveFloat = 0.1  # of the distance to the neighbours
-    max_copies: Annotated[int, Interval(ge=1, le=BINOMIALS)] = 50  # that share opacity, the Gaussian included
+    # that share opacity, the Gaussian included
+    max_copies: Annotated[int, Interval(ge=1, le=BINOMIALS)] = 50
 
     def prepare(self, gaussians: Gaussians) -> Gaussians:
         return spread_out(gaussians, self.initial_opacity, self.initial_scale)
 
     def regularizer(self, gaussians: Gaussians) -> Tensor:
-        return self.opacity_weight * gaussians.opacities.mean() + self.scale_weight * gaussians.scales.mean()
+        return (
+            self.opacity_weight * gaussians.opacities.mean()
+            + self.scale_weight * gaussians.scales.mean()
+        )
 
     def rules(self, refinement: Refinement) -> list[Rule]:
         return [*self.governing(), self.relocate, self.add] if self.due(refinement.step) else []
 
     def forecast(self, refinement: Refinement) -> int:
-        """The count after a round without the cap: ``strictness`` divides the share that is added."""
+        """The count after a round without the cap: ``strictness`` divides the share that is
+        added."""
         return int((1 + self.growth / self.strictness) * len(refinement.gaussians))
 
     def may_cull(self, step: int) -> bool:
@@ -70,7 +77,9 @@ class MCMC(Budgeted):
     @torch.no_grad()
     def after_step(self, step: int, gaussians: TrainableGaussians, rng: torch.Generator) -> None:
         values = gaussians.values
-        gate = torch.sigmoid(-GATE_STEEPNESS * (values.opacities - self.min_opacity))  # [N], near 0 if opaque
+        gate = torch.sigmoid(
+            -GATE_STEEPNESS * (values.opacities - self.min_opacity)
+        )  # [N], near 0 if opaque
         noise = standard_normal((len(gaussians), 3), rng, values.means)
         axes = values.rotations * values.scales.unsqueeze(-2)  # [N, 3, 3]
         covariance = axes @ axes.mT
@@ -89,7 +98,8 @@ class MCMC(Budgeted):
         refinement.event.relocated = count
 
     def add(self, refinement: Refinement) -> None:
-        """Add copies of living Gaussians, drawn by opacity: a share ``growth`` of the count, up to the cap."""
+        """Add copies of living Gaussians, drawn by opacity: a share ``growth`` of the count, up to
+        the cap."""
         gaussians, event = refinement.gaussians, refinement.event
         if event.relocated == 0 and (gaussians.values.opacities <= self.min_opacity).all():
             return  # all are dead
@@ -100,9 +110,11 @@ class MCMC(Budgeted):
             return
         self._copy(refinement, gaussians.values.opacities.detach(), event.added, None, Cause.ADDED)
 
-    def _copy(self, refinement: Refinement, weights: Tensor, count: int, keep: Tensor | None, cause: Cause) -> None:
-        """Append ``count`` (at least 1) copies of Gaussians drawn by ``weights`` [N], which share their opacity; of
-        the others, keep those at the mask ``keep``."""
+    def _copy(
+        self, refinement: Refinement, weights: Tensor, count: int, keep: Tensor | None, cause: Cause
+    ) -> None:
+        """Append ``count`` (at least 1) copies of Gaussians drawn by ``weights`` [N], which share
+        their opacity; of the others, keep those at the mask ``keep``."""
         gaussians, sources = refinement.gaussians, _draw(weights, count, refinement.rng)  # [A]
         copies = torch.bincount(sources, minlength=len(gaussians)) + 1  # [N], the Gaussian included
         touched = copies > 1
@@ -114,17 +126,18 @@ class MCMC(Budgeted):
         log_scales = gaussians.values.log_scales.detach().clone()
         log_scales[touched] += shrink.log().unsqueeze(-1)
         changed = {"opacity_logits": logits, "log_scales": log_scales}
-        for name, tensor in gaussians.values.tensors().items():  # all six parameters: overwriting zeroes the moments
+        # all six parameters: overwriting zeroes the moments
+        for name, tensor in gaussians.values.tensors().items():
             gaussians.overwrite(name, changed.get(name, tensor), where=touched)
         self.edit(refinement, keep, gaussians.values.detach().select(sources), sources, cause)
 
 
 def shared_opacity(opacities: Tensor, copies: Tensor) -> tuple[Tensor, Tensor]:
-    """Opacity o' and factor s'/s on the scale of each of n = ``copies`` that together look like one Gaussian of
-    opacity o.
+    """Opacity o' and factor s'/s on the scale of each of n = ``copies`` that together look like one
+    Gaussian of opacity o.
 
-    o' = 1 - (1 - o)^(1/n) and s'/s = o / sum_{i=1..n} sum_{k=0..i-1} C(i-1, k) (-1)^k o'^(k+1) / sqrt(k+1), eq. 9 of
-    the paper; all [M].
+    o' = 1 - (1 - o)^(1/n) and s'/s = o / sum_{i=1..n} sum_{k=0..i-1} C(i-1, k) (-1)^k o'^(k+1) /
+    sqrt(k+1), eq. 9 of the paper; all [M].
     """
     new = 1 - (1 - opacities.double()).pow(1 / copies.double())  # [M]
     total = torch.zeros_like(new)
@@ -137,49 +150,59 @@ def shared_opacity(opacities: Tensor, copies: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _draw(weights: Tensor, count: int, rng: torch.Generator) -> Tensor:
-    """Draw ``count`` indices with replacement, in proportion to ``weights`` [N]; on the CPU, so that a seed gives the
-    same draw on every device."""
+    """Draw ``count`` indices with replacement, in proportion to ``weights`` [N]; on the CPU, so
+    that a seed gives the same draw on every device."""
     cumulative = weights.double().cpu().cumsum(0)
     draws = torch.rand(count, generator=rng, dtype=torch.float64) * cumulative[-1]
-    return torch.searchsorted(cumulative, draws, right=True).clamp_max(len(weights) - 1).to(weights.device)
+    return (
+        torch.searchsorted(cumulative, draws, right=True)
+        .clamp_max(len(weights) - 1)
+        .to(weights.device)
+    )
 
 
 def spread_out(gaussians: Gaussians, opacity: float, scale: float) -> Gaussians:
     """``gaussians`` with the same ``opacity`` for all, and their scales multiplied by ``scale``."""
     changed = {
-        "opacity_logits": torch.full_like(gaussians.opacity_logits, math.log(opacity / (1 - opacity))),
+        "opacity_logits": torch.full_like(
+            gaussians.opacity_logits, math.log(opacity / (1 - opacity))
+        ),
         "log_scales": gaussians.log_scales + math.log(scale),
     }
     return Gaussians(**(gaussians.tensors() | changed))
 
 
-# Constants from LichtFeld-Studio's code (src/training/strategies/mrnf.cpp, kernels/mrnf_kernels.cu).
+# Constants from LichtFeld-Studio's code (src/training/strategies/mrnf.cpp,
+# kernels/mrnf_kernels.cu).
 EDGE_WEIGHT = 0.25  # weights of draws are multiplied by 1 + this times (edge score / its median)
 REACH = 100.0  # times half the scene's size: Gaussians that are farther or larger are pruned
 MIN_SCALE = 1e-10  # world units; smaller Gaussians are pruned
 BOUNDS = (0.1, 0.9)  # quantiles of the means on each axis that bound the scene
 NOISE_POWER = 150.0  # noise is proportional to (1 - opacity) to this power
 SPLIT_OFFSET = 0.5  # standard deviations
-SPLIT_LONGEST, SPLIT_ACROSS, SPLIT_OPACITY = 0.5, 0.85, 0.6  # factors on the children's scales and opacity
+# factors on the children's scales and opacity
+SPLIT_LONGEST, SPLIT_ACROSS, SPLIT_OPACITY = 0.5, 0.85, 0.6
 MIN_DECAYED = 1e-12  # of opacities and scales after decay
 
 
 @dataclass
 class MRNF(Budgeted):
-    """Each round replaces pruned Gaussians and adds a small share by long-axis splits; opacities and scales decay.
+    """Each round replaces pruned Gaussians and adds a small share by long-axis splits; opacities
+    and scales decay.
 
-    The refine weight of a Gaussian is the largest sum over pixels of e alpha T in ``score_views`` training views, drawn
-    in each round, where e = max(0, 1 - SSIM) divided by its mean in the view. Candidates are the Gaussians seen since
-    the last round whose weight is above ``growth_threshold``. A round prunes Gaussians below ``prune_opacity`` and
-    those too small, too large or too far away. Then it splits:
+    The refine weight of a Gaussian is the largest sum over pixels of e alpha T in ``score_views``
+    training views, drawn in each round, where e = max(0, 1 - SSIM) divided by its mean in the view.
+    Candidates are the Gaussians seen since the last round whose weight is above
+    ``growth_threshold``. A round prunes Gaussians below ``prune_opacity`` and those too small, too
+    large or too far away. Then it splits:
 
     1. as many Gaussians as it pruned, drawn by opacity;
-    2. until iteration ``grow_until``, further candidates, drawn by refine weight, so that the two splits together are
-       the ``growth_share`` of all candidates.
+    2. until iteration ``grow_until``, further candidates, drawn by refine weight, so that the two
+       splits together are the ``growth_share`` of all candidates.
 
-    Both draws also favour Gaussians that cover edges. After each round every opacity decreases by ``opacity_decay`` and
-    every scale by the share ``scale_decay``; both amounts fall to 0 at iteration ``decay_until``. After each step, the
-    means of faint Gaussians get noise.
+    Both draws also favour Gaussians that cover edges. After each round every opacity decreases by
+    ``opacity_decay`` and every scale by the share ``scale_decay``; both amounts fall to 0 at
+    iteration ``decay_until``. After each step, the means of faint Gaussians get noise.
     """
 
     STATISTICS: ClassVar[dict[str, torch.dtype]] = {"seen": torch.bool}  # since the last round
@@ -219,7 +242,8 @@ class MRNF(Budgeted):
         return [self.refill_and_grow, self.decay, self.reset_statistics]
 
     def refill_and_grow(self, refinement: Refinement) -> None:
-        """Prune, split as many Gaussians to replace the pruned ones, then split a share of the candidates."""
+        """Prune, split as many Gaussians to replace the pruned ones, then split a share of the
+        candidates."""
         step, rng, event = refinement.step, refinement.rng, refinement.event
         values, seen = refinement.gaussians.values, self.statistics["seen"]
         pruned = self.to_prune(values)  # [N]
@@ -236,12 +260,20 @@ class MRNF(Budgeted):
         replacing = draw(seen & ~pruned, opacity_scores, num_pruned, rng)
         remaining = max(0, wanted - int(replacing.sum())) if step < self.grow_until else 0
         eligible = candidates & ~pruned & ~replacing
-        growing = draw(eligible, weights * edge_factor, min(remaining, room - int(replacing.sum())), rng)
+        growing = draw(
+            eligible, weights * edge_factor, min(remaining, room - int(replacing.sum())), rng
+        )
         event.blocked_by_cap += max(0, min(remaining, int(eligible.sum())) - int(growing.sum()))
         event.pruned_opacity += num_pruned
         parents = (replacing | growing).nonzero().squeeze(-1)  # [S]
         event.split_gradient += len(parents)
-        children = halves(values.detach().select(parents), SPLIT_OFFSET, SPLIT_LONGEST, SPLIT_ACROSS, SPLIT_OPACITY)
+        children = halves(
+            values.detach().select(parents),
+            SPLIT_OFFSET,
+            SPLIT_LONGEST,
+            SPLIT_ACROSS,
+            SPLIT_OPACITY,
+        )
         kept = ~(pruned | replacing | growing)
         self.edit(refinement, kept, children, parents.repeat(2), Cause.SPLIT_GRADIENT)
 
@@ -249,14 +281,19 @@ class MRNF(Budgeted):
         """The refine weights [N] over the training views at the indices ``views``."""
         training, largest = self.context.training_views, torch.zeros_like(gaussians.opacity_logits)
         for index in views:
-            error = training.dissimilarity(index, training.render(index, gaussians, step).image.detach())  # [H, W]
+            error = training.dissimilarity(
+                index, training.render(index, gaussians, step).image.detach()
+            )  # [H, W]
             error = (error / error.mean().clamp_min(torch.finfo(error.dtype).tiny)).unsqueeze(-1)
-            sums, _ = blended_sums(training, index, gaussians, step, error.expand(-1, -1, 3).contiguous())
+            sums, _ = blended_sums(
+                training, index, gaussians, step, error.expand(-1, -1, 3).contiguous()
+            )
             largest = torch.maximum(largest, sums[:, 0])
         return largest
 
     def to_prune(self, gaussians: Gaussians) -> Tensor:
-        """Mask [N] of the Gaussians to prune: transparent, too small, too large, or too far away."""
+        """Mask [N] of the Gaussians to prune: transparent, too small, too large, or too far
+        away."""
         center, half, _ = bounds(gaussians.means.detach())
         limit = REACH * half
         scales = gaussians.log_scales
@@ -266,13 +303,18 @@ class MRNF(Budgeted):
 
     def decay(self, refinement: Refinement) -> None:
         """Lower all opacities and scales a little. Adam's moments stay."""
-        values, remaining = refinement.gaussians.values, max(0.0, 1 - refinement.step / self.decay_until)
+        values, remaining = (
+            refinement.gaussians.values,
+            max(0.0, 1 - refinement.step / self.decay_until),
+        )
         opacities = values.opacities - self.opacity_decay * remaining
         margin = max(
             MIN_DECAYED, torch.finfo(opacities.dtype).eps
         )  # in float32, 1 - 1e-12 would be 1: an infinite logit
         values.opacity_logits.copy_(torch.logit(opacities.clamp(MIN_DECAYED, 1 - margin)))
-        values.log_scales.add_(math.log(1 - self.scale_decay * remaining)).clamp_min_(math.log(MIN_DECAYED))
+        values.log_scales.add_(math.log(1 - self.scale_decay * remaining)).clamp_min_(
+            math.log(MIN_DECAYED)
+        )
 
     @torch.no_grad()
     def after_step(self, step: int, gaussians: TrainableGaussians, rng: torch.Generator) -> None:
@@ -280,7 +322,9 @@ class MRNF(Budgeted):
             return
         values, seen = gaussians.values, self.statistics["seen"]
         _, _, size = bounds(values.means)
-        weight = (1 - values.opacities).pow(NOISE_POWER) * (self.noise_rate * gaussians.position_rate)  # [N]
+        weight = (1 - values.opacities).pow(NOISE_POWER) * (
+            self.noise_rate * gaussians.position_rate
+        )  # [N]
         noise = standard_normal((len(gaussians), 3), rng, values.means) * weight.unsqueeze(-1)
         values.means += torch.where(seen.unsqueeze(-1), noise.clamp(-size, size), 0.0)
 

@@ -10,32 +10,46 @@ from torch import Tensor
 from gsbench.densify.adc import ADC
 from gsbench.densify.adc_variants import AbsGS
 from gsbench.densify.base import Refinement, Rule
-from gsbench.densify.scores import blended_sums, by_median, draw, draw_views, edge_map, error_map, to_unit_range
+from gsbench.densify.scores import (
+    blended_sums,
+    by_median,
+    draw,
+    draw_views,
+    edge_map,
+    error_map,
+    to_unit_range,
+)
 from gsbench.gaussians.model import Gaussians
 from gsbench.settings import Fraction, OpenFraction
 
-MIN_DIVISOR = 1e-6  # keeps the weights finite by which Gaussians are drawn for pruning (from the authors' code)
+# keeps the weights finite by which Gaussians are drawn for pruning (from the authors' code)
+MIN_DIVISOR = 1e-6
 
 
 @dataclass
 class FastGS(AbsGS):
-    """AbsGS whose candidates grow only if they cover badly rendered pixels (Ren et al., arXiv 2511.04283).
+    """AbsGS whose candidates grow only if they cover badly rendered pixels (Ren et al., arXiv
+    2511.04283).
 
-    Each round draws ``score_views`` training views. A pixel is bad if its L1 error, shifted and scaled to [0, 1] in
-    its view, is above ``error_threshold``. A Gaussian's count is the number of bad pixels that it is blended into. A
-    candidate grows if its mean count over the views, rounded down, is above ``least_count``.
+    Each round draws ``score_views`` training views. A pixel is bad if its L1 error, shifted and
+    scaled to [0, 1] in its view, is above ``error_threshold``. A Gaussian's count is the number of
+    bad pixels that it is blended into. A candidate grows if its mean count over the views, rounded
+    down, is above ``least_count``.
 
-    The pruning score is the sum over views of the view's loss times the count, shifted and scaled to [0, 1]. If n
-    Gaussians are faint or huge, n / 2 are drawn from all Gaussians in proportion to 1 / (1 - score); faint and huge
-    Gaussians are pruned only if drawn. Then opacities are lowered to the ceiling. After the window, every
-    ``final_interval`` iterations, Gaussians below ``final_opacity`` or above ``final_score`` are pruned.
+    The pruning score is the sum over views of the view's loss times the count, shifted and scaled
+    to [0, 1]. If n Gaussians are faint or huge, n / 2 are drawn from all Gaussians in proportion to
+    1 / (1 - score); faint and huge Gaussians are pruned only if drawn. Then opacities are lowered
+    to the ceiling. After the window, every ``final_interval`` iterations, Gaussians below
+    ``final_opacity`` or above ``final_score`` are pruned.
     """
 
-    STATISTICS: ClassVar[dict[str, torch.dtype]] = {"count": torch.float32, "score": torch.float32}  # within a round
+    # within a round
+    STATISTICS: ClassVar[dict[str, torch.dtype]] = {"count": torch.float32, "score": torch.float32}
     needs_footprint = True
 
     split_threshold: PositiveFloat = 1.2e-3
-    cap: Literal["soft", "hard", "curve"] = "soft"  # freeze and governor need a forecast before there are scores
+    # freeze and governor need a forecast before there are scores
+    cap: Literal["soft", "hard", "curve"] = "soft"
     score_views: PositiveInt = 10
     error_threshold: Fraction = 0.1
     least_count: NonNegativeFloat = 5.0
@@ -44,7 +58,8 @@ class FastGS(AbsGS):
     final_score: Fraction = 0.9
 
     def rules(self, refinement: Refinement) -> list[Rule]:
-        """The rules of ADC, with scores before growth and the ceiling after pruning; then the final prunings."""
+        """The rules of ADC, with scores before growth and the ceiling after pruning; then the final
+        prunings."""
         step = refinement.step
         rules = [rule for rule in super().rules(refinement) if rule != self.lower_opacity]
         if self.grow_by_gradient in rules:
@@ -58,11 +73,16 @@ class FastGS(AbsGS):
         """Compute the count and the pruning score of every Gaussian."""
         values, views = refinement.gaussians.values, self.context.training_views
         indices = draw_views(views, self.score_views, refinement.rng)
-        total, weighted = torch.zeros_like(values.opacity_logits), torch.zeros_like(values.opacity_logits)
+        total, weighted = (
+            torch.zeros_like(values.opacity_logits),
+            torch.zeros_like(values.opacity_logits),
+        )
         for index in indices:
             render = views.render(index, values, refinement.step)
             bad = error_map(render.image, views.image(index)) > self.error_threshold
-            counts = render.require_footprint(bad.to(render.image)).values  # [N] bad pixels that each is blended into
+            counts = render.require_footprint(
+                bad.to(render.image)
+            ).values  # [N] bad pixels that each is blended into
             total += counts
             weighted += views.loss(index, render.image) * counts
         self.statistics["count"] = (total / len(indices)).floor().float()
@@ -75,11 +95,19 @@ class FastGS(AbsGS):
     def prune(self, refinement: Refinement) -> None:
         """Remove some of the faint and huge Gaussians, more likely those with high scores."""
         values, score = refinement.gaussians.values, self.statistics["score"]
-        faint, huge = self.faint(values.opacity_logits), self.huge(refinement.step, values.log_scales)
-        # Only Gaussians from before the round have a score. They come first, without the removed split parents.
+        faint, huge = (
+            self.faint(values.opacity_logits),
+            self.huge(refinement.step, values.log_scales),
+        )
+        # Only Gaussians from before the round have a score. They come first, without the removed
+        # split parents.
         split_parents = refinement.event.split_gradient // (self.split_children - 1)
-        scored = torch.arange(len(score), device=score.device) < refinement.event.before - split_parents
-        drawn = draw(scored, 1 / (MIN_DIVISOR + 1 - score), int((faint | huge).sum()) // 2, refinement.rng)
+        scored = (
+            torch.arange(len(score), device=score.device) < refinement.event.before - split_parents
+        )
+        drawn = draw(
+            scored, 1 / (MIN_DIVISOR + 1 - score), int((faint | huge).sum()) // 2, refinement.rng
+        )
         self.remove(refinement, faint & drawn, huge & drawn)
 
     def prune_finally(self, refinement: Refinement) -> None:
@@ -88,24 +116,28 @@ class FastGS(AbsGS):
         self.remove(refinement, faint, self.statistics["score"] > self.final_score)
 
 
-MIN_SCORE = 1e-6  # keeps 1 / score finite, by which Gaussians are drawn for pruning (from the authors' code)
+# keeps 1 / score finite, by which Gaussians are drawn for pruning (from the authors' code)
+MIN_SCORE = 1e-6
 
 
 @dataclass
 class Taming(ADC):
     """ADC whose candidates are drawn by score, up to a budget (Mallick et al., arXiv 2406.15643).
 
-    Each round draws ``score_views`` training views. A view that sees a Gaussian adds to its score the loss of the view
-    times a weighted sum of the terms below (``weight_…``), each divided by its median. A pixel's value, which some
-    terms use, is ``weight_error`` times its L1 error plus ``weight_edge`` times its edge strength, both in [0, 1].
+    Each round draws ``score_views`` training views. A view that sees a Gaussian adds to its score
+    the loss of the view times a weighted sum of the terms below (``weight_…``), each divided by its
+    median. A pixel's value, which some terms use, is ``weight_error`` times its L1 error plus
+    ``weight_edge`` times its edge strength, both in [0, 1].
 
-    A round may grow to the count that ``cap=curve`` allows (eq. 2 of the paper). This budget is divided between clones
-    and splits in proportion to the numbers of their candidates, which are drawn without replacement in proportion to
-    the score. In the first ``prune_rounds`` rounds, if n Gaussians are faint or huge, n / 2 are drawn from all
-    Gaussians in inverse proportion to the score; faint and huge Gaussians are pruned only if drawn.
+    A round may grow to the count that ``cap=curve`` allows (eq. 2 of the paper). This budget is
+    divided between clones and splits in proportion to the numbers of their candidates, which are
+    drawn without replacement in proportion to the score. In the first ``prune_rounds`` rounds, if n
+    Gaussians are faint or huge, n / 2 are drawn from all Gaussians in inverse proportion to the
+    score; faint and huge Gaussians are pruned only if drawn.
     """
 
-    STATISTICS: ClassVar[dict[str, torch.dtype]] = {"score": torch.float32}  # of this round; 0 for new Gaussians
+    # of this round; 0 for new Gaussians
+    STATISTICS: ClassVar[dict[str, torch.dtype]] = {"score": torch.float32}
     needs_footprint = True
 
     max_gaussians: PositiveInt = 1_000_000
@@ -117,7 +149,8 @@ class Taming(ADC):
     weight_depth: NonNegativeFloat = 5.0  # view z
     weight_radius: NonNegativeFloat = 10.0  # px
     weight_scale: NonNegativeFloat = 25.0  # product of the three scales
-    weight_distance: NonNegativeFloat = 50.0  # sum over the Gaussian's pixels of their distance to its mean
+    # sum over the Gaussian's pixels of their distance to its mean
+    weight_distance: NonNegativeFloat = 50.0
     weight_values: NonNegativeFloat = 10.0  # sum over its pixels of their values
     weight_pixels: NonNegativeFloat = 0.1  # number of its pixels
     weight_blending: NonNegativeFloat = 50.0  # sum over its pixels of alpha T
@@ -178,7 +211,10 @@ class Taming(ADC):
         if refinement.step // self.interval - self.start // self.interval > self.prune_rounds:
             return
         values, score = refinement.gaussians.values, self.statistics["score"]
-        faint, huge = self.faint(values.opacity_logits), self.huge(refinement.step, values.log_scales)
+        faint, huge = (
+            self.faint(values.opacity_logits),
+            self.huge(refinement.step, values.log_scales),
+        )
         budget = int((faint | huge).sum()) // 2
         drawn = draw(score > 0, 1 / score, budget, refinement.rng)
         self.remove(refinement, faint & drawn, huge & drawn)

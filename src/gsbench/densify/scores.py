@@ -1,4 +1,5 @@
-"""Scores of Gaussians, which are sums over the pixels of training views, and random draws by score."""
+"""Scores of Gaussians, which are sums over the pixels of training views, and random draws by
+score."""
 
 from collections.abc import Callable, Sequence
 from typing import Protocol
@@ -9,7 +10,8 @@ from torch import Tensor
 from gsbench.gaussians.model import C0, Gaussians
 from gsbench.raster.base import RenderOutput
 
-# Pillow's conversion of RGB to L: the weights of ITU-R 601-2 times 2^16, then a rounding shift by 16 bits.
+# Pillow's conversion of RGB to L: the weights of ITU-R 601-2 times 2^16, then a rounding shift by
+# 16 bits.
 LUMINANCE = (19595, 38470, 7471)
 HALF, SHIFT = 1 << 15, 16
 
@@ -28,8 +30,8 @@ class TrainingViews(Protocol):
         ...
 
     def dissimilarity(self, index: int, image: Tensor) -> Tensor:
-        """max(0, 1 - SSIM) of a rendered ``image`` [H, W, 3] and its photograph, [H, W]; SSIM is the mean over
-        channels."""
+        """max(0, 1 - SSIM) of a rendered ``image`` [H, W, 3] and its photograph, [H, W]; SSIM is
+        the mean over channels."""
         ...
 
     def loss(self, index: int, image: Tensor) -> Tensor:
@@ -46,12 +48,13 @@ def draw_views(views: TrainingViews, count: int, rng: torch.Generator) -> list[i
 def blended_sums(
     views: TrainingViews, index: int, gaussians: Gaussians, step: int, weights: Tensor
 ) -> tuple[Tensor, RenderOutput]:
-    """Return the sum over pixels of w alpha T for each Gaussian and three weights w [H, W, 3], as [N, 3]; and the
-    render of the view.
+    """Return the sum over pixels of w alpha T for each Gaussian and three weights w [H, W, 3], as
+    [N, 3]; and the render of the view.
 
-    alpha T is the derivative of a pixel with respect to the colour of the Gaussian. So the sum is the gradient of
-    ``(image * weights).sum()`` with respect to that colour, which any rasterizer computes. All colours are set to grey,
-    so that no rasterizer clamps them (a clamped colour has no gradient).
+    alpha T is the derivative of a pixel with respect to the colour of the Gaussian. So the sum is
+    the gradient of ``(image * weights).sum()`` with respect to that colour, which any rasterizer
+    computes. All colours are set to grey, so that no rasterizer clamps them (a clamped colour has
+    no gradient).
     """
     probe = Gaussians(**{name: tensor.detach() for name, tensor in gaussians.tensors().items()})
     probe.sh_dc = torch.zeros_like(probe.sh_dc, requires_grad=True)
@@ -63,22 +66,28 @@ def blended_sums(
 
 
 def edge_map(image: Tensor) -> Tensor:
-    """The strength of edges in ``image`` [H, W, 3] uint8: [H, W] float32 in [0, 1] (all 0 without edges).
+    """The strength of edges in ``image`` [H, W, 3] uint8: [H, W] float32 in [0, 1] (all 0 without
+    edges).
 
-    Eight times the luminance of a pixel minus the sum over its eight neighbours, clipped to 8 bits, then shifted and
-    scaled to [0, 1]. This is Pillow's FIND_EDGES, except that the outermost pixels are 0 here.
+    Eight times the luminance of a pixel minus the sum over its eight neighbours, clipped to 8 bits,
+    then shifted and scaled to [0, 1]. This is Pillow's FIND_EDGES, except that the outermost pixels
+    are 0 here.
     """
     rgb = image.to(torch.int32)
-    luma = (rgb[..., 0] * LUMINANCE[0] + rgb[..., 1] * LUMINANCE[1] + rgb[..., 2] * LUMINANCE[2] + HALF) >> SHIFT
+    luma = (
+        rgb[..., 0] * LUMINANCE[0] + rgb[..., 1] * LUMINANCE[1] + rgb[..., 2] * LUMINANCE[2] + HALF
+    ) >> SHIFT
     edges = torch.zeros_like(luma)
     height, width = luma.shape
-    block = sum(luma[y : height - 2 + y, x : width - 2 + x] for y in range(3) for x in range(3))  # 3 x 3 pixels
+    # 3 x 3 pixels
+    block = sum(luma[y : height - 2 + y, x : width - 2 + x] for y in range(3) for x in range(3))
     edges[1:-1, 1:-1] = (9 * luma[1:-1, 1:-1] - block).clamp(0, 255)
     return to_unit_range(edges.float())
 
 
 def error_map(image: Tensor, photograph: Tensor) -> Tensor:
-    """The absolute error of ``image`` [H, W, 3], mean over channels, [H, W], shifted and scaled to [0, 1].
+    """The absolute error of ``image`` [H, W, 3], mean over channels, [H, W], shifted and scaled to
+    [0, 1].
 
     ``photograph`` is [H, W, 3] uint8.
     """
@@ -92,12 +101,14 @@ def to_unit_range(values: Tensor) -> Tensor:
 
 
 def by_median(values: Tensor) -> Tensor:
-    """``values`` [N] divided by the (lower) median of the positive ones; values that are not positive become 0."""
+    """``values`` [N] divided by the (lower) median of the positive ones; values that are not
+    positive become 0."""
     return _normalized(values, torch.median)
 
 
 def by_mean(values: Tensor) -> Tensor:
-    """``values`` [N] divided by the mean of the positive ones; values that are not positive become 0."""
+    """``values`` [N] divided by the mean of the positive ones; values that are not positive become
+    0."""
     return _normalized(values, torch.mean)
 
 
@@ -109,12 +120,16 @@ def _normalized(values: Tensor, average: Callable[[Tensor], Tensor]) -> Tensor:
 
 
 def edge_scores(
-    views: TrainingViews, indices: Sequence[int], gaussians: Gaussians, step: int, normalize: Callable[[Tensor], Tensor]
+    views: TrainingViews,
+    indices: Sequence[int],
+    gaussians: Gaussians,
+    step: int,
+    normalize: Callable[[Tensor], Tensor],
 ) -> Tensor:
     """Scores [N] by the edges in photographs that each Gaussian covers.
 
-    In a view the score is the sum over pixels of (edge strength) alpha T, passed through ``normalize``; the result is
-    the mean over the views ``indices``.
+    In a view the score is the sum over pixels of (edge strength) alpha T, passed through
+    ``normalize``; the result is the mean over the views ``indices``.
     """
     total = torch.zeros_like(gaussians.opacity_logits)
     for index in indices:
@@ -127,12 +142,16 @@ def edge_scores(
 def draw(candidates: Tensor, scores: Tensor, count: int, rng: torch.Generator) -> Tensor:
     """Draw ``count`` of the ``candidates`` [N] (all, if there are fewer), as a mask [N].
 
-    The draw is without replacement, in proportion to ``scores`` [N]. Candidates with score 0 come last, in order of
-    index. Method: Efraimidis and Spirakis 2006, the smallest values of e / score with e ~ Exp(1). Random numbers are
-    drawn on the CPU, so a seed gives the same draw on every device.
+    The draw is without replacement, in proportion to ``scores`` [N]. Candidates with score 0 come
+    last, in order of index. Method: Efraimidis and Spirakis 2006, the smallest values of e / score
+    with e ~ Exp(1). Random numbers are drawn on the CPU, so a seed gives the same draw on every
+    device.
     """
     index = candidates.nonzero().squeeze(-1).cpu()  # [C]
-    keys = torch.empty(len(index), dtype=torch.float64).exponential_(generator=rng) / scores.detach().cpu()[index]
+    keys = (
+        torch.empty(len(index), dtype=torch.float64).exponential_(generator=rng)
+        / scores.detach().cpu()[index]
+    )
     drawn = torch.zeros(len(candidates), dtype=torch.bool)
     drawn[index[torch.sort(keys, stable=True).indices[: max(count, 0)]]] = True
     return drawn.to(candidates.device)

@@ -1,7 +1,7 @@
 """The volume rule of arXiv 2508.05187: ADC that also splits Gaussians whose volume is too large.
 
-Questions that the paper leaves open are options. Their defaults follow the paper's equations or, where these say
-nothing, the split of ADC. Volumes and condition numbers are computed in log space.
+Questions that the paper leaves open are options. Their defaults follow the paper's equations or,
+where these say nothing, the split of ADC. Volumes and condition numbers are computed in log space.
 """
 
 import math
@@ -26,56 +26,67 @@ LOG_SPHERE = math.log(4 * math.pi / 3)
 
 
 def log_volume(log_scales: Tensor) -> Tensor:
-    """log V = log(4 pi / 3) + sum of log s_i (eq. 5), [N] from [N, 3]; world units^3, never underflows."""
+    """log V = log(4 pi / 3) + sum of log s_i (eq. 5), [N] from [N, 3]; world units^3, never
+    underflows."""
     return LOG_SPHERE + log_scales.sum(-1)
 
 
 def log_condition(log_scales: Tensor) -> Tensor:
-    """log kappa = 2 (log s_max - log s_min) (eq. 6: the ratio of the eigenvalues s^2), [N] from [N, 3], at least 0."""
+    """log kappa = 2 (log s_max - log s_min) (eq. 6: the ratio of the eigenvalues s^2), [N] from [N,
+    3], at least 0."""
     return 2 * (log_scales.amax(-1) - log_scales.amin(-1))
 
 
 ThresholdMode = Literal["absolute", "extent_relative", "quantile", "auto"]
 TUKEY_FENCE = 1.5  # interquartile ranges above the third quartile (Tukey 1977)
-VANISHING_SIZE = 1e-4  # of the extent: 0.1 px at a distance of one extent with a focal length of 1000 px
+# of the extent: 0.1 px at a distance of one extent with a focal length of 1000 px
+VANISHING_SIZE = 1e-4
 
 
 @dataclass
 class Volumetric(ADC):
-    """ADC, then a split of every Gaussian with V > V_th (eq. 5 to 7, Fig. 4), then the pruning of ADC.
+    """ADC, then a split of every Gaussian with V > V_th (eq. 5 to 7, Fig. 4), then the pruning of
+    ADC.
 
     ``threshold_mode`` determines V_th:
 
     - ``absolute``: ``volume_threshold``, in cubed units of the COLMAP model (the paper);
     - ``extent_relative``: ``volume_threshold`` times the cubed scene extent;
     - ``quantile``: the ``volume_quantile`` of all volumes;
-    - ``auto``: the upper Tukey fence of log V, which is the third quartile plus 1.5 interquartile ranges. It adapts to
-      the scene in any gauge, and selects few Gaussians if no volume stands out.
+    - ``auto``: the upper Tukey fence of log V, which is the third quartile plus 1.5 interquartile
+      ranges. It adapts to the scene in any gauge, and selects few Gaussians if no volume stands
+      out.
 
     ``volume_start``, ``volume_stop`` and ``volume_interval`` default to those of ADC.
 
-    ``cap=governor`` multiplies the gradient threshold by one factor, and V_th by that factor to the power
-    ``governor_dimension``. With 3 the factor acts on a size, whose cube is V_th. With 1 it acts on V_th itself.
+    ``cap=governor`` multiplies the gradient threshold by one factor, and V_th by that factor to the
+    power ``governor_dimension``. With 3 the factor acts on a size, whose cube is V_th. With 1 it
+    acts on V_th itself.
     """
 
     SWITCHES: ClassVar[Mapping[str, Switch]] = {
         "volume_rule": Switch({"volume_stop": 0}, "the split of what is too large"),
         "shrink": Switch(
-            {"condition_of": "nothing"}, "eq. 7's scales of its children, instead of ADC's", "volume_rule"
+            {"condition_of": "nothing"},
+            "eq. 7's scales of its children, instead of ADC's",
+            "volume_rule",
         ),
         "no_resplit": Switch(
-            {"split_isotropic": True}, "a Gaussian is not split if its children would be split again", "volume_rule"
+            {"split_isotropic": True},
+            "a Gaussian is not split if its children would be split again",
+            "volume_rule",
         ),
     }
 
     volume_threshold: PositiveFloat = VOLUME_THRESHOLD
     threshold_mode: ThresholdMode = "absolute"
     volume_quantile: OpenFraction = 0.9978  # 99.78 % of the volumes of Mip-NeRF 360 lie below 0.03
-    condition_of: Literal["eigenvalues", "scales", "nothing"] = (
-        "eigenvalues"  # kappa divides eigenvalues (eq. 7) or scales; nothing: as ADC
-    )
-    max_condition: Annotated[float, Ge(1)] | None = None  # limits kappa, so that children of needles do not vanish
-    split_isotropic: bool = True  # False: do not split a Gaussian whose children would be above the threshold again
+    # kappa divides eigenvalues (eq. 7) or scales; nothing: as ADC
+    condition_of: Literal["eigenvalues", "scales", "nothing"] = "eigenvalues"
+    # limits kappa, so that children of needles do not vanish
+    max_condition: Annotated[float, Ge(1)] | None = None
+    # False: do not split a Gaussian whose children would be above the threshold again
+    split_isotropic: bool = True
     volume_children: Annotated[int, Interval(ge=2, le=MAX_CHILDREN)] = 2
     keep_parent: bool = False
     placement: Literal["sampled", "parent_mean"] = "sampled"
@@ -89,7 +100,8 @@ class Volumetric(ADC):
         super().__post_init__()
         if self.volume_interval is not None and self.volume_interval % self.interval:
             raise InputError(
-                f"densify.volume_interval must be a multiple of densify.interval ({self.interval}), "
+                "densify.volume_interval must be a multiple of densify.interval "
+                f"({self.interval}), "
                 f"got {self.volume_interval}"
             )
 
@@ -115,8 +127,9 @@ class Volumetric(ADC):
     def child_log_scales(self, log_scales: Tensor) -> Tensor:
         """Log scales of children (eq. 7), [N, 3], given those of their parents.
 
-        ``condition_of`` says what kappa divides. ``eigenvalues``: lambda' = lambda / kappa, so log s' = log s -
-        log(kappa) / 2. ``scales``: s' = s / kappa. ``nothing``: s' = s / ``split_shrink``, as in ADC, instead of eq. 7.
+        ``condition_of`` says what kappa divides. ``eigenvalues``: lambda' = lambda / kappa, so log
+        s' = log s - log(kappa) / 2. ``scales``: s' = s / kappa. ``nothing``: s' = s /
+        ``split_shrink``, as in ADC, instead of eq. 7.
         """
         if self.condition_of == "nothing":
             return log_scales - math.log(self.split_shrink)
@@ -146,10 +159,14 @@ class Volumetric(ADC):
         if not self.volume_due(refinement.step):
             return grown
         number, log_scales = grown.number, grown.log_scales
-        if self.volume_order == "before_adc":  # children of the volume rule have no gradients, so they do not grow
+        # children of the volume rule have no gradients, so they do not grow
+        if self.volume_order == "before_adc":
             before = refinement.gaussians.values.log_scales
             large = self.selected_by_volume(before)
-            number, log_scales = torch.where(large, 1, number), torch.where(large.unsqueeze(-1), before, log_scales)
+            number, log_scales = (
+                torch.where(large, 1, number),
+                torch.where(large.unsqueeze(-1), before, log_scales),
+            )
         else:
             large = self.selected_by_volume(log_scales)
         number = torch.where(large, (1 + self.volume_gain) * number, number)
@@ -168,7 +185,9 @@ class Volumetric(ADC):
         children = self.child_log_scales(log_scales)  # [N, 3]
         candidates = self.selected_by_volume(log_scales)
         selected, blocked = admit(candidates, volumes, self.volume_gain, self.allowance(refinement))
-        split_again = log_volume(children) > threshold  # [N] the next round would select the children, too
+        split_again = (
+            log_volume(children) > threshold
+        )  # [N] the next round would select the children, too
         vanishing = children.amax(-1) < math.log(VANISHING_SIZE * self.context.extent)  # [N]
         event.volume_threshold = math.exp(threshold)
         event.blocked_by_cap += blocked
@@ -186,7 +205,9 @@ class Volumetric(ADC):
 
     def log_threshold(self, volumes: Tensor) -> float:
         """log V_th for Gaussians with log volumes [N], ``strictness`` of the governor included."""
-        return self._ungoverned_log_threshold(volumes) + self.governor_dimension * math.log(self.strictness)
+        return self._ungoverned_log_threshold(volumes) + self.governor_dimension * math.log(
+            self.strictness
+        )
 
     def _ungoverned_log_threshold(self, volumes: Tensor) -> float:
         if self.threshold_mode == "absolute":

@@ -1,4 +1,5 @@
-"""The evaluator, which applies the metrics of a protocol and the user's own metrics to pairs of images."""
+"""The evaluator, which applies the metrics of a protocol and the user's own metrics to pairs of
+images."""
 
 import importlib.util
 import math
@@ -19,7 +20,15 @@ from torch import Tensor
 from gsbench.errors import InputError, TrainingError
 from gsbench.eval import metrics, structure
 from gsbench.eval.color_correction import Corrected
-from gsbench.eval.facts import CORRECTED, LPIPS, METRICS, MORE, facts_of, further_keys, lpips_variants
+from gsbench.eval.facts import (
+    CORRECTED,
+    LPIPS,
+    METRICS,
+    MORE,
+    facts_of,
+    further_keys,
+    lpips_variants,
+)
 from gsbench.eval.images import as_unit_range, in_double_precision, replace_ignored
 from gsbench.eval.lpips import Lpips, load_lpips
 from gsbench.eval.metric import MaskedMetric, Metric, UnavailableError
@@ -55,7 +64,8 @@ class MetricContext:
 
 
 class Psnr:
-    """Peak signal-to-noise ratio in dB, at most the protocol's cap (identical images have an infinite PSNR)."""
+    """Peak signal-to-noise ratio in dB, at most the protocol's cap (identical images have an
+    infinite PSNR)."""
 
     def __init__(self, context: MetricContext) -> None:
         self._cap = context.protocol.psnr_cap
@@ -74,7 +84,9 @@ class Ssim:
         self._padding = context.protocol.ssim_padding
 
     def measure(self, image: Tensor, truth: Tensor, mask: Tensor | None = None) -> float:
-        return float(ssim(in_double_precision(image), in_double_precision(truth), self._padding, mask))
+        return float(
+            ssim(in_double_precision(image), in_double_precision(truth), self._padding, mask)
+        )
 
     measure_masked = measure
 
@@ -87,7 +99,9 @@ class LpipsMetric:
 
     def measure(self, image: Tensor, truth: Tensor, mask: Tensor | None = None) -> float:
         _require_size(image, self._network.backbone.min_size)
-        first, second = (x.permute(2, 0, 1).unsqueeze(0) for x in (image, truth))  # [1, 3, H, W] each
+        first, second = (
+            x.permute(2, 0, 1).unsqueeze(0) for x in (image, truth)
+        )  # [1, 3, H, W] each
         if not self._raw:
             first, second = 2 * first - 1, 2 * second - 1
         return float(self._network(first, second, mask))
@@ -112,7 +126,8 @@ class Flip:
 
 
 class StructuralMetric:
-    """A metric of structure without weights, which no protocol changes: its authors' definition holds."""
+    """A metric of structure without weights, which no protocol changes: its authors' definition
+    holds."""
 
     def __init__(self, function: Callable[[Tensor, Tensor], Tensor], min_side: int) -> None:
         self._function, self._min_side = function, min_side  # px
@@ -137,7 +152,8 @@ def _corrected(key: str) -> Callable[[MetricContext], Metric]:
     return lambda context: Corrected(MEASURES[key](context))
 
 
-# Each metric of `gsbench.eval.facts.METRICS` for a context. Raises UnavailableError if weights or packages are missing.
+# Each metric of `gsbench.eval.facts.METRICS` for a context. Raises UnavailableError if weights or
+# packages are missing.
 MEASURES: dict[str, Callable[[MetricContext], Metric]] = {
     "psnr": Psnr,
     "ssim": Ssim,
@@ -153,20 +169,25 @@ MEASURES: dict[str, Callable[[MetricContext], Metric]] = {
 }
 
 
-MEASURES |= {f"{key}{CORRECTED}": _corrected(key) for key in list(MEASURES) if f"{key}{CORRECTED}" in further_keys()}
+MEASURES |= {
+    f"{key}{CORRECTED}": _corrected(key)
+    for key in list(MEASURES)
+    if f"{key}{CORRECTED}" in further_keys()
+}
 MEASURES["cc_gain"] = lambda context: Corrected(Psnr(context), gain=True)
 
 
 class Evaluator:
     """Computes the metrics of one protocol; loads every network once.
 
-    ``lpips`` names the variants to compute (see `gsbench.eval.facts.lpips_variants`), ``more`` names further metrics of
-    gsbench (`further_keys`), and ``extra`` are the user's own metrics by name. ``weights`` is the folder that is
-    searched first.
+    ``lpips`` names the variants to compute (see `gsbench.eval.facts.lpips_variants`), ``more``
+    names further metrics of gsbench (`further_keys`), and ``extra`` are the user's own metrics by
+    name. ``weights`` is the folder that is searched first.
 
-    ``unavailable`` maps each metric that cannot be computed to the reason, in one line. ``awaited`` holds those that
-    can be computed once their weights or packages are installed. Both can grow while views are evaluated;
-    ``summarize`` then leaves the metric out for all views. ``own`` are the facts of the user's metrics.
+    ``unavailable`` maps each metric that cannot be computed to the reason, in one line. ``awaited``
+    holds those that can be computed once their weights or packages are installed. Both can grow
+    while views are evaluated; ``summarize`` then leaves the metric out for all views. ``own`` are
+    the facts of the user's metrics.
     """
 
     def __init__(
@@ -181,7 +202,10 @@ class Evaluator:
         more: Sequence[str] = (),
     ) -> None:
         variants = lpips_variants()
-        for what, given, known in (("LPIPS variant", lpips or (), variants), ("metric", more, further_keys())):
+        for what, given, known in (
+            ("LPIPS variant", lpips or (), variants),
+            ("metric", more, further_keys()),
+        ):
             if unknown := [key for key in given if key not in known]:
                 raise InputError(f"unknown {what} {unknown[0]!r}; choose among {', '.join(known)}")
         self.protocol = protocol
@@ -192,7 +216,11 @@ class Evaluator:
         self.more = tuple(sorted(more))
         self.own = {name: facts_of(name, metric) for name, metric in extra.items()}
         wanted = {f"{LPIPS}{variant}" for variant in (variants if lpips is None else lpips)}
-        wanted |= {facts.key for facts in METRICS if not facts.setting} | ({"flip"} if flip else set()) | set(more)
+        wanted |= (
+            {facts.key for facts in METRICS if not facts.setting}
+            | ({"flip"} if flip else set())
+            | set(more)
+        )
         context = MetricContext(protocol, self.device, weights, download)
         self._metrics: dict[str, Metric] = {}
         for facts in METRICS:
@@ -207,15 +235,19 @@ class Evaluator:
         self._metrics |= extra
 
     def evaluate_view(
-        self, render: NDArray[Any] | Tensor, ground_truth: NDArray[Any] | Tensor, mask: NDArray[np.bool_] | None = None
+        self,
+        render: NDArray[Any] | Tensor,
+        ground_truth: NDArray[Any] | Tensor,
+        mask: NDArray[np.bool_] | None = None,
     ) -> dict[str, float]:
         """The metrics of one view; images are [H, W, 3], uint8 or floating point in [0, 1].
 
-        Where ``mask`` [H, W] is False, the render is ignored: its pixels are replaced by the photograph's before
-        anything is measured, and metrics that average over pixels leave them out (see `MaskedMetric`).
+        Where ``mask`` [H, W] is False, the render is ignored: its pixels are replaced by the
+        photograph's before anything is measured, and metrics that average over pixels leave them
+        out (see `MaskedMetric`).
 
-        A metric that cannot be computed is absent and listed in ``unavailable``. Raises ``TrainingError`` if the render
-        holds a non-finite value.
+        A metric that cannot be computed is absent and listed in ``unavailable``. Raises
+        ``TrainingError`` if the render holds a non-finite value.
         """
         image, target = self._prepare(render), self._prepare(ground_truth)  # [H, W, 3]
         counted = None if mask is None else torch.as_tensor(mask, device=self.device)  # [H, W]
@@ -233,7 +265,9 @@ class Evaluator:
                 self._leave_out(key, error)
         return values
 
-    def _measure(self, key: str, metric: Metric, image: Tensor, target: Tensor, mask: Tensor | None) -> float:
+    def _measure(
+        self, key: str, metric: Metric, image: Tensor, target: Tensor, mask: Tensor | None
+    ) -> float:
         try:
             value: Any
             if mask is not None and isinstance(metric, MaskedMetric):
@@ -243,19 +277,24 @@ class Evaluator:
         except UnavailableError:
             raise
         except SystemExit as error:  # would end gsbench without a message
-            raise InputError(f"eval.extra.{key} ended the process (exit code {error.code}): it must return") from error
+            raise InputError(
+                f"eval.extra.{key} ended the process (exit code {error.code}): it must return"
+            ) from error
         except Exception as error:
             if key not in self.own:
                 raise
             frame = traceback.extract_tb(error.__traceback__)[-1]
             message = " ".join(f"{type(error).__name__} {str(error)[:200]}".split())
             raise InputError(
-                f"eval.extra.{key} raised {message} ({frame.filename}, line {frame.lineno}): correct it"
+                f"eval.extra.{key} raised {message} ({frame.filename}, line {frame.lineno}): "
+                "correct it"
             ) from error
         if isinstance(value, Tensor | np.ndarray | np.generic) and math.prod(value.shape) == 1:
             value = value.item()
         if isinstance(value, bool) or not isinstance(value, Real):
-            raise InputError(f"eval.extra.{key} must return a number for each view, got {value!r:.80}")
+            raise InputError(
+                f"eval.extra.{key} must return a number for each view, got {value!r:.80}"
+            )
         try:
             return float(value)
         except OverflowError:
@@ -272,20 +311,28 @@ class Evaluator:
         tensor = torch.as_tensor(image, device=self.device)  # [H, W, 3]
         if tensor.dtype != torch.uint8:
             if not bool(tensor.isfinite().all()):
-                raise TrainingError("a render holds values that are not finite: the trained model is broken")
+                raise TrainingError(
+                    "a render holds values that are not finite: the trained model is broken"
+                )
             tensor = quantize(tensor)
         return as_unit_range(tensor, torch.float32)
 
 
 def quantize(image: Tensor) -> Tensor:
-    """Round a floating point image in [0, 1] to uint8, as for a PNG: ``floor(clamp(255 x + 0.5, 0, 255))``."""
+    """Round a floating point image in [0, 1] to uint8, as for a PNG: ``floor(clamp(255 x + 0.5, 0,
+    255))``."""
     return (image * 255 + 0.5).clamp(0, 255).to(torch.uint8)
 
 
-def summarize(per_view: Mapping[str, Mapping[str, float]], unavailable: Mapping[str, str]) -> dict[str, float]:
-    """The mean over views of every metric that all views have and that is not in ``unavailable``."""
+def summarize(
+    per_view: Mapping[str, Mapping[str, float]], unavailable: Mapping[str, str]
+) -> dict[str, float]:
+    """The mean over views of every metric that all views have and that is not in
+    ``unavailable``."""
     if not per_view:
         return {}
     views = list(per_view.values())
-    shared = [key for key in views[0] if key not in unavailable and all(key in view for view in views)]
+    shared = [
+        key for key in views[0] if key not in unavailable and all(key in view for view in views)
+    ]
     return {key: float(np.mean([view[key] for view in views])) for key in shared}

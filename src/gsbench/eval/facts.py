@@ -1,6 +1,7 @@
 """One table of facts about gsbench's metrics, such as labels, units and directions. Loads no torch.
 
-A metric of your own needs no entry here: ``eval.extra.NAME._target_=mine.MyMetric`` (docs/metric.md).
+A metric of your own needs no entry here: ``eval.extra.NAME._target_=mine.MyMetric``
+(docs/metric.md).
 """
 
 from dataclasses import asdict, dataclass, fields, replace
@@ -22,12 +23,12 @@ class MetricFacts:
 
     key: str  # in results, per-view files and ``--metrics``
     label: Annotated[StrictStr, Predicate(lambda text: bool(text.strip()))]  # in tables
-    direction: Literal[-1, 0, 1] = 0  # 1: more is better; -1: less is better; 0: not known, so there is no verdict
+    # 1: more is better; -1: less is better; 0: not known, so there is no verdict
+    direction: Literal[-1, 0, 1] = 0
     decimals: Annotated[int, Interval(ge=0, le=12)] = 3  # in tables
     unit: StrictStr = ""
-    worthwhile: PositiveFloat | None = (
-        None  # the smallest difference worth resolving, about what papers claim as improvements
-    )
+    # the smallest difference worth resolving, about what papers claim as improvements
+    worthwhile: PositiveFloat | None = None
     setting: str = ""  # the setting that requests it; empty: it is always computed
     lowest: float | None = None  # lower bound of its values; None: none or unknown
     highest: float | None = None  # upper bound
@@ -43,45 +44,96 @@ def _lpips(variant: str, label: str, words: str) -> MetricFacts:
     return MetricFacts(f"{LPIPS}{variant}", label, -1, 3, "", 0.005, "eval.lpips", 0.0, words=words)
 
 
-def _structural(key: str, label: str, direction: Literal[-1, 1], highest: float, words: str) -> MetricFacts:
+def _structural(
+    key: str, label: str, direction: Literal[-1, 1], highest: float, words: str
+) -> MetricFacts:
     """A metric of structure without weights, computed if ``eval.more`` names it."""
     return MetricFacts(key, label, direction, 4, "", 0.002, MORE, 0.0, highest, words)
 
 
-CORRECTED = "_cc"  # ends the key of a metric that is measured after an affine correction of the colours
+# ends the key of a metric that is measured after an affine correction of the colours
+CORRECTED = "_cc"
 
 
 def _corrected(facts: MetricFacts) -> MetricFacts:
     """``facts`` of the same metric after the correction, computed if ``eval.more`` names it."""
     key, label = f"{facts.key}{CORRECTED}", f"{facts.label} cc"
-    return replace(facts, key=key, label=label, setting=MORE, words=f"{facts.label} after a correction of the colours")
+    return replace(
+        facts,
+        key=key,
+        label=label,
+        setting=MORE,
+        words=f"{facts.label} after a correction of the colours",
+    )
 
 
 _PLAIN = (  # `gsbench.eval.evaluator.MEASURES` has the class of each
-    MetricFacts("psnr", "PSNR", 1, 2, "dB", 0.1, lowest=0.0, words="mean squared error, logarithmic"),
-    MetricFacts("ssim", "SSIM", 1, 3, "", 0.005, "", -1.0, 1.0, "means, contrast and structure in windows of 11 px"),
+    MetricFacts(
+        "psnr", "PSNR", 1, 2, "dB", 0.1, lowest=0.0, words="mean squared error, logarithmic"
+    ),
+    MetricFacts(
+        "ssim",
+        "SSIM",
+        1,
+        3,
+        "",
+        0.005,
+        "",
+        -1.0,
+        1.0,
+        "means, contrast and structure in windows of 11 px",
+    ),
     _lpips("vgg_raw", "LPIPS VGG raw", "distance of what vgg sees, fed [0, 1]"),
     _lpips("vgg", "LPIPS VGG", "distance of what vgg sees"),
     _lpips("alex", "LPIPS Alex", "distance of what alex sees"),
     _lpips("squeeze", "LPIPS Squeeze", "distance of what squeeze sees"),
     MetricFacts(
-        "flip", "FLIP", -1, 3, "", 0.005, "eval.flip", 0.0, 1.0, "difference one sees when two images alternate"
+        "flip",
+        "FLIP",
+        -1,
+        3,
+        "",
+        0.005,
+        "eval.flip",
+        0.0,
+        1.0,
+        "difference one sees when two images alternate",
     ),
     _structural("ms_ssim", "MS-SSIM", 1, 1.0, "SSIM's structure at five scales"),
-    _structural("iw_ssim", "IW-SSIM", 1, 1.0, "the same, weighted by the information that a place carries"),
-    _structural("fsim", "FSIMc", 1, 1.0, "edges and lines: phase congruency, contrast and colour there"),
+    _structural(
+        "iw_ssim", "IW-SSIM", 1, 1.0, "the same, weighted by the information that a place carries"
+    ),
+    _structural(
+        "fsim", "FSIMc", 1, 1.0, "edges and lines: phase congruency, contrast and colour there"
+    ),
     _structural("gmsd", "GMSD", -1, 0.5, "how unevenly the gradients agree"),
 )
 _CORRECTED = tuple(
-    _corrected(facts) for facts in _PLAIN if facts.key in ("psnr", "ssim") or facts.key.startswith(LPIPS)
+    _corrected(facts)
+    for facts in _PLAIN
+    if facts.key in ("psnr", "ssim") or facts.key.startswith(LPIPS)
 )
 GAIN = MetricFacts(
-    "cc_gain", "gain by cc", 0, 2, "dB", setting=MORE, words="what the correction of the colours adds to PSNR"
+    "cc_gain",
+    "gain by cc",
+    0,
+    2,
+    "dB",
+    setting=MORE,
+    words="what the correction of the colours adds to PSNR",
 )
 METRICS = (*_PLAIN, *_CORRECTED, GAIN)
 # A fact about the trained model instead of its pictures, measured separately in the evaluation.
 FPS = MetricFacts(
-    "fps", "speed", 1, 2, "frames/s", None, "eval.fps", 0.0, words="renders of the test views at one size"
+    "fps",
+    "speed",
+    1,
+    2,
+    "frames/s",
+    None,
+    "eval.fps",
+    0.0,
+    words="renders of the test views at one size",
 )
 ALL = (*METRICS, FPS)  # in the order of tables
 
@@ -93,7 +145,9 @@ def known_keys() -> tuple[str, ...]:
 
 def lpips_variants() -> tuple[str, ...]:
     """The values allowed in ``eval.lpips``."""
-    return tuple(facts.key.removeprefix(LPIPS) for facts in METRICS if facts.setting == "eval.lpips")
+    return tuple(
+        facts.key.removeprefix(LPIPS) for facts in METRICS if facts.setting == "eval.lpips"
+    )
 
 
 def further_keys() -> tuple[str, ...]:
@@ -107,14 +161,23 @@ def find_metric(key: str) -> MetricFacts | None:
 
 
 def facts_of(key: str, metric: object) -> MetricFacts:
-    """The facts about a user's metric, from the attributes of its class; raises InputError for a wrong attribute."""
-    given = {field.name: getattr(metric, field.name) for field in fields(MetricRecord) if hasattr(metric, field.name)}
-    return MetricFacts(key, **({"label": key} | check_values(MetricFacts, given, type(metric).__qualname__)))
+    """The facts about a user's metric, from the attributes of its class; raises InputError for a
+    wrong attribute."""
+    given = {
+        field.name: getattr(metric, field.name)
+        for field in fields(MetricRecord)
+        if hasattr(metric, field.name)
+    }
+    return MetricFacts(
+        key, **({"label": key} | check_values(MetricFacts, given, type(metric).__qualname__))
+    )
 
 
 def to_record(facts: MetricFacts) -> MetricRecord:
     """The facts about a user's metric for its results, so that tables need not import its class."""
-    return MetricRecord(**{field.name: getattr(facts, field.name) for field in fields(MetricRecord)})
+    return MetricRecord(
+        **{field.name: getattr(facts, field.name) for field in fields(MetricRecord)}
+    )
 
 
 def from_record(key: str, record: MetricRecord | None) -> MetricFacts:

@@ -20,7 +20,8 @@ def in_double_precision(image: Tensor) -> Tensor:
 
 
 def replace_ignored(image: Tensor, target: Tensor, mask: Tensor | None) -> Tensor:
-    """``image`` [H, W, 3] with the pixels of ``target`` (uint8 or floating) where ``mask`` [H, W, 1] is False.
+    """``image`` [H, W, 3] with the pixels of ``target`` (uint8 or floating) where ``mask`` [H, W,
+    1] is False.
 
     The replaced pixels have no error and no gradient. With ``mask`` None all pixels count.
     """
@@ -33,22 +34,29 @@ def as_batch(image: Tensor) -> Tensor:
 
 
 def check_pair(image: Tensor, target: Tensor) -> None:
-    """Raise ValueError unless both are floating point and have the same shape, [H, W, 3] or [B, 3, H, W]."""
+    """Raise ValueError unless both are floating point and have the same shape, [H, W, 3] or [B, 3,
+    H, W]."""
     if image.shape != target.shape:
-        raise ValueError(f"the images have different shapes: {tuple(image.shape)} and {tuple(target.shape)}")
+        raise ValueError(
+            f"the images have different shapes: {tuple(image.shape)} and {tuple(target.shape)}"
+        )
     is_image = image.ndim == 3 and image.shape[-1] == 3
     is_batch = image.ndim == 4 and image.shape[1] == 3
     if not (is_image or is_batch):
         raise ValueError(f"an image is [H, W, 3] or a batch [B, 3, H, W], got {tuple(image.shape)}")
     if not (image.is_floating_point() and target.is_floating_point()):
-        raise ValueError(f"images are floating point in [0, 1], got {image.dtype} and {target.dtype}")
+        raise ValueError(
+            f"images are floating point in [0, 1], got {image.dtype} and {target.dtype}"
+        )
 
 
 def check_size(image: Tensor, min_side: int, metric: str) -> None:
     """Raise ValueError for a batch [B, 3, H, W] with a side below ``min_side`` px."""
     height, width = image.shape[-2:]
     if min(height, width) < min_side:
-        raise ValueError(f"{metric} needs images of at least {min_side} px a side, got {width}x{height}")
+        raise ValueError(
+            f"{metric} needs images of at least {min_side} px a side, got {width}x{height}"
+        )
 
 
 def mix_channels(images: Tensor, weights: tuple[float, float, float]) -> Tensor:
@@ -58,7 +66,8 @@ def mix_channels(images: Tensor, weights: tuple[float, float, float]) -> Tensor:
 
 
 def halved(images: Tensor, padding: str) -> Tensor:
-    """Means [B, C, H / 2, W / 2] of 2x2 px of [B, C, H, W]; odd sides are padded in torch's mode ``padding``."""
+    """Means [B, C, H / 2, W / 2] of 2x2 px of [B, C, H, W]; odd sides are padded in torch's mode
+    ``padding``."""
     height, width = images.shape[-2:]
     padded = torch.nn.functional.pad(images, [0, width % 2, 0, height % 2], mode=padding)
     return torch.nn.functional.avg_pool2d(padded, 2)
@@ -74,7 +83,9 @@ def gradient_magnitude(images: Tensor, smoothing: tuple[float, float, float]) ->
 
     Gradients are central differences, smoothed in the other direction by three weights.
     """
-    horizontal = images.new_tensor(smoothing).unsqueeze(1) * images.new_tensor([-1.0, 0.0, 1.0])  # [3, 3]
+    horizontal = images.new_tensor(smoothing).unsqueeze(1) * images.new_tensor(
+        [-1.0, 0.0, 1.0]
+    )  # [3, 3]
     kernels = torch.stack([horizontal, horizontal.T]).unsqueeze(1)  # [2, 1, 3, 3]
     gradient = torch.nn.functional.conv2d(images, kernels, padding=1)  # [B, 2, H, W]
     return gradient.square().sum(dim=1, keepdim=True).sqrt()

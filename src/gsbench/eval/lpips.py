@@ -1,7 +1,9 @@
-"""LPIPS v0.1 (Zhang et al. 2018, "The unreasonable effectiveness of deep features as a perceptual metric").
+"""LPIPS v0.1 (Zhang et al. 2018, "The unreasonable effectiveness of deep features as a perceptual
+metric").
 
-The layers of VGG16, AlexNet and SqueezeNet 1.1 are in torchvision's order, so that torchvision's ImageNet weights load
-into them without torchvision. The learned linear heads are those of LPIPS v0.1.
+The layers of VGG16, AlexNet and SqueezeNet 1.1 are in torchvision's order, so that torchvision's
+ImageNet weights load into them without torchvision. The learned linear heads are those of LPIPS
+v0.1.
 """
 
 from collections.abc import Callable, Mapping
@@ -24,7 +26,8 @@ ROWS_AT_A_TIME = 64  # feature rows compared at once, to limit the memory
 
 @dataclass(frozen=True)
 class Backbone:
-    """A network's convolutional layers, the layers whose output LPIPS compares, and the weights files."""
+    """A network's convolutional layers, the layers whose output LPIPS compares, and the weights
+    files."""
 
     build: Callable[[], nn.Sequential]
     taps: tuple[int, ...]  # indices of the layers whose output is compared
@@ -45,10 +48,14 @@ class Fire(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         squeezed = self.squeeze(x).relu_()
-        return torch.cat([self.expand1x1(squeezed), self.expand3x3(squeezed)], dim=1).relu_()  # [B, 2 * expanded, H, W]
+        return torch.cat(
+            [self.expand1x1(squeezed), self.expand3x3(squeezed)], dim=1
+        ).relu_()  # [B, 2 * expanded, H, W]
 
 
-def _convolution(channels: int, width: int, size: int, stride: int = 1, padding: int = 0) -> list[nn.Module]:
+def _convolution(
+    channels: int, width: int, size: int, stride: int = 1, padding: int = 0
+) -> list[nn.Module]:
     return [nn.Conv2d(channels, width, size, stride, padding), nn.ReLU(inplace=True)]
 
 
@@ -118,7 +125,10 @@ BACKBONES: dict[str, Backbone] = {
         channels=(64, 128, 256, 512, 512),
         min_size=16,
         features=(
-            _torchvision("vgg16-397923af.pth", "397923af8e79cdbb6a7127f12361acd7a2f83e06b05044ddf496e83de57a5bf0"),
+            _torchvision(
+                "vgg16-397923af.pth",
+                "397923af8e79cdbb6a7127f12361acd7a2f83e06b05044ddf496e83de57a5bf0",
+            ),
         ),
         heads=_heads("vgg", "a78928a0af1e5f0fcb1f3b9e8f8c3a2a5a3de244d830ad5c1feddc79b8432868"),
     ),
@@ -129,7 +139,8 @@ BACKBONES: dict[str, Backbone] = {
         min_size=31,
         features=(
             _torchvision(
-                "alexnet-owt-7be5be79.pth", "7be5be791159472b1fbf3c69796f7cb30dca7ad8466c2df70058c37116cdee02"
+                "alexnet-owt-7be5be79.pth",
+                "7be5be791159472b1fbf3c69796f7cb30dca7ad8466c2df70058c37116cdee02",
             ),
         ),
         heads=_heads("alex", "df73285e35b22355a2df87cdb6b70b343713b667eddbda73e1977e0c860835c0"),
@@ -141,7 +152,8 @@ BACKBONES: dict[str, Backbone] = {
         min_size=17,
         features=(
             _torchvision(
-                "squeezenet1_1-b8a52dc0.pth", "b8a52dc049b60e4b6ab68ad0df457362afab8b6304b2febdc1650a5dab4d7e7b"
+                "squeezenet1_1-b8a52dc0.pth",
+                "b8a52dc049b60e4b6ab68ad0df457362afab8b6304b2febdc1650a5dab4d7e7b",
             ),
             SQUEEZE_FEATURES_ONLY,
         ),
@@ -153,12 +165,17 @@ BACKBONES: dict[str, Backbone] = {
 class Lpips:
     """One LPIPS network, ready to compare images; it computes no gradients.
 
-    ``features`` holds the backbone's weights with the keys of torchvision's model, or of its ``features`` alone; keys
-    of a classifier are ignored. ``heads`` holds ``lin{k}.model.1.weight`` [1, C, 1, 1] for every tap k.
+    ``features`` holds the backbone's weights with the keys of torchvision's model, or of its
+    ``features`` alone; keys of a classifier are ignored. ``heads`` holds ``lin{k}.model.1.weight``
+    [1, C, 1, 1] for every tap k.
     """
 
     def __init__(
-        self, net: str, features: Mapping[str, Tensor], heads: Mapping[str, Tensor], device: torch.device | str = "cpu"
+        self,
+        net: str,
+        features: Mapping[str, Tensor],
+        heads: Mapping[str, Tensor],
+        device: torch.device | str = "cpu",
     ) -> None:
         self.net = net
         self.backbone = BACKBONES[net]
@@ -166,7 +183,9 @@ class Lpips:
         load_features(stack, features, f"lpips {net}")
         last = max(self.backbone.taps)
         self._layers = stack[: last + 1].requires_grad_(False).eval().to(device)
-        self._heads = [head.to(device) for head in _head_weights(self.backbone, heads, net)]  # [C] each
+        self._heads = [
+            head.to(device) for head in _head_weights(self.backbone, heads, net)
+        ]  # [C] each
         self._shift = torch.tensor(SHIFT, device=device).view(1, 3, 1, 1)
         self._scale = torch.tensor(SCALE, device=device).view(1, 3, 1, 1)
         self.device = torch.device(device)
@@ -175,23 +194,35 @@ class Lpips:
     def __call__(self, first: Tensor, second: Tensor, mask: Tensor | None = None) -> Tensor:
         """Distances [B] of two batches [B, 3, H, W], which are fed to the network unchanged.
 
-        LPIPS is defined for inputs in [-1, 1]: pass ``2 * x - 1`` for images in [0, 1]. The evaluation of 3DGS passes
-        images in [0, 1] unchanged, as the metrics named ``..._raw`` do.
+        LPIPS is defined for inputs in [-1, 1]: pass ``2 * x - 1`` for images in [0, 1]. The
+        evaluation of 3DGS passes images in [0, 1] unchanged, as the metrics named ``..._raw`` do.
 
-        With a ``mask`` [H, W], each position of a layer is weighted by the share of its pixels that count.
+        With a ``mask`` [H, W], each position of a layer is weighted by the share of its pixels that
+        count.
         """
         if first.shape != second.shape or first.ndim != 4 or first.shape[1] != 3:
-            raise ValueError(f"lpips compares batches [B, 3, H, W], got {tuple(first.shape)} and {tuple(second.shape)}")
+            raise ValueError(
+                f"lpips compares batches [B, 3, H, W], got {tuple(first.shape)} and "
+                f"{tuple(second.shape)}"
+            )
         if min(first.shape[-2:]) < self.backbone.min_size:
-            raise ValueError(f"lpips {self.net} needs sides of at least {self.backbone.min_size} px")
-        weights = None if mask is None else mask.to(self.device, torch.float32)[None, None]  # [1, 1, H, W]
-        return torch.stack([self._pair(a[None], b[None], weights) for a, b in zip(first, second, strict=True)])  # [B]
+            raise ValueError(
+                f"lpips {self.net} needs sides of at least {self.backbone.min_size} px"
+            )
+        weights = (
+            None if mask is None else mask.to(self.device, torch.float32)[None, None]
+        )  # [1, 1, H, W]
+        return torch.stack(
+            [self._pair(a[None], b[None], weights) for a, b in zip(first, second, strict=True)]
+        )  # [B]
 
     def _pair(self, first: Tensor, second: Tensor, weights: Tensor | None = None) -> Tensor:
         """The distance [] of two images [1, 3, H, W]."""
-        # Both images pass a layer before the next one, so that features of earlier layers need not be kept.
+        # Both images pass a layer before the next one, so that features of earlier layers need not
+        # be kept.
         first, second = (
-            (image.to(self.device, torch.float32) - self._shift) / self._scale for image in (first, second)
+            (image.to(self.device, torch.float32) - self._shift) / self._scale
+            for image in (first, second)
         )
         total = torch.zeros((), device=self.device)
         heads = iter(self._heads)
@@ -199,7 +230,9 @@ class Lpips:
             first, second = layer(first), layer(second)  # [1, C, h, w] each
             if index in self.backbone.taps:
                 size = first.shape[2], first.shape[3]
-                layer_weights = None if weights is None else F.adaptive_avg_pool2d(weights, size)[0, 0]  # [h, w]
+                layer_weights = (
+                    None if weights is None else F.adaptive_avg_pool2d(weights, size)[0, 0]
+                )  # [h, w]
                 total = total + _feature_distance(first, second, next(heads), layer_weights)
         return total
 
@@ -207,7 +240,8 @@ class Lpips:
 def load_lpips(
     net: str, folder: Path | None = None, download: bool = True, device: torch.device | str = "cpu"
 ) -> Lpips:
-    """Load an LPIPS network; its weights are searched in ``folder`` and the usual places, else downloaded.
+    """Load an LPIPS network; its weights are searched in ``folder`` and the usual places, else
+    downloaded.
 
     Raises ``MissingWeightsError`` if they are not found.
     """
@@ -218,7 +252,8 @@ def load_lpips(
 
 
 def find_first_weights(specs: tuple[WeightsFile, ...], folder: Path | None, download: bool) -> Path:
-    """Find one of the alternatives ``specs`` on this machine; else download the first, if allowed."""
+    """Find one of the alternatives ``specs`` on this machine; else download the first, if
+    allowed."""
     for spec in specs[1:]:
         try:
             return find_weights(spec, folder, download=False)
@@ -227,17 +262,28 @@ def find_first_weights(specs: tuple[WeightsFile, ...], folder: Path | None, down
     return find_weights(specs[0], folder, download)
 
 
-def _feature_distance(first: Tensor, second: Tensor, head: Tensor, weights: Tensor | None = None) -> Tensor:
-    """Spatial mean of the weighted squared difference of unit feature vectors; maps [1, C, h, w], head [C].
+def _feature_distance(
+    first: Tensor, second: Tensor, head: Tensor, weights: Tensor | None = None
+) -> Tensor:
+    """Spatial mean of the weighted squared difference of unit feature vectors; maps [1, C, h, w],
+    head [C].
 
     ``weights`` [h, w] weight the positions in the mean; None: all equal.
     """
     if weights is not None:
-        first, second = (x / (x.square().sum(dim=1, keepdim=True).sqrt() + NORM_EPSILON) for x in (first, second))
+        first, second = (
+            x / (x.square().sum(dim=1, keepdim=True).sqrt() + NORM_EPSILON) for x in (first, second)
+        )
         distances = ((first - second).square()[0] * head[:, None, None]).sum(dim=0)  # [h, w]
         return (distances * weights).sum().double() / weights.sum().double()
-    total = torch.zeros((), dtype=torch.float64 if first.device.type == "cpu" else torch.float32, device=first.device)
-    for a, b in zip(first[0].split(ROWS_AT_A_TIME, dim=1), second[0].split(ROWS_AT_A_TIME, dim=1), strict=True):
+    total = torch.zeros(
+        (),
+        dtype=torch.float64 if first.device.type == "cpu" else torch.float32,
+        device=first.device,
+    )
+    for a, b in zip(
+        first[0].split(ROWS_AT_A_TIME, dim=1), second[0].split(ROWS_AT_A_TIME, dim=1), strict=True
+    ):
         a = a / (a.square().sum(dim=0).sqrt() + NORM_EPSILON)  # [C, rows, w]
         b = b / (b.square().sum(dim=0).sqrt() + NORM_EPSILON)  # [C, rows, w]
         per_channel = (a - b).square().sum(dim=(1, 2))  # [C]
@@ -246,12 +292,16 @@ def _feature_distance(first: Tensor, second: Tensor, head: Tensor, weights: Tens
 
 
 def load_features(stack: nn.Sequential, state: Mapping[str, Tensor], who: str) -> None:
-    """Load published weights into a backbone; raises InputError naming ``who`` if they are for another network."""
+    """Load published weights into a backbone; raises InputError naming ``who`` if they are for
+    another network."""
     expected = stack.state_dict().keys()
     renamed = {key.removeprefix("features."): value for key, value in state.items()}
     missing = [key for key in expected if key not in renamed]
     if missing:
-        raise InputError(f"the weights of {who} lack {missing[0]!r} and {len(missing) - 1} more: not that network")
+        raise InputError(
+            f"the weights of {who} lack {missing[0]!r} and {len(missing) - 1} more: not that "
+            "network"
+        )
     stack.load_state_dict({key: renamed[key].float() for key in expected})
 
 
@@ -261,7 +311,8 @@ def _head_weights(backbone: Backbone, state: Mapping[str, Tensor], net: str) -> 
         weight = state.get(f"lin{index}.model.1.weight")
         if weight is None or weight.numel() != channels:
             raise InputError(
-                f"the heads of lpips {net} lack lin{index} with {channels} weights: not that network's heads"
+                f"the heads of lpips {net} lack lin{index} with {channels} weights: not that "
+                "network's heads"
             )
         weights.append(weight.flatten().float())  # [C]
     return weights

@@ -1,4 +1,5 @@
-"""Contract of a metric, a class that compares an image with its photograph. docs/metric.md has an example."""
+"""Contract of a metric, a class that compares an image with its photograph. docs/metric.md has an
+example."""
 
 from typing import Protocol, runtime_checkable
 
@@ -8,8 +9,8 @@ from torch import Tensor
 class Metric(Protocol):
     """Measures a render against its photograph.
 
-    Class attributes say how to read its values: ``direction`` (1, -1 or 0), ``label``, ``unit``, ``decimals`` and
-    ``worthwhile``. `gsbench.eval.facts.MetricFacts` explains them.
+    Class attributes say how to read its values: ``direction`` (1, -1 or 0), ``label``, ``unit``,
+    ``decimals`` and ``worthwhile``. `gsbench.eval.facts.MetricFacts` explains them.
 
     Examples:
         The largest error of any pixel, in 8-bit levels (less is better):
@@ -29,8 +30,8 @@ class Metric(Protocol):
     def measure(self, image: Tensor, truth: Tensor) -> float:
         """The value of one view; both are [H, W, 3], float32 in [0, 1], on the evaluation's device.
 
-        The render is rounded to 8 bits. Both images have equal pixels where a mask ignores them. May raise
-        `UnavailableError`.
+        The render is rounded to 8 bits. Both images have equal pixels where a mask ignores them.
+        May raise `UnavailableError`.
         """
         ...
 
@@ -43,14 +44,17 @@ class MaskedMetric(Metric, Protocol):
     """
 
     def measure_masked(self, image: Tensor, truth: Tensor, mask: Tensor) -> float:
-        """The value of one view over the pixels that count: ``mask`` [H, W] bool, and the images of `measure`."""
+        """The value of one view over the pixels that count: ``mask`` [H, W] bool, and the images of
+        `measure`."""
         ...
 
 
 class UnavailableError(Exception):
-    """Raised for a metric that cannot be computed; its message, one line, is the reason in results and tables.
+    """Raised for a metric that cannot be computed; its message, one line, is the reason in results
+    and tables.
 
-    ``awaited`` (gsbench's own metrics only) says that the metric can be computed after an installation or a download.
+    ``awaited`` (gsbench's own metrics only) says that the metric can be computed after an
+    installation or a download.
     """
 
     def __init__(self, reason: str, awaited: bool = False) -> None:

@@ -1,4 +1,5 @@
-"""The settings of an evaluation: the protocol, the metrics, and the declared metric of the verdict."""
+"""The settings of an evaluation: the protocol, the metrics, and the declared metric of the
+verdict."""
 
 import re
 from collections.abc import Mapping
@@ -9,14 +10,23 @@ from annotated_types import Interval, Len, Predicate, doc
 from pydantic import PositiveInt
 
 from gsbench.errors import InputError
-from gsbench.eval.facts import FPS, LPIPS, MORE, find_metric, further_keys, known_keys, lpips_variants
+from gsbench.eval.facts import (
+    FPS,
+    LPIPS,
+    MORE,
+    find_metric,
+    further_keys,
+    known_keys,
+    lpips_variants,
+)
 from gsbench.eval.protocol import PROTOCOLS
 from gsbench.runs.experiments import AT, QUESTIONS, metric_and_question
 from gsbench.settings import MISSING, FolderName, PathName, check_settings
 from gsbench.words import did_you_mean
 
 METRIC_NAME = re.compile(r"[a-z][a-z0-9_]*")
-RESERVED_NAMES = (*known_keys(), "view", "lpips")  # keys of metrics, the column of views, and the protocol's LPIPS
+# keys of metrics, the column of views, and the protocol's LPIPS
+RESERVED_NAMES = (*known_keys(), "view", "lpips")
 
 
 def all_different(values: list[Any]) -> bool:
@@ -25,7 +35,9 @@ def all_different(values: list[Any]) -> bool:
 
 
 ProtocolName = Annotated[
-    str, Predicate(lambda name: name in PROTOCOLS), doc(" or ".join(f"'{name}'" for name in PROTOCOLS))
+    str,
+    Predicate(lambda name: name in PROTOCOLS),
+    doc(" or ".join(f"'{name}'" for name in PROTOCOLS)),
 ]
 AT_RULE = "a list of different iterations, at which the test views are measured beside the last"
 CONTROLS_RULE = "a mapping {ARM: ARM}: the arm, beside the baseline, that an arm is compared with"
@@ -45,14 +57,22 @@ class EvalConfig:
         default_factory=lambda: list(lpips_variants())
     )
     flip: bool = True
-    more: Annotated[list[FurtherMetric], Predicate(all_different), doc(MORE_RULE)] = field(default_factory=list)
-    extra: dict[str, Any] = field(default_factory=dict)  # metrics of your own: {name: {_target_: mine.MyMetric}}
-    at: Annotated[list[PositiveInt], Predicate(all_different), doc(AT_RULE)] = field(default_factory=list)
-    # The metric of the verdict, declared before results are seen (psnr@extrapolation: for one question); null: none.
+    more: Annotated[list[FurtherMetric], Predicate(all_different), doc(MORE_RULE)] = field(
+        default_factory=list
+    )
+    # metrics of your own: {name: {_target_: mine.MyMetric}}
+    extra: dict[str, Any] = field(default_factory=dict)
+    at: Annotated[list[PositiveInt], Predicate(all_different), doc(AT_RULE)] = field(
+        default_factory=list
+    )
+    # The metric of the verdict, declared before results are seen (psnr@extrapolation: for one
+    # question); null: none.
     primary: str | None = None
-    controls: Annotated[dict[str, FolderName], doc(CONTROLS_RULE)] = field(default_factory=dict)  # {longaxis: absgrad}
+    # {longaxis: absgrad}
+    controls: Annotated[dict[str, FolderName], doc(CONTROLS_RULE)] = field(default_factory=dict)
     maps: bool = False  # draw the large Gaussians over a test view
-    fps: Annotated[list[Side], Len(2, 2), doc(FPS_RULE)] | None = None  # [1920, 1080]: the speed at this size, px
+    # [1920, 1080]: the speed at this size, px
+    fps: Annotated[list[Side], Len(2, 2), doc(FPS_RULE)] | None = None
     weights: PathName | None = None  # folder; null: $GSBENCH_WEIGHTS, then the torch hub cache
     download: bool = True  # fetch missing weights, checked by checksum
 
@@ -61,25 +81,34 @@ class EvalConfig:
         for name, options in self.extra.items():
             if not METRIC_NAME.fullmatch(name) or name in RESERVED_NAMES:
                 raise InputError(
-                    f"eval.extra.{name}: name your metric in small letters, digits and underscores, and none of "
+                    f"eval.extra.{name}: name your metric in small letters, digits and "
+                    "underscores, and none of "
                     f"{', '.join(RESERVED_NAMES)}"
                 )
             if not isinstance(options, Mapping) or "_target_" not in options:
-                raise InputError(f"eval.extra.{name} must name a class, as eval.extra.{name}._target_=mine.MyMetric")
+                raise InputError(
+                    f"eval.extra.{name} must name a class, as "
+                    f"eval.extra.{name}._target_=mine.MyMetric"
+                )
         if self.primary is not None:
             metric, question = metric_and_question(self.primary)
             if question not in QUESTIONS.values() and (question or AT in self.primary):
-                raise InputError(f"eval.primary={self.primary}: after {AT} comes {' or '.join(QUESTIONS.values())}")
+                raise InputError(
+                    f"eval.primary={self.primary}: after {AT} comes "
+                    f"{' or '.join(QUESTIONS.values())}"
+                )
             if metric not in self.extra:
                 self._check_primary(metric)
 
     def _check_primary(self, key: str) -> None:
-        """Raise InputError unless one of gsbench's own metrics, which these settings ask for, has this key."""
+        """Raise InputError unless one of gsbench's own metrics, which these settings ask for, has
+        this key."""
         facts = find_metric(key)
         if facts is None:
             known = [*known_keys(), *self.extra]
             raise InputError(
-                f"eval.primary={key} is not a metric{did_you_mean(key, known)} (known are {', '.join(known)}; your own "
+                f"eval.primary={key} is not a metric{did_you_mean(key, known)} (known are "
+                f"{', '.join(known)}; your own "
                 "metric by its name under eval.extra)"
             )
         if facts.setting == "eval.flip" and not self.flip:
@@ -89,4 +118,6 @@ class EvalConfig:
         if facts.setting == MORE and key not in self.more:
             raise InputError(f"eval.primary={key} is not measured: add {key} to eval.more")
         if facts.setting == "eval.lpips" and key.removeprefix(LPIPS) not in self.lpips:
-            raise InputError(f"eval.primary={key} is not measured: add {key.removeprefix(LPIPS)} to eval.lpips")
+            raise InputError(
+                f"eval.primary={key} is not measured: add {key.removeprefix(LPIPS)} to eval.lpips"
+            )

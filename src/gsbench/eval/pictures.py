@@ -1,4 +1,5 @@
-"""Matching the pictures that a program rendered with photographs by name, without guesses, and measuring them."""
+"""Matching the pictures that a program rendered with photographs by name, without guesses, and
+measuring them."""
 
 import re
 from collections import defaultdict
@@ -29,13 +30,16 @@ class Matching:
     left_out: tuple[str, ...]
 
 
-def match_pictures(photographs: Sequence[str], pictures: Sequence[str], by_order: str = "--by-order") -> Matching:
+def match_pictures(
+    photographs: Sequence[str], pictures: Sequence[str], by_order: str = "--by-order"
+) -> Matching:
     """Match names (relative paths) by the first rule under which every photograph has a picture.
 
-    The rules, from strict to loose, compare names: as they are; without the extension; with folders written as part of
-    the name; without case; without a start and an end that all names share; without leading zeros; and by the last
-    three rules without folders. Raises `InputError` if that rule gives a photograph several pictures, or if no rule
-    gives each a picture. ``by_order`` is the option that error messages suggest for `match_by_order`.
+    The rules, from strict to loose, compare names: as they are; without the extension; with folders
+    written as part of the name; without case; without a start and an end that all names share;
+    without leading zeros; and by the last three rules without folders. Raises `InputError` if that
+    rule gives a photograph several pictures, or if no rule gives each a picture. ``by_order`` is
+    the option that error messages suggest for `match_by_order`.
     """
     for rule, make_keys in _RULES.items():
         photograph_keys, picture_keys = make_keys(photographs), make_keys(pictures)
@@ -49,7 +53,10 @@ def match_pictures(photographs: Sequence[str], pictures: Sequence[str], by_order
         matches = {photograph: by_key[key] for photograph, key in photograph_keys.items()}
         for photograph, candidates in matches.items():
             if len(candidates) > 1:
-                raise InputError(f"{', '.join(sorted(candidates))} all fit the photograph {photograph}: leave one")
+                raise InputError(
+                    f"{', '.join(sorted(candidates))} all fit the photograph {photograph}: leave "
+                    "one"
+                )
         pairs = {photograph: candidates[0] for photograph, candidates in matches.items()}
         return Matching(pairs, rule, tuple(sorted(set(pictures) - set(pairs.values()))))
     raise InputError(_no_match(photographs, pictures, by_order))
@@ -62,7 +69,8 @@ def match_by_order(photographs: Sequence[str], pictures: Sequence[str]) -> Match
     """
     if len(photographs) != len(pictures):
         raise InputError(
-            f"there are {counted(len(pictures), 'picture')} for {counted(len(photographs), 'photograph')}: by order, "
+            f"there are {counted(len(pictures), 'picture')} for "
+            f"{counted(len(photographs), 'photograph')}: by order, "
             "each needs one"
         )
     in_order = sorted(photographs, key=_by_value), sorted(pictures, key=_by_value)
@@ -72,13 +80,21 @@ def match_by_order(photographs: Sequence[str], pictures: Sequence[str]) -> Match
 
 def _no_match(photographs: Sequence[str], pictures: Sequence[str], by_order: str) -> str:
     missing = list(photographs)
-    for make_keys in _RULES.values():  # report the rule that left the fewest photographs without a picture
+    # report the rule that left the fewest photographs without a picture
+    for make_keys in _RULES.values():
         picture_keys, photograph_keys = set(make_keys(pictures).values()), make_keys(photographs)
-        missing = min(missing, [name for name in photographs if photograph_keys[name] not in picture_keys], key=len)
+        missing = min(
+            missing,
+            [name for name in photographs if photograph_keys[name] not in picture_keys],
+            key=len,
+        )
     called = some_of(sorted(pictures)) or "there are none"
-    hint = f"; {by_order} takes them as they are sorted" if len(pictures) == len(photographs) else ""
+    hint = (
+        f"; {by_order} takes them as they are sorted" if len(pictures) == len(photographs) else ""
+    )
     return (
-        f"{len(missing)} of {counted(len(photographs), 'photograph')} have no picture of their name "
+        f"{len(missing)} of {counted(len(photographs), 'photograph')} have no picture of their "
+        "name "
         f"({some_of(missing)}); the pictures are {called}: rename them{hint}"
     )
 
@@ -100,7 +116,8 @@ def _folded(words: Mapping[str, str]) -> dict[str, str]:
 
 
 def _stripped(words: Mapping[str, str]) -> dict[str, str]:
-    """The words without the start and the end that all of them share, which never contain digits next to the rest."""
+    """The words without the start and the end that all of them share, which never contain digits
+    next to the rest."""
     if len(words) < 2:
         return dict(words)
     texts = list(words.values())
@@ -116,7 +133,9 @@ def _common_start(texts: Sequence[str]) -> str:
 
 
 def _unpadded(words: Mapping[str, str]) -> dict[str, str]:
-    return {name: DIGITS.sub(lambda digits: str(int(digits[0])), word) for name, word in words.items()}
+    return {
+        name: DIGITS.sub(lambda digits: str(int(digits[0])), word) for name, word in words.items()
+    }
 
 
 def _by_value(name: str) -> list[tuple[int, int, str]]:
@@ -124,10 +143,13 @@ def _by_value(name: str) -> list[tuple[int, int, str]]:
     return [(1, int(part), part) if part.isdigit() else (0, 0, part) for part in parts]
 
 
-KeyFunction = Callable[[Sequence[str]], dict[str, str]]  # names are equal under a rule if their keys are
+# names are equal under a rule if their keys are
+KeyFunction = Callable[[Sequence[str]], dict[str, str]]
 
 
-def _names(key: Callable[[str], str], *steps: Callable[[Mapping[str, str]], dict[str, str]]) -> KeyFunction:
+def _names(
+    key: Callable[[str], str], *steps: Callable[[Mapping[str, str]], dict[str, str]]
+) -> KeyFunction:
     def keys(names: Sequence[str]) -> dict[str, str]:
         words = {name: key(name) for name in names}
         for step in steps:
@@ -152,7 +174,8 @@ _RULES: dict[str, KeyFunction] = {
 
 @dataclass(frozen=True)
 class PicturePair:
-    """A view with the files of its photograph, of the picture rendered for it, and of its mask, if it has one."""
+    """A view with the files of its photograph, of the picture rendered for it, and of its mask, if
+    it has one."""
 
     view: str
     photograph: Path
@@ -161,24 +184,32 @@ class PicturePair:
 
 
 def check_picture_sizes(pairs: Sequence[PicturePair]) -> None:
-    """Raise `InputError` for a picture whose size differs from its photograph's: pictures are never resized."""
+    """Raise `InputError` for a picture whose size differs from its photograph's: pictures are never
+    resized."""
     for pair in pairs:
-        (width, height), (wanted_width, wanted_height) = image_size(pair.picture), image_size(pair.photograph)
+        (width, height), (wanted_width, wanted_height) = (
+            image_size(pair.picture),
+            image_size(pair.photograph),
+        )
         if (width, height) != (wanted_width, wanted_height):
             raise InputError(
                 f"{pair.picture} is {width}x{height} px, but its photograph {pair.photograph} "
-                f"{wanted_width}x{wanted_height}: sizes are never changed here, so render at the photographs' size"
+                f"{wanted_width}x{wanted_height}: sizes are never changed here, so render at the "
+                "photographs' size"
             )
 
 
 def measure(
     pairs: Sequence[PicturePair], evaluator: Evaluator, report: Progress = no_progress
 ) -> dict[str, dict[str, float]]:
-    """The metrics of every view, in the pairs' order. Raises `InputError` for damaged files and unequal sizes."""
+    """The metrics of every view, in the pairs' order. Raises `InputError` for damaged files and
+    unequal sizes."""
     check_picture_sizes(pairs)
     per_view = {}
     for done, pair in enumerate(pairs, 1):
         mask = None if pair.mask is None else read_mask(pair.mask)
-        per_view[pair.view] = evaluator.evaluate_view(read_image(pair.picture), read_image(pair.photograph), mask)
+        per_view[pair.view] = evaluator.evaluate_view(
+            read_image(pair.picture), read_image(pair.photograph), mask
+        )
         report("views", done, len(pairs))
     return per_view

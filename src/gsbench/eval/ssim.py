@@ -1,7 +1,8 @@
 """SSIM, with the window and constants that the metrics based on it and the training loss share.
 
-Wang, Bovik, Sheikh and Simoncelli 2004, "Image quality assessment: from error visibility to structural similarity": an
-11x11 Gaussian window of sigma 1.5, constants for a data range of 1, and population variances.
+Wang, Bovik, Sheikh and Simoncelli 2004, "Image quality assessment: from error visibility to
+structural similarity": an 11x11 Gaussian window of sigma 1.5, constants for a data range of 1, and
+population variances.
 """
 
 from typing import get_args
@@ -21,23 +22,27 @@ C2 = 0.03**2
 
 
 def window() -> Tensor:
-    """The one-dimensional Gaussian window, [11] float64 of sum 1; its outer product with itself is the 2D window."""
+    """The one-dimensional Gaussian window, [11] float64 of sum 1; its outer product with itself is
+    the 2D window."""
     offsets = torch.arange(-WINDOW_RADIUS, WINDOW_RADIUS + 1, dtype=torch.float64)
     weights = torch.exp(-0.5 * (offsets / WINDOW_SIGMA) ** 2)
     return weights / weights.sum()
 
 
-_WEIGHTS = window().tolist()  # plain numbers, because a tensor would have to be copied to each device
+# plain numbers, because a tensor would have to be copied to each device
+_WEIGHTS = window().tolist()
 
 
-def ssim(image: Tensor, target: Tensor, padding: SsimPadding = "zero", mask: Tensor | None = None) -> Tensor:
+def ssim(
+    image: Tensor, target: Tensor, padding: SsimPadding = "zero", mask: Tensor | None = None
+) -> Tensor:
     """Structural similarity (eq. 13), averaged over pixels and channels.
 
-    Images are [H, W, 3] in [0, 1] (the value is a 0-dimensional tensor) or a batch [B, 3, H, W] (the values are [B]).
-    With ``padding`` "zero" the images are padded with zeros and the full map is averaged, as in the evaluation of 3DGS.
-    With "valid" only pixels whose window lies inside the image count, as in scikit-image. With ``mask`` [H, W], for one
-    image, only windows whose centre counts are averaged (NaN if none does). Raises ValueError for wrong shapes and
-    sizes.
+    Images are [H, W, 3] in [0, 1] (the value is a 0-dimensional tensor) or a batch [B, 3, H, W]
+    (the values are [B]). With ``padding`` "zero" the images are padded with zeros and the full map
+    is averaged, as in the evaluation of 3DGS. With "valid" only pixels whose window lies inside the
+    image count, as in scikit-image. With ``mask`` [H, W], for one image, only windows whose centre
+    counts are averaged (NaN if none does). Raises ValueError for wrong shapes and sizes.
     """
     check_pair(image, target)
     if padding not in get_args(SsimPadding):
@@ -54,15 +59,20 @@ def ssim(image: Tensor, target: Tensor, padding: SsimPadding = "zero", mask: Ten
 
 
 def ssim_map(image: Tensor, target: Tensor) -> Tensor:
-    """SSIM at every pixel and channel, [3, H, W], of two images [H, W, 3] in [0, 1], padded with zeros."""
+    """SSIM at every pixel and channel, [3, H, W], of two images [H, W, 3] in [0, 1], padded with
+    zeros."""
     luminance, structure = ssim_parts(as_batch(image), as_batch(target), "zero")
     return (luminance * structure)[0]
 
 
-def ssim_parts(x: Tensor, y: Tensor, padding: SsimPadding, data_range: float = 1.0) -> tuple[Tensor, Tensor]:
-    """Two factors of SSIM for images [B, C, H, W] with values from 0 to ``data_range``, [B, C, H', W'] each.
+def ssim_parts(
+    x: Tensor, y: Tensor, padding: SsimPadding, data_range: float = 1.0
+) -> tuple[Tensor, Tensor]:
+    """Two factors of SSIM for images [B, C, H, W] with values from 0 to ``data_range``, [B, C, H',
+    W'] each.
 
-    The first is luminance (eq. 6), the second contrast times structure (eq. 9 times eq. 10, with C3 = C2 / 2).
+    The first is luminance (eq. 6), the second contrast times structure (eq. 9 times eq. 10, with C3
+    = C2 / 2).
     """
     moments = _blur(torch.cat([x, y, x * x, y * y, x * y]), padding)  # [5B, C, H', W']
     mean_x, mean_y, mean_xx, mean_yy, mean_xy = moments.chunk(5)  # [B, C, H', W'] each

@@ -22,14 +22,16 @@ from gsbench.words import counted, some_of
 
 IMAGES = "images"
 TRANSFORMS = "transforms.json"
-OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenCV's camera axes (y down, z forward) to OpenGL's (y up, z backward)
+# OpenCV's camera axes (y down, z forward) to OpenGL's (y up, z backward)
+OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 FAST_PNG = 1  # zlib level; the files are deleted after the training
 
 
 def write_training_views(
     folder: Path, views: Sequence[View], cloud: PointCloud, normalization: Normalization = IDENTITY
 ) -> None:
-    """Write ``views`` as a COLMAP folder: PNG files, PINHOLE cameras of their size, and ``cloud`` as its points.
+    """Write ``views`` as a COLMAP folder: PNG files, PINHOLE cameras of their size, and ``cloud``
+    as its points.
 
     ``normalization`` is undone: programs get the coordinates in which the scene was given.
 
@@ -38,19 +40,27 @@ def write_training_views(
     check_picture_names([view.name for view in views], folder / IMAGES)
     (folder / IMAGES).mkdir(parents=True)
     for view in views:
-        Image.fromarray(view.image).save(folder / IMAGES / png_name(view.name), compress_level=FAST_PNG)
+        Image.fromarray(view.image).save(
+            folder / IMAGES / png_name(view.name), compress_level=FAST_PNG
+        )
     points = cloud.points if normalization.is_identity else normalization.undo(cloud.points)
     write_model(folder / MODEL_FOLDER, _cameras(views, normalization), cloud=(points, cloud.colors))
 
 
-def write_test_cameras(folder: Path, views: Sequence[View], normalization: Normalization = IDENTITY) -> None:
-    """Write the cameras of ``views``, without images, as a COLMAP model and as nerfstudio's ``transforms.json``.
+def write_test_cameras(
+    folder: Path, views: Sequence[View], normalization: Normalization = IDENTITY
+) -> None:
+    """Write the cameras of ``views``, without images, as a COLMAP model and as nerfstudio's
+    ``transforms.json``.
 
     Renders are expected under the names in these files.
     """
     cameras = _cameras(views, normalization)
     write_model(folder / MODEL_FOLDER, cameras)
-    write_json(folder / TRANSFORMS, {"camera_model": "OPENCV", "frames": [_frame(*item) for item in cameras.items()]})
+    write_json(
+        folder / TRANSFORMS,
+        {"camera_model": "OPENCV", "frames": [_frame(*item) for item in cameras.items()]},
+    )
 
 
 def _cameras(views: Sequence[View], normalization: Normalization) -> dict[str, Camera]:
@@ -65,15 +75,19 @@ def _frame(name: str, camera: Camera) -> dict[str, Any]:
     return {"file_path": name} | intrinsics | {"cx": camera.cx, "cy": camera.cy} | pose
 
 
-def collect_model(output: Path, pattern: str, target: Path, normalization: Normalization = IDENTITY) -> Gaussians:
-    """Copy the one file below ``output`` that fits ``pattern`` to ``target``, normalised; return its Gaussians.
+def collect_model(
+    output: Path, pattern: str, target: Path, normalization: Normalization = IDENTITY
+) -> Gaussians:
+    """Copy the one file below ``output`` that fits ``pattern`` to ``target``, normalised; return
+    its Gaussians.
 
     Raises `TrainingError` if there is not exactly one such file, or if it is not a valid 3DGS PLY.
     """
     files = _files(output, pattern)
     if len(files) > 1:
         raise TrainingError(
-            f"{counted(len(files), 'file')} fit densify.result ({_named(files, output)}): it must name one"
+            f"{counted(len(files), 'file')} fit densify.result ({_named(files, output)}): it must "
+            "name one"
         )
     try:
         gaussians = read_ply(files[0], normalization=normalization)
@@ -86,23 +100,32 @@ def collect_model(output: Path, pattern: str, target: Path, normalization: Norma
     return gaussians
 
 
-def collect_renders(output: Path, pattern: str, by_order: bool, views: Sequence[View], target: Path) -> None:
-    """Write the pictures below ``output`` that fit ``pattern`` to ``target``, as PNG files named after ``views``.
+def collect_renders(
+    output: Path, pattern: str, by_order: bool, views: Sequence[View], target: Path
+) -> None:
+    """Write the pictures below ``output`` that fit ``pattern`` to ``target``, as PNG files named
+    after ``views``.
 
-    Raises `TrainingError` if a view has no or several pictures, or if a picture is damaged or has another size.
+    Raises `TrainingError` if a view has no or several pictures, or if a picture is damaged or has
+    another size.
     """
     files = _files(output, pattern)
     names = [file.relative_to(output).as_posix() for file in files]
     wanted = [png_name(view.name) for view in views]
     target.mkdir()
     try:
-        matching = match_by_order(wanted, names) if by_order else match_pictures(wanted, names, "densify.by_order=true")
+        matching = (
+            match_by_order(wanted, names)
+            if by_order
+            else match_pictures(wanted, names, "densify.by_order=true")
+        )
         for name, view in zip(wanted, views, strict=True):
             picture = read_image(output / matching.pairs[name])  # [H, W, 3]
             (height, width), camera = picture.shape[:2], view.camera
             if (width, height) != (camera.width, camera.height):
                 raise InputError(
-                    f"{output / matching.pairs[name]} is {width}x{height} px and the view {camera.width}x"
+                    f"{output / matching.pairs[name]} is {width}x{height} px and the view "
+                    f"{camera.width}x"
                     f"{camera.height}: sizes are never changed here"
                 )
             Image.fromarray(picture).save(target / name)
@@ -111,12 +134,14 @@ def collect_renders(output: Path, pattern: str, by_order: bool, views: Sequence[
 
 
 def _files(output: Path, pattern: str) -> list[Path]:
-    """The files that fit ``pattern``, sorted; raises `TrainingError` if there are none, naming the existing files."""
+    """The files that fit ``pattern``, sorted; raises `TrainingError` if there are none, naming the
+    existing files."""
     files = sorted(path for path in output.glob(pattern) if path.is_file())
     if not files:
         existing = sorted(path for path in output.rglob("*") if path.is_file())
         raise TrainingError(
-            f"it left no {pattern} (densify.result); it wrote {_named(existing, output) if existing else 'no file'}"
+            f"it left no {pattern} (densify.result); it wrote "
+            f"{_named(existing, output) if existing else 'no file'}"
         )
     return files
 

@@ -1,4 +1,5 @@
-"""Running another program until it ends or its time limit passes, without leaving processes behind."""
+"""Running another program until it ends or its time limit passes, without leaving processes
+behind."""
 
 import subprocess
 import time
@@ -14,8 +15,10 @@ from gsbench.system.isolate import CrashError, describe_exit, error_tail, run_is
 from gsbench.system.resources import MIB, peak_child_mb
 from gsbench.words import readable_time
 
-SECONDS_BETWEEN_LOOKS = 0.5  # between two measurements of the memory of the program and its children
-FIRST_LOOK = 0.02  # seconds; pauses double up to SECONDS_BETWEEN_LOOKS, so that short programs are measured too
+# between two measurements of the memory of the program and its children
+SECONDS_BETWEEN_LOOKS = 0.5
+# seconds; pauses double up to SECONDS_BETWEEN_LOOKS, so that short programs are measured too
+FIRST_LOOK = 0.02
 
 
 @dataclass(frozen=True)
@@ -28,16 +31,24 @@ class ProgramResult:
 
 
 def run_program(
-    command: Sequence[str], log: Path, folder: Path, environment: Mapping[str, str], limit: float | None
+    command: Sequence[str],
+    log: Path,
+    folder: Path,
+    environment: Mapping[str, str],
+    limit: float | None,
 ) -> ProgramResult:
-    """Run ``command`` in ``folder`` with ``environment``, its output in the file ``log``; ``limit`` is in seconds.
+    """Run ``command`` in ``folder`` with ``environment``, its output in the file ``log``; ``limit``
+    is in seconds.
 
-    All processes that it started end with it, at the limit, and when gsbench ends for any reason; on Linux this
-    includes daemons. Raises `TrainingError`, with the last lines of the log, unless it succeeds within the limit.
+    All processes that it started end with it, at the limit, and when gsbench ends for any reason;
+    on Linux this includes daemons. Raises `TrainingError`, with the last lines of the log, unless
+    it succeeds within the limit.
     """
     name = Path(command[0]).name
     try:
-        ended = run_isolated(watch, list(command), folder, dict(environment), limit, what=name, log=log)
+        ended = run_isolated(
+            watch, list(command), folder, dict(environment), limit, what=name, log=log
+        )
     except CrashError as error:
         raise TrainingError(f"{error}; log: {log}") from error
     if ended.code == 0:
@@ -49,7 +60,9 @@ def run_program(
     raise TrainingError(f"{name} {what}; its last lines: {error_tail(log)}; log: {log}")
 
 
-def watch(command: Sequence[str], folder: Path, environment: Mapping[str, str], limit: float | None) -> ProgramResult:
+def watch(
+    command: Sequence[str], folder: Path, environment: Mapping[str, str], limit: float | None
+) -> ProgramResult:
     """Run ``command`` as a child of this process, which `run_isolated` started, and measure it.
 
     If the program is killed here, `run_isolated` ends the processes that it had started.

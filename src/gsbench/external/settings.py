@@ -1,7 +1,7 @@
 """The settings of another program that trains in place of gsbench.
 
-It is chosen in the group ``densify``, because an arm of a table is an initialiser and a densifier. A placeholder
-``{name}`` in its command is replaced when it runs. Loads no torch.
+It is chosen in the group ``densify``, because an arm of a table is an initialiser and a densifier.
+A placeholder ``{name}`` in its command is replaced when it runs. Loads no torch.
 """
 
 import os
@@ -23,30 +23,42 @@ from gsbench.words import did_you_mean
 
 # Placeholders of a command, in addition to the options of its YAML file.
 DATA = "data"  # folder of the training views: images/ and the COLMAP model sparse/0
-TEST_CAMERAS = "test_cameras"  # folder of the test views' cameras: transforms.json and the COLMAP model sparse/0
+# folder of the test views' cameras: transforms.json and the COLMAP model sparse/0
+TEST_CAMERAS = "test_cameras"
 OUTPUT = "output"  # empty folder, which is also the program's working folder
 PLACEHOLDERS = (DATA, TEST_CAMERAS, OUTPUT, "iterations", "seed", "device", "threads")
 FOLDERS = (DATA, TEST_CAMERAS, OUTPUT)  # absolute paths
 MODEL_SUFFIX = ".ply"
 
-Text = Annotated[str, MinLen(1), Predicate(lambda text: text != MISSING and bool(text.strip())), doc("a text")]
-CommandLine = Annotated[list[str] | str, doc("a list of words, or a text that is split as a shell would")]
+Text = Annotated[
+    str, MinLen(1), Predicate(lambda text: text != MISSING and bool(text.strip())), doc("a text")
+]
+CommandLine = Annotated[
+    list[str] | str, doc("a list of words, or a text that is split as a shell would")
+]
 PLACEHOLDER = re.compile(r"\{(\w+)\}")
 Command = str | Sequence[str]  # one text is split as a shell would, but no shell runs
 
 
 def split_command(command: Command, key: str) -> list[str]:
-    """A command's words. Raises InputError, naming the setting ``key``, for an empty command or open quotes."""
+    """A command's words. Raises InputError, naming the setting ``key``, for an empty command or
+    open quotes."""
     try:
-        words = shlex.split(command) if isinstance(command, str) else [str(word) for word in command]
+        words = (
+            shlex.split(command) if isinstance(command, str) else [str(word) for word in command]
+        )
     except ValueError as error:
-        raise InputError(f"{key} cannot be split into words ({error}): write it as a list") from error
+        raise InputError(
+            f"{key} cannot be split into words ({error}): write it as a list"
+        ) from error
     if not words or not words[0]:
         raise InputError(f"{key} is empty: name the program to run")
     return words
 
 
-def program_of(command: Command, options: Mapping[str, object], key: str = "densify.command") -> str:
+def program_of(
+    command: Command, options: Mapping[str, object], key: str = "densify.command"
+) -> str:
     """The program that the setting ``key`` runs: its first word, with ``options`` filled in."""
     return fill_placeholders(split_command(command, key)[0], options, key)
 
@@ -57,13 +69,17 @@ def placeholders_in(texts: Iterable[str]) -> set[str]:
 
 
 def fill_placeholders(text: str, values: Mapping[str, object], key: str) -> str:
-    """Replace every placeholder in ``text`` once. Raises InputError, naming ``key``, for an unknown placeholder."""
+    """Replace every placeholder in ``text`` once. Raises InputError, naming ``key``, for an unknown
+    placeholder."""
 
     def value(match: re.Match[str]) -> str:
         name = match[1]
         if name not in values:
             names = ", ".join(f"{{{known}}}" for known in values)
-            raise InputError(f"{key}: nothing is known as {{{name}}}{did_you_mean(name, values)} (there are {names})")
+            raise InputError(
+                f"{key}: nothing is known as {{{name}}}{did_you_mean(name, values)} (there are "
+                f"{names})"
+            )
         return str(values[name])
 
     return PLACEHOLDER.sub(value, text)
@@ -79,39 +95,47 @@ def check_pattern(pattern: str) -> None:
         or PureWindowsPath(pattern).drive
         or {"..", "\0"} & {*parts, *pattern}
     ):
-        raise InputError(f"{key}: give a pattern of files below the program's output folder, such as point_cloud/*.ply")
+        raise InputError(
+            f"{key}: give a pattern of files below the program's output folder, such as "
+            "point_cloud/*.ply"
+        )
     try:
         with TemporaryDirectory() as empty:
             list(Path(empty).glob(pattern))
     except (ValueError, NotImplementedError, IndexError, OSError, RecursionError) as error:
         raise InputError(
-            f"{key} is not a pattern of files ({error}): ** stands for folders, so it is a part of its own"
+            f"{key} is not a pattern of files ({error}): ** stands for folders, so it is a part "
+            "of its own"
         ) from None
 
 
 @dataclass(frozen=True, kw_only=True)
 class External:
-    """A program that trains on a folder of training views and writes a model, or renders of the test views.
+    """A program that trains on a folder of training views and writes a model, or renders of the
+    test views.
 
-    ``command`` runs without a shell. ``{data}``, ``{output}``, the other `PLACEHOLDERS` and the names of ``options``
-    are replaced in ``command``, ``result`` and ``environment``. ``result`` is a pattern below the output folder: of one
-    3DGS PLY, or of pictures of the test views, which are matched by name or ``by_order``. ``version`` is the program's
-    version, which is part of the key of its results. The output of ``version_command`` must contain it.
+    ``command`` runs without a shell. ``{data}``, ``{output}``, the other `PLACEHOLDERS` and the
+    names of ``options`` are replaced in ``command``, ``result`` and ``environment``. ``result`` is
+    a pattern below the output folder: of one 3DGS PLY, or of pictures of the test views, which are
+    matched by name or ``by_order``. ``version`` is the program's version, which is part of the key
+    of its results. The output of ``version_command`` must contain it.
 
     Examples:
         A program ``train.py`` that writes ``point_cloud.ply``:
 
         >>> trainer = External(
-        ...     command="python train.py --data {data} --out {output} --steps {iterations} --rate {rate}",
+        ...     command="python train.py --data {data} --to {output} -n {iterations} --lr {lr}",
         ...     result="point_cloud.ply",
         ...     version="1.2",
-        ...     options={"rate": 0.01},
+        ...     options={"lr": 0.01},
         ... )
         >>> trainer.program, trainer.leaves_model
         ('python', True)
-        >>> External(command="python train.py", result="*.png", version="1.2")
+        >>> External(
+        ...     command="python train.py", result="*.png", version="1.2"
+        ... )  # doctest: +ELLIPSIS
         Traceback (most recent call last):
-        gsbench.errors.InputError: densify.command has no {data}: the folder that the program is to train on
+        gsbench.errors.InputError: densify.command has no {data}: the folder that ...
     """
 
     command: CommandLine
@@ -121,16 +145,22 @@ class External:
     options: dict[str, Any] = field(default_factory=dict)
     environment: dict[str, str] = field(default_factory=dict)  # additional environment variables
     by_order: bool = False
-    time_limit_minutes: PositiveFloat | None = None  # after it, the program is ended and the trial fails
+    # after it, the program is ended and the trial fails
+    time_limit_minutes: PositiveFloat | None = None
 
     def __post_init__(self) -> None:
         check_settings(self, "densify")
         for name, value in self.options.items():
             if value == MISSING:
                 raise InputError(f"densify.options.{name} is not set: give it a value")
-            if not str(name).isidentifier() or name in PLACEHOLDERS or isinstance(value, Mapping | list):
+            if (
+                not str(name).isidentifier()
+                or name in PLACEHOLDERS
+                or isinstance(value, Mapping | list)
+            ):
                 raise InputError(
-                    f"densify.options.{name}: an option is one value with a name of its own, none of "
+                    f"densify.options.{name}: an option is one value with a name of its own, none "
+                    "of "
                     f"{', '.join(PLACEHOLDERS)}"
                 )
         check_pattern(
@@ -144,7 +174,9 @@ class External:
         for key, text in [("command", word) for word in self.words] + [("result", self.result)]:
             fill_placeholders(text, known, f"densify.{key}")
         if not placeholders_in(self.words) & {DATA}:
-            raise InputError("densify.command has no {data}: the folder that the program is to train on")
+            raise InputError(
+                "densify.command has no {data}: the folder that the program is to train on"
+            )
 
     @property
     def words(self) -> list[str]:
@@ -171,7 +203,8 @@ class External:
         program_path = shutil.which(Path(self.program).expanduser(), path=path)
         if program_path is None:
             raise InputError(
-                f"densify.command: this machine has no program {self.program!r}: install it (docs/other_trainers.md "
+                f"densify.command: this machine has no program {self.program!r}: install it "
+                "(docs/other_trainers.md "
                 "says how), or give its path"
             )
         return str(Path(program_path).absolute())

@@ -9,23 +9,32 @@ from gsbench.errors import InputError
 from gsbench.gaussians.model import NUM_SH_REST, Gaussians, rgb_to_dc
 
 NEIGHBOURS = 3
-MIN_SQUARED_DISTANCE = 1e-7  # world units^2; lower limit of the mean squared distance to the neighbours, as in 3DGS
+# world units^2; lower limit of the mean squared distance to the neighbours, as in 3DGS
+MIN_SQUARED_DISTANCE = 1e-7
 INITIAL_OPACITY = 0.1
 
 
 def gaussians_from_cloud(
     points: NDArray[np.float64], colors: NDArray[np.uint8], device: torch.device | str = "cpu"
 ) -> Gaussians:
-    """Make one isotropic Gaussian at each of ``points`` [P, 3] with ``colors`` [P, 3] (0 to 255), float32.
+    """Make one isotropic Gaussian at each of ``points`` [P, 3] with ``colors`` [P, 3] (0 to 255),
+    float32.
 
-    The standard deviation is the root of the mean *squared* distance to the 3 nearest other points (simple-knn of
-    3DGS). Raises InputError if there are fewer than 4 points or points that are not finite.
+    The standard deviation is the root of the mean *squared* distance to the 3 nearest other points
+    (simple-knn of 3DGS). Raises InputError if there are fewer than 4 points or points that are not
+    finite.
     """
     if len(points) <= NEIGHBOURS:
-        raise InputError(f"the initial cloud has {len(points)} points, at least {NEIGHBOURS + 1} are needed")
+        raise InputError(
+            f"the initial cloud has {len(points)} points, at least {NEIGHBOURS + 1} are needed"
+        )
     if not np.isfinite(points).all():
-        raise InputError("the initial cloud has points that are not finite; rebuild it or clean the COLMAP model")
-    distances, _ = cKDTree(points).query(points, k=NEIGHBOURS + 1)  # [P, 4], the first is the point itself
+        raise InputError(
+            "the initial cloud has points that are not finite; rebuild it or clean the COLMAP model"
+        )
+    distances, _ = cKDTree(points).query(
+        points, k=NEIGHBOURS + 1
+    )  # [P, 4], the first is the point itself
     squared = np.maximum((distances[:, 1:] ** 2).mean(axis=1), MIN_SQUARED_DISTANCE)  # [P]
     n = len(points)
     log_scales = torch.from_numpy(0.5 * np.log(squared)).float()

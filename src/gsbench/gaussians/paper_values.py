@@ -1,4 +1,5 @@
-"""Values from papers and their code that several packages use as defaults. Does not import torch."""
+"""Values from papers and their code that several packages use as defaults. Does not import
+torch."""
 
 import math
 from dataclasses import dataclass
@@ -10,11 +11,13 @@ VOLUME_THRESHOLD = 0.03  # V_th of the paper, in the units of its COLMAP models,
 
 @dataclass
 class LearningRates:
-    """Adam's learning rates; the defaults are those of the 2023 code of 3DGS (late-2024 code: 0.025 for opacity)."""
+    """Adam's learning rates; the defaults are those of the 2023 code of 3DGS (late-2024 code: 0.025
+    for opacity)."""
 
     position_initial: PositiveFloat = 1.6e-4  # times the scene extent
     position_final: PositiveFloat = 1.6e-6  # times the scene extent
-    position_steps: PositiveInt = 30_000  # the position rate falls log-linearly over so many iterations
+    # the position rate falls log-linearly over so many iterations
+    position_steps: PositiveInt = 30_000
     sh_dc: PositiveFloat = 2.5e-3
     sh_rest: PositiveFloat = 2.5e-3 / 20
     opacity: PositiveFloat = 0.05
@@ -22,6 +25,9 @@ class LearningRates:
     rotation: PositiveFloat = 1e-3
 
     def position(self, step: float) -> float:
-        """The learning rate of the means at iteration ``step``, before multiplication by the scene extent."""
+        """The learning rate of the means at iteration ``step``, before multiplication by the scene
+        extent."""
         t = min(max(step / self.position_steps, 0.0), 1.0)
-        return math.exp((1 - t) * math.log(self.position_initial) + t * math.log(self.position_final))
+        return math.exp(
+            (1 - t) * math.log(self.position_initial) + t * math.log(self.position_final)
+        )

@@ -21,7 +21,8 @@ from gsbench.words import counted
 
 log = logging.getLogger(__name__)
 
-NUM_REST = 3 * NUM_SH_REST  # f_rest is stored channel by channel: 15 of red, 15 of green, 15 of blue
+# f_rest is stored channel by channel: 15 of red, 15 of green, 15 of blue
+NUM_REST = 3 * NUM_SH_REST
 POSITION = ["x", "y", "z"]
 COLUMNS = (
     [*POSITION, "nx", "ny", "nz"]
@@ -34,19 +35,31 @@ COLUMNS = (
 
 REST = "f_rest_"
 REST_COUNTS = tuple(3 * ((degree + 1) ** 2 - 1) for degree in range(MAX_SH_DEGREE + 1))
-# The logit that stands for an opacity of 1, and with a minus for 0: float32's nearest to 1 that still has a gradient.
+# The logit that stands for an opacity of 1, and with a minus for 0: float32's nearest to 1 that
+# still has a gradient.
 MAX_LOGIT = 23 * math.log(2)  # 1 - 2^-23
 TYPICAL_SCALE = 0.02  # of a model's size: the median of Gaussians trained here is .009 to .035
 MIN_TEXT_BYTES = 2  # bytes of a value in an ASCII file, at least: a digit and a space
-SIZES = {"short": 2, "ushort": 2, "int16": 2, "uint16": 2, "int": 4, "uint": 4, "int32": 4, "uint32": 4}
+SIZES = {
+    "short": 2,
+    "ushort": 2,
+    "int16": 2,
+    "uint16": 2,
+    "int": 4,
+    "uint": 4,
+    "int32": 4,
+    "uint32": 4,
+}
 SIZES |= {"float": 4, "float32": 4, "double": 8, "float64": 8}  # bytes; all other types have 1
 
 
 def write_ply(gaussians: Gaussians, path: Path, normalization: Normalization = IDENTITY) -> None:
-    """Write raw parameters as binary little-endian float32 in 3DGS's column order, with zero normals; atomic.
+    """Write raw parameters as binary little-endian float32 in 3DGS's column order, with zero
+    normals; atomic.
 
-    ``normalization`` is undone. Positions far from the origin are written as float64, because float32 has steps of half
-    a unit at UTM coordinates. Others stay float32, which every viewer reads.
+    ``normalization`` is undone. Positions far from the origin are written as float64, because
+    float32 has steps of half a unit at UTM coordinates. Others stay float32, which every viewer
+    reads.
     """
     raw = gaussians.detach().map(lambda tensor: tensor.float().cpu())
     table = torch.cat(
@@ -61,10 +74,16 @@ def write_ply(gaussians: Gaussians, path: Path, normalization: Normalization = I
         ],
         dim=1,
     ).numpy()  # [N, 62]
-    vertices = np.ascontiguousarray(table, dtype="<f4").view([(name, "<f4") for name in COLUMNS]).reshape(len(raw))
+    vertices = (
+        np.ascontiguousarray(table, dtype="<f4")
+        .view([(name, "<f4") for name in COLUMNS])
+        .reshape(len(raw))
+    )
     if not normalization.is_identity:
         position_type = "<f8" if normalization.is_far else "<f4"
-        vertices = vertices.astype([(name, position_type if name in POSITION else "<f4") for name in COLUMNS])
+        vertices = vertices.astype(
+            [(name, position_type if name in POSITION else "<f4") for name in COLUMNS]
+        )
         own = normalization.undo(raw.means.numpy())  # [N, 3]
         for axis, name in enumerate(POSITION):
             vertices[name] = own[:, axis]
@@ -73,24 +92,35 @@ def write_ply(gaussians: Gaussians, path: Path, normalization: Normalization = I
 
 
 def check_ply(path: Path) -> None:
-    """Raise InputError if a file cannot be a PLY of Gaussians, judged only by its header and length."""
+    """Raise InputError if a file cannot be a PLY of Gaussians, judged only by its header and
+    length."""
     with _checked(path):
         pass
 
 
 @contextmanager
 def _checked(path: Path) -> Iterator[None]:
-    """Check the length of a file; turn every error that damage can cause into an InputError that names the file."""
+    """Check the length of a file; turn every error that damage can cause into an InputError that
+    names the file."""
     try:
         _check_length(path)
         yield
-    except (OSError, LookupError, PlyParseError, ValueError, TypeError, OverflowError, MemoryError) as error:
+    except (
+        OSError,
+        LookupError,
+        PlyParseError,
+        ValueError,
+        TypeError,
+        OverflowError,
+        MemoryError,
+    ) as error:
         raise InputError(f"{path}: not a readable PLY of Gaussians ({error})") from error
 
 
 def _check_length(path: Path) -> None:
     """Raise ValueError if the header announces more data than the file can hold."""
-    # plyfile allocates what the header announces before it reads: a false count could fill the memory.
+    # plyfile allocates what the header announces before it reads: a false count could fill the
+    # memory.
     require_regular(path)
     header = read_header(path)
     is_text = b"format ascii" in header
@@ -108,7 +138,8 @@ def _check_length(path: Path) -> None:
 
 
 def _with_finite_opacities(vertices: NDArray[Any], path: Path) -> NDArray[Any]:
-    """Replace infinite logits, which are opacities of exactly 0 and 1 in other programs, by `MAX_LOGIT`."""
+    """Replace infinite logits, which are opacities of exactly 0 and 1 in other programs, by
+    `MAX_LOGIT`."""
     logits = vertices["opacity"]
     infinite = np.isinf(logits) if logits.dtype.kind == "f" else np.zeros(len(logits), bool)
     if not infinite.any():
@@ -125,12 +156,15 @@ def _have(count: int) -> str:
 
 def _check_finite(column: NDArray[Any], name: str, path: Path) -> None:
     if column.dtype.kind not in "fiu":
-        raise InputError(f"{path}: {name} is not a finite number everywhere: export the model again")
+        raise InputError(
+            f"{path}: {name} is not a finite number everywhere: export the model again"
+        )
     with np.errstate(over="ignore"):  # float64 may lie beyond float32
         (bad,) = np.nonzero(~np.isfinite(column.astype(np.float32)))
     if len(bad):
         raise InputError(
-            f"{path}: {name} is not a finite number everywhere: it is {column[bad[0]]} in row {bad[0]} and in "
+            f"{path}: {name} is not a finite number everywhere: it is {column[bad[0]]} in row "
+            f"{bad[0]} and in "
             f"{len(bad) - 1} more: export the model again"
         )
 
@@ -138,10 +172,18 @@ def _check_finite(column: NDArray[Any], name: str, path: Path) -> None:
 def _warn_of_activated(vertices: NDArray[Any], path: Path) -> None:
     """Warn of values that look as if they were stored after 3DGS's activations, exp and sigmoid."""
     if _look_like_lengths(vertices):
-        log.warning("%s: all scales are positive: they look like lengths, where 3DGS stores their logarithms", path)
+        log.warning(
+            "%s: all scales are positive: they look like lengths, where 3DGS stores their "
+            "logarithms",
+            path,
+        )
     opacity = vertices["opacity"]
     if ((opacity >= 0) & (opacity <= 1)).all():
-        log.warning("%s: all opacities lie in [0, 1]: they look like opacities, where 3DGS stores their logits", path)
+        log.warning(
+            "%s: all opacities lie in [0, 1]: they look like opacities, where 3DGS stores their "
+            "logits",
+            path,
+        )
 
 
 def _look_like_lengths(vertices: NDArray[Any]) -> bool:
@@ -161,7 +203,9 @@ def _look_like_lengths(vertices: NDArray[Any]) -> bool:
     return abs(math.log(scale) - typical) < abs(scale - typical)
 
 
-def read_ply(path: Path, device: torch.device | str = "cpu", normalization: Normalization = IDENTITY) -> Gaussians:
+def read_ply(
+    path: Path, device: torch.device | str = "cpu", normalization: Normalization = IDENTITY
+) -> Gaussians:
     """Read a 3DGS PLY of SH degree 0 to 3 as float32; coefficients above its degree become zero.
 
     ``normalization`` is applied to positions, before they become float32, and to scales.
@@ -177,8 +221,10 @@ def read_ply(path: Path, device: torch.device | str = "cpu", normalization: Norm
     missing = [name for name in required if name not in present]
     if present_rest != set(rest) or len(rest) not in REST_COUNTS:
         raise InputError(
-            f"{path}: not a 3DGS PLY; its harmonics must be f_rest_0 to 8, to 23 or to 44 (degree 1 to 3), or none; "
-            f"it has {len(rest)}" + (f", with {min(present_rest - set(rest))}" if present_rest != set(rest) else "")
+            f"{path}: not a 3DGS PLY; its harmonics must be f_rest_0 to 8, to 23 or to 44 (degree "
+            "1 to 3), or none; "
+            f"it has {len(rest)}"
+            + (f", with {min(present_rest - set(rest))}" if present_rest != set(rest) else "")
         )
     if missing or len(vertices) == 0:
         listed = ", ".join(missing) or "all, since it is empty"
@@ -189,12 +235,16 @@ def read_ply(path: Path, device: torch.device | str = "cpu", normalization: Norm
     for name in (*required, *rest):
         _check_finite(vertices[name], name, path)
     if not np.any([vertices[f"rot_{i}"] != 0 for i in range(4)], axis=0).all():
-        raise InputError(f"{path}: a Gaussian has a rotation of (0, 0, 0, 0): export the model again")
+        raise InputError(
+            f"{path}: a Gaussian has a rotation of (0, 0, 0, 0): export the model again"
+        )
 
     _warn_of_activated(vertices, path)
 
     def columns(names: list[str]) -> torch.Tensor:
-        return torch.from_numpy(np.stack([vertices[name].astype(np.float32) for name in names], axis=1)).to(device)
+        return torch.from_numpy(
+            np.stack([vertices[name].astype(np.float32) for name in names], axis=1)
+        ).to(device)
 
     positions = np.stack([vertices[name] for name in POSITION], axis=1)  # [N, 3]
     n, stored = len(vertices), len(rest) // 3  # coefficients per channel

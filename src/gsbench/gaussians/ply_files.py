@@ -1,4 +1,5 @@
-"""Opening PLY files as other programs write them, and naming the formats of Gaussians that are no plain PLY."""
+"""Opening PLY files as other programs write them, and naming the formats of Gaussians that are no
+plain PLY."""
 
 import codecs
 import io
@@ -10,19 +11,24 @@ from plyfile import PlyData
 MAX_HEADER = 1 << 16  # bytes
 END = b"end_header"
 NOT_ASCII = re.compile(rb"[^\x00-\x7f]")
-# Formats that are not PLY, by the first bytes of a file. Sources: Niantic's repository "spz" (gzip until version 3,
-# then the magic number itself); PlayCanvas's page on SOG (a ZIP archive, or meta.json beside WebP images).
+# Formats that are not PLY, by the first bytes of a file. Sources: Niantic's repository "spz" (gzip
+# until version 3, then the magic number itself); PlayCanvas's page on SOG (a ZIP archive, or
+# meta.json beside WebP images).
 MAGIC = {b"\x1f\x8b": "SPZ", b"NGSP": "SPZ", b"PK\x03\x04": "SOG", b"{": "SOG"}
-SUFFIXES = {".splat": "splat", ".ksplat": "ksplat", ".spz": "SPZ", ".sog": "SOG"}  # the first two have no magic number
+# the first two have no magic number
+SUFFIXES = {".splat": "splat", ".ksplat": "ksplat", ".spz": "SPZ", ".sog": "SOG"}
 
 
 def read_header(path: Path) -> bytes:
-    """The header of a PLY file without its last line; raises ValueError, naming the format, for any other file."""
+    """The header of a PLY file without its last line; raises ValueError, naming the format, for any
+    other file."""
     with path.open("rb") as stream:
         start = stream.read(MAX_HEADER)
     start = start.removeprefix(codecs.BOM_UTF8)
     if not start.startswith(b"ply"):
-        found = SUFFIXES.get(path.suffix.lower()) or next((MAGIC[key] for key in MAGIC if start.startswith(key)), None)
+        found = SUFFIXES.get(path.suffix.lower()) or next(
+            (MAGIC[key] for key in MAGIC if start.startswith(key)), None
+        )
         if found is not None:
             raise ValueError(f"it is in the format {found}: {_how_to_unpack(path)}")
     header, end, _ = start.partition(END)
@@ -40,7 +46,8 @@ def _how_to_unpack(path: Path) -> str:
 def read_ply_data(path: Path) -> PlyData:
     """The content of a PLY file; raises ValueError as `read_header` does, and plyfile's errors.
 
-    Comments may have characters beyond ASCII, and the file a byte order mark, which plyfile refuses.
+    Comments may have characters beyond ASCII, and the file a byte order mark, which plyfile
+    refuses.
     """
     header = read_header(path)
     with path.open("rb") as stream:

@@ -19,7 +19,8 @@ ADAM_EPSILON = 1e-15  # 3DGS
 
 @dataclass
 class AdamState:
-    """Adam's state of one parameter: learning rate, number of steps, and both moments in the parameter's shape."""
+    """Adam's state of one parameter: learning rate, number of steps, and both moments in the
+    parameter's shape."""
 
     rate: float
     step: Tensor  # [] float32: torch's fused kernel needs a tensor
@@ -30,11 +31,12 @@ class AdamState:
 class TrainableGaussians:
     """Raw parameters as leaves of the autograd graph, each with its Adam state.
 
-    ``edit`` adds and removes Gaussians, and ``overwrite`` sets values; both change parameters and moments together. As
-    in 3DGS, an edited parameter is a new leaf without gradient, so the optimiser step of that iteration skips it.
+    ``edit`` adds and removes Gaussians, and ``overwrite`` sets values; both change parameters and
+    moments together. As in 3DGS, an edited parameter is a new leaf without gradient, so the
+    optimiser step of that iteration skips it.
 
-    `torch.optim.Adam` is not used, because the first object of that class imports torch's compiler, which takes 1.5
-    CPU-seconds in each process. The function `adam` does the same arithmetic.
+    `torch.optim.Adam` is not used, because the first object of that class imports torch's compiler,
+    which takes 1.5 CPU-seconds in each process. The function `adam` does the same arithmetic.
     """
 
     def __init__(self, gaussians: Gaussians, rates: LearningRates, spatial_scale: float) -> None:
@@ -77,17 +79,19 @@ class TrainableGaussians:
         self.adam["means"].rate = self.rates.position(step) * self.spatial_scale
 
     def set_rate(self, name: str, rate: float) -> None:
-        """Set the learning rate of the parameter ``name``. For the means, `set_step` replaces it in each iteration."""
+        """Set the learning rate of the parameter ``name``. For the means, `set_step` replaces it in
+        each iteration."""
         self.adam[name].rate = rate
 
     @torch.no_grad()
     def optimizer_step(self, sh_degree: int = MAX_SH_DEGREE, visible: Tensor | None = None) -> None:
         """Apply Adam to every parameter that has a gradient, then clear the gradients.
 
-        With the mask ``visible`` [N], only visible Gaussians and their moments are updated. This departs from 3DGS,
-        where momentum also moves the others.
+        With the mask ``visible`` [N], only visible Gaussians and their moments are updated. This
+        departs from 3DGS, where momentum also moves the others.
         """
-        # At degree 0 the gradient of sh_rest is zero, so its moments stay zero: Adam would only count the step.
+        # At degree 0 the gradient of sh_rest is zero, so its moments stay zero: Adam would only
+        # count the step.
         if sh_degree == 0 and self.values.means.grad is not None:
             self.values.sh_rest.grad = None
             self.adam["sh_rest"].step += 1
@@ -103,32 +107,42 @@ class TrainableGaussians:
 
     @torch.no_grad()
     def edit(self, keep: Tensor | None = None, append: Gaussians | None = None) -> None:
-        """Keep the Gaussians at the boolean mask ``keep`` [N] (None: all), then append new ones with zero moments."""
+        """Keep the Gaussians at the boolean mask ``keep`` [N] (None: all), then append new ones
+        with zero moments."""
         for name, old in self.values.tensors().items():
             added = None if append is None else getattr(append, name).detach()
             self._replace(name, _edited(old.detach(), keep, added), keep, added)
 
     @torch.no_grad()
     def overwrite(self, name: str, values: Tensor, where: Tensor | None = None) -> None:
-        """Set the parameter ``name`` to ``values`` of the same shape. Zero its moments at the mask ``where`` [N] (None:
-        all)."""
+        """Set the parameter ``name`` to ``values`` of the same shape. Zero its moments at the mask
+        ``where`` [N] (None: all)."""
         parameter = getattr(self.values, name)
         if values.shape != parameter.shape:
-            raise ValueError(f"overwrite: {name} has shape {tuple(parameter.shape)}, got {tuple(values.shape)}")
+            raise ValueError(
+                f"overwrite: {name} has shape {tuple(parameter.shape)}, got {tuple(values.shape)}"
+            )
         self._replace(name, values.detach().clone())
         state = self.adam[name]
         for moment in (state.first, state.second):
             moment[... if where is None else where] = 0
 
-    def _replace(self, name: str, values: Tensor, keep: Tensor | None = None, added: Tensor | None = None) -> None:
-        """Replace the parameter ``name`` by ``values``, and edit its moments alike; the step count stays."""
+    def _replace(
+        self, name: str, values: Tensor, keep: Tensor | None = None, added: Tensor | None = None
+    ) -> None:
+        """Replace the parameter ``name`` by ``values``, and edit its moments alike; the step count
+        stays."""
         state = self.adam[name]
         zeros = None if added is None else torch.zeros_like(added)
-        state.first, state.second = _edited(state.first, keep, zeros), _edited(state.second, keep, zeros)
+        state.first, state.second = (
+            _edited(state.first, keep, zeros),
+            _edited(state.second, keep, zeros),
+        )
         setattr(self.values, name, values.contiguous().requires_grad_(True))
 
     def state_dict(self) -> dict[str, object]:
-        """Return the state for a checkpoint. It shares memory with this object: save it before the next step."""
+        """Return the state for a checkpoint. It shares memory with this object: save it before the
+        next step."""
         return {
             "gaussians": {name: tensor.detach() for name, tensor in self.values.tensors().items()},
             "adam": {name: vars(state).copy() for name, state in self.adam.items()},
@@ -136,20 +150,28 @@ class TrainableGaussians:
 
     @classmethod
     def load(
-        cls, state: dict[str, Any], rates: LearningRates, spatial_scale: float, device: torch.device | None = None
+        cls,
+        state: dict[str, Any],
+        rates: LearningRates,
+        spatial_scale: float,
+        device: torch.device | None = None,
     ) -> TrainableGaussians:
-        """Make an object from a copy of ``state_dict``, on ``device`` (None: the device of the state)."""
+        """Make an object from a copy of ``state_dict``, on ``device`` (None: the device of the
+        state)."""
         gaussians = Gaussians(**state["gaussians"]).map(lambda tensor: tensor.to(device))
         trainable = cls(gaussians, rates, spatial_scale)
         for name, saved in state["adam"].items():
             copied = copy.deepcopy(saved)
-            moved = {key: value.to(device) for key, value in copied.items() if isinstance(value, Tensor)}
+            moved = {
+                key: value.to(device) for key, value in copied.items() if isinstance(value, Tensor)
+            }
             trainable.adam[name] = AdamState(**copied | moved)
         return trainable
 
 
 def _step_all(parameter: Tensor, state: AdamState) -> None:
-    """Apply Adam (Kingma and Ba 2015) to a whole parameter, by torch's fused kernel on CPU and CUDA."""
+    """Apply Adam (Kingma and Ba 2015) to a whole parameter, by torch's fused kernel on CPU and
+    CUDA."""
     assert parameter.grad is not None
     adam(
         [parameter],

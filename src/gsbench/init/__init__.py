@@ -1,4 +1,5 @@
-"""Initialisers, which make a COLMAP model with cameras and an initial point cloud from a capture."""
+"""Initialisers, which make a COLMAP model with cameras and an initial point cloud from a
+capture."""
 
 from gsbench.init.base import MODEL_FOLDER, read_cloud
 from gsbench.init.dim import Dim, SiftKornia
@@ -6,6 +7,16 @@ from gsbench.init.placed import Carved, Dataset, Ply, Points, Random
 from gsbench.init.sfm import Jittered, Sfm, SfmDense
 
 __all__ = [
-    "MODEL_FOLDER", "Carved", "Dataset", "Dim", "Jittered", "Ply", "Points", "Random", "Sfm", "SfmDense", "SiftKornia",
+    "MODEL_FOLDER",
+    "Carved",
+    "Dataset",
+    "Dim",
+    "Jittered",
+    "Ply",
+    "Points",
+    "Random",
+    "Sfm",
+    "SfmDense",
+    "SiftKornia",
     "read_cloud",
-]  # fmt: skip
+]

@@ -16,8 +16,10 @@ from numpy.typing import NDArray
 from gsbench.logs import Progress, no_progress
 from gsbench.scene.types import Capture
 
-MODEL_FOLDER = Path("sparse", "0")  # below the output folder: where COLMAP users and 3DGS trainers look for a model
-OWN_GAUGE_FOLDER = Path("sparse_own_gauge", "0")  # the same model in the mapper's gauge, before alignment
+# below the output folder: where COLMAP users and 3DGS trainers look for a model
+MODEL_FOLDER = Path("sparse", "0")
+# the same model in the mapper's gauge, before alignment
+OWN_GAUGE_FOLDER = Path("sparse_own_gauge", "0")
 WORK_FOLDER = "work"  # below the output folder, during a run
 REPORT_FILE = "report.json"
 GAUSSIANS_FILE = "gaussians.ply"  # only if training starts from given Gaussians instead of points
@@ -54,9 +56,14 @@ class PointCloud:
 
     def __post_init__(self) -> None:
         if self.points.ndim != 2 or self.points.shape[1] != 3 or self.points.dtype != np.float64:
-            raise ValueError(f"points must be [P, 3] float64, got {self.points.shape} {self.points.dtype}")
+            raise ValueError(
+                f"points must be [P, 3] float64, got {self.points.shape} {self.points.dtype}"
+            )
         if self.colors.shape != self.points.shape or self.colors.dtype != np.uint8:
-            raise ValueError(f"colors must be {self.points.shape} uint8, got {self.colors.shape} {self.colors.dtype}")
+            raise ValueError(
+                f"colors must be {self.points.shape} uint8, got {self.colors.shape} "
+                f"{self.colors.dtype}"
+            )
 
     def __len__(self) -> int:
         return len(self.points)
@@ -76,8 +83,8 @@ def read_cloud(model_dir: Path) -> PointCloud:
 class PoseErrors:
     """Errors of camera poses against a reference, after alignment by a similarity.
 
-    Centres are in reference units, rotations in degrees. ``exact`` says that the reference is the truth, not another
-    estimate. The ``_relative`` value is divided by the reference's scene extent.
+    Centres are in reference units, rotations in degrees. ``exact`` says that the reference is the
+    truth, not another estimate. The ``_relative`` value is divided by the reference's scene extent.
     """
 
     num_images: int
@@ -94,13 +101,16 @@ class PoseErrors:
 class Gauge:
     """The meaning of the volume threshold V_th in the unit of length of one model.
 
-    COLMAP models have an arbitrary scale, so one threshold selects different Gaussians in two models of a scene.
+    COLMAP models have an arbitrary scale, so one threshold selects different Gaussians in two
+    models of a scene.
     """
 
     scene_extent: float  # 3DGS's cameras_extent of the training cameras, in the model's units
-    scale_to_reference: float | None  # reference units per unit of the model; None without a reference
+    # reference units per unit of the model; None without a reference
+    scale_to_reference: float | None
     volume_threshold: float  # the paper's V_th
-    threshold_over_extent_cubed: float | None  # V_th / extent³, comparable between gauges; None if the extent is 0
+    # V_th / extent³, comparable between gauges; None if the extent is 0
+    threshold_over_extent_cubed: float | None
     threshold_radius: float  # radius of the sphere of volume V_th, in the model's units
     threshold_radius_over_extent: float | None
     threshold_in_reference: float | None  # V_th as a volume in reference units
@@ -110,8 +120,9 @@ class Gauge:
 class TrainingPoints:
     """Record of a cloud made from the training views alone (``init.points_from``).
 
-    ``removed`` is the share of the ``total`` points of all views that was dropped, negative if points were added. Both
-    are None if test photographs were never matched, so that the total is unknown.
+    ``removed`` is the share of the ``total`` points of all views that was dropped, negative if
+    points were added. Both are None if test photographs were never matched, so that the total is
+    unknown.
     """
 
     choice: PointsFrom
@@ -137,11 +148,15 @@ class InitReport:
     seconds: Mapping[str, float]
     settings: Mapping[str, Any]
     versions: Mapping[str, str]
-    own_gauge: Gauge | None = None  # of the model before its alignment to the reference; None if it was not aligned
-    pose_errors: PoseErrors | None = None  # None without a reference, or if the poses are those of the reference
+    # of the model before its alignment to the reference; None if it was not aligned
+    own_gauge: Gauge | None = None
+    # None without a reference, or if the poses are those of the reference
+    pose_errors: PoseErrors | None = None
     warnings: tuple[str, ...] = ()
-    counts: Mapping[str, int] = field(default_factory=dict)  # features, pairs, verified pairs, inlier matches
-    mapped_by: str | None = None  # the mapping strategy that placed the cameras (init.mapper); None if they were given
+    # features, pairs, verified pairs, inlier matches
+    counts: Mapping[str, int] = field(default_factory=dict)
+    # the mapping strategy that placed the cameras (init.mapper); None if they were given
+    mapped_by: str | None = None
     training_points: TrainingPoints | None = None  # None if all views contributed points
 
     def to_dict(self) -> dict[str, Any]:
@@ -160,10 +175,12 @@ class Preparation:
 
 
 class Initializer(ABC):
-    """Makes cameras and an initial point cloud for a capture. Subclasses are dataclasses whose fields are the settings.
+    """Makes cameras and an initial point cloud for a capture. Subclasses are dataclasses whose
+    fields are the settings.
 
     Examples:
-        If only the points are new, derive from `PlacedCloud`. Its ``run`` adds cameras, report and picture.
+        If only the points are new, derive from `PlacedCloud`. Its ``run`` adds cameras, report and
+        picture.
 
         >>> from gsbench.init.placed import PlacedCloud
         >>> @dataclass(frozen=True, kw_only=True)
@@ -184,10 +201,12 @@ class Initializer(ABC):
     """
 
     name: ClassVar[str]  # the name in reports
-    random_points: ClassVar[bool] = False  # places and colours are drawn at random, so they need not fit photographs
+    # places and colours are drawn at random, so they need not fit photographs
+    random_points: ClassVar[bool] = False
 
     def needs_reference(self, capture: Capture) -> bool:
-        """Return whether `run` needs a ``reference`` model for this capture because it came without cameras."""
+        """Return whether `run` needs a ``reference`` model for this capture because it came without
+        cameras."""
         return False
 
     def content(self) -> str | None:
@@ -203,9 +222,11 @@ class Initializer(ABC):
         reference: Path | None = None,
         work_dir: Path | None = None,
     ) -> InitReport:
-        """Write the model to `MODEL_FOLDER`, the report to `REPORT_FILE` and a picture to `PICTURE_FILE`.
+        """Write the model to `MODEL_FOLDER`, the report to `REPORT_FILE` and a picture to
+        `PICTURE_FILE`.
 
-        All are below ``output_dir``. The cameras have the sizes of the files in ``capture.images``. ``reference`` is a
-        COLMAP model of the same files whose cameras replace those of the capture. ``work_dir`` may keep files that a
-        later run can reuse. Raises ``InputError`` if no model can be made from the capture.
+        All are below ``output_dir``. The cameras have the sizes of the files in ``capture.images``.
+        ``reference`` is a COLMAP model of the same files whose cameras replace those of the
+        capture. ``work_dir`` may keep files that a later run can reuse. Raises ``InputError`` if no
+        model can be made from the capture.
         """

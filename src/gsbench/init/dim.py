@@ -1,4 +1,5 @@
-"""Deep image matching: features and matches from networks, geometry from COLMAP. kornia's SIFT takes the same path.
+"""Deep image matching: features and matches from networks, geometry from COLMAP. kornia's SIFT
+takes the same path.
 
 The tables below list the weights files of the extractors and of LightGlue.
 """
@@ -35,16 +36,23 @@ SUPERPOINT_LICENCE = "Magic Leap: academic or non-profit noncommercial research 
 
 EXTRACTOR_WEIGHTS = {
     "superpoint": WeightsFile(
-        ("superpoint.safetensors", "superpoint/model.safetensors", "lightglue_superpoint/model.safetensors"),
+        (
+            "superpoint.safetensors",
+            "superpoint/model.safetensors",
+            "lightglue_superpoint/model.safetensors",
+        ),
         "https://huggingface.co/magic-leap-community/superpoint/resolve/main/model.safetensors",
     ),
     "disk": WeightsFile(  # Apache-2.0
-        ("depth-save.pth",), "https://raw.githubusercontent.com/cvlab-epfl/disk/master/depth-save.pth"
+        ("depth-save.pth",),
+        "https://raw.githubusercontent.com/cvlab-epfl/disk/master/depth-save.pth",
     ),
 }
 ALIKED_WEIGHTS = {  # BSD-3-Clause
     model: WeightsFile(
-        (f"aliked-{model}.pth",), f"https://github.com/Shiaoming/ALIKED/raw/main/models/aliked-{model}.pth", sha256
+        (f"aliked-{model}.pth",),
+        f"https://github.com/Shiaoming/ALIKED/raw/main/models/aliked-{model}.pth",
+        sha256,
     )
     for model, sha256 in {
         "n16": "5be8704840ed662d9d8c561bf7279c222092674e7eb05fd0feab94899e9d82f2",
@@ -65,18 +73,19 @@ LIGHTGLUE_WEIGHTS = {  # Apache-2.0
 Extractor = Literal["superpoint", "aliked", "disk"]
 Matcher = Literal["lightglue", "mutual_nearest"]
 AlikedModel = Literal["n16", "n16rot", "n32", "t16"]
-# Detection scores are not comparable between extractors. The thresholds and radii are deep-image-matching's for
-# superpoint, the authors' for the others.
+# Detection scores are not comparable between extractors. The thresholds and radii are
+# deep-image-matching's for superpoint, the authors' for the others.
 KEYPOINT_THRESHOLDS = {"superpoint": 0.0005, "aliked": 0.2, "disk": 0.0}
 NMS_RADII = {"superpoint": 3, "aliked": 2, "disk": 2}  # px
 
 
 @dataclass(frozen=True, kw_only=True)
 class FeatureInitializer(ColmapInitializer):
-    """Base of initialisers with features and matches from outside COLMAP, which verifies and maps or triangulates them.
+    """Base of initialisers with features and matches from outside COLMAP, which verifies and maps
+    or triangulates them.
 
-    ``max_image_size`` is in px of the longest side. Features and matches are stored in the ``work_dir`` of `run`, by
-    image and by pair, so an interrupted run continues there.
+    ``max_image_size`` is in px of the longest side. Features and matches are stored in the
+    ``work_dir`` of `run`, by image and by pair, so an interrupted run continues there.
     """
 
     pairs: Pairing | Literal["lowres"] = "exhaustive"  # type: ignore[assignment]  # SIFT has no "lowres"
@@ -100,20 +109,31 @@ class FeatureInitializer(ColmapInitializer):
         super().check(capture, reference)
         self.find_weights()
 
-    def prepare(self, capture: Capture, work_dir: Path, reference: Path | None, progress: Progress) -> Preparation:
+    def prepare(
+        self, capture: Capture, work_dir: Path, reference: Path | None, progress: Progress
+    ) -> Preparation:
         from gsbench.init.networks.extract_and_match import NetworkJob, extract_and_match
 
-        job = NetworkJob(self, self.feature_settings(), capture, reference, work_dir, *self.find_weights())
-        return run_with_progress(extract_and_match, job, progress, what=f"{self.name}: features and matches")
+        job = NetworkJob(
+            self, self.feature_settings(), capture, reference, work_dir, *self.find_weights()
+        )
+        return run_with_progress(
+            extract_and_match, job, progress, what=f"{self.name}: features and matches"
+        )
 
     def fill_database(self, task: DatabaseTask, progress: Progress, timer: Timer) -> dict[str, int]:
         from gsbench.init.colmap.database import verify_pairs, write_keypoints, write_matches
         from gsbench.init.colmap.reconstruct import verification_options
         from gsbench.init.networks.extract_and_match import NetworkJob, choose_pairs, open_store
 
-        job = NetworkJob(self, self.feature_settings(), task.capture, None, task.work_dir, *self.find_weights())
+        job = NetworkJob(
+            self, self.feature_settings(), task.capture, None, task.work_dir, *self.find_weights()
+        )
         store = open_store(job)
-        write_keypoints(task.database, {name: store.require_features(name).colmap_keypoints for name in task.names})
+        write_keypoints(
+            task.database,
+            {name: store.require_features(name).colmap_keypoints for name in task.names},
+        )
         pairs = choose_pairs(job, task.names, task.pairs)
         matches = {pair: store.require_matches(*pair) for pair in pairs}
         matches = {pair: indices for pair, indices in matches.items() if len(indices) > 0}
@@ -128,7 +148,8 @@ class FeatureInitializer(ColmapInitializer):
 
 @dataclass(frozen=True, kw_only=True)
 class Dim(FeatureInitializer):
-    """Deep image matching: SuperPoint, ALIKED or DISK features, matched by LightGlue or mutual nearest neighbours."""
+    """Deep image matching: SuperPoint, ALIKED or DISK features, matched by LightGlue or mutual
+    nearest neighbours."""
 
     name: ClassVar[str] = "dim"
 
@@ -143,8 +164,15 @@ class Dim(FeatureInitializer):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.extractor == "aliked" and self.matcher == "lightglue" and self.aliked_model == "t16":
-            raise InputError("init.matcher=lightglue has no weights for init.aliked_model=t16: use mutual_nearest")
+        if (
+            self.extractor == "aliked"
+            and self.matcher == "lightglue"
+            and self.aliked_model == "t16"
+        ):
+            raise InputError(
+                "init.matcher=lightglue has no weights for init.aliked_model=t16: use "
+                "mutual_nearest"
+            )
 
     def feature_settings(self) -> FeatureSettings:
         threshold, radius = self.keypoint_threshold, self.nms_radius
@@ -153,7 +181,9 @@ class Dim(FeatureInitializer):
             matcher=self.matcher,
             max_image_size=self.max_image_size,
             max_keypoints=self.max_keypoints,
-            keypoint_threshold=KEYPOINT_THRESHOLDS[self.extractor] if threshold is None else threshold,
+            keypoint_threshold=KEYPOINT_THRESHOLDS[self.extractor]
+            if threshold is None
+            else threshold,
             nms_radius=NMS_RADII[self.extractor] if radius is None else radius,
             aliked_model=self.aliked_model,
             filter_threshold=self.filter_threshold,
@@ -169,7 +199,11 @@ class Dim(FeatureInitializer):
         return " ".join(digests) or None
 
     def _weights_files(self) -> list[WeightsFile]:
-        files = [ALIKED_WEIGHTS[self.aliked_model] if self.extractor == "aliked" else EXTRACTOR_WEIGHTS[self.extractor]]
+        files = [
+            ALIKED_WEIGHTS[self.aliked_model]
+            if self.extractor == "aliked"
+            else EXTRACTOR_WEIGHTS[self.extractor]
+        ]
         return [*files, LIGHTGLUE_WEIGHTS[self.extractor]] if self.matcher == "lightglue" else files
 
     def _weights_folder(self) -> Path | None:
@@ -186,7 +220,8 @@ class Dim(FeatureInitializer):
 
 @dataclass(frozen=True, kw_only=True)
 class SiftKornia(FeatureInitializer):
-    """kornia's SIFT, which needs no weights, through the same steps as `Dim`. It is a substitute, not the same."""
+    """kornia's SIFT, which needs no weights, through the same steps as `Dim`. It is a substitute,
+    not the same."""
 
     name: ClassVar[str] = "sift_kornia"
 

@@ -1,4 +1,5 @@
-"""Initialisers that keep the reference cameras and take their points from the data set, at random, or from a file.
+"""Initialisers that keep the reference cameras and take their points from the data set, at random,
+or from a file.
 
 A file holds points of any origin (laser scans, multi-view stereo), or a trained model.
 """
@@ -44,7 +45,8 @@ if TYPE_CHECKING:
 
 
 class GivenCameras(Initializer):
-    """Base of initialisers that keep the reference's cameras and only make points. Subclasses are dataclasses."""
+    """Base of initialisers that keep the reference's cameras and only make points. Subclasses are
+    dataclasses."""
 
     def __post_init__(self) -> None:
         check_settings(self, "init")
@@ -57,16 +59,22 @@ class GivenCameras(Initializer):
         reference: Path | None = None,
         work_dir: Path | None = None,
     ) -> InitReport:
-        """Write model and report; ``work_dir`` is not used. Raises ``InputError`` if there are no cameras."""
+        """Write model and report; ``work_dir`` is not used. Raises ``InputError`` if there are no
+        cameras."""
         if reference is None and capture.model is None:
             raise InputError(
-                f"init={self.name} needs cameras and scene {capture.name} came without: make them with init=sfm first"
+                f"init={self.name} needs cameras and scene {capture.name} came without: make them "
+                "with init=sfm first"
             )
         output_dir.mkdir(parents=True, exist_ok=True)
-        return run_with_progress(_build, (self, capture, output_dir, reference), progress, what=self.name)
+        return run_with_progress(
+            _build, (self, capture, output_dir, reference), progress, what=self.name
+        )
 
     @abstractmethod
-    def set_points(self, model: pycolmap.Reconstruction, capture: Capture, output_dir: Path) -> TrainingPoints | None:
+    def set_points(
+        self, model: pycolmap.Reconstruction, capture: Capture, output_dir: Path
+    ) -> TrainingPoints | None:
         """Set the points of the reference ``model``; runs in the isolated process."""
 
 
@@ -99,21 +107,28 @@ def _build(job: tuple[GivenCameras, Capture, Path, Path | None], progress: Progr
 
 @dataclass(frozen=True, kw_only=True)
 class Dataset(GivenCameras):
-    """Uses the capture's own model, restricted to the selected images, with cameras scaled to the files.
+    """Uses the capture's own model, restricted to the selected images, with cameras scaled to the
+    files.
 
-    ``points_from=train`` keeps the points that at least two training views see, in the colours of those views.
+    ``points_from=train`` keeps the points that at least two training views see, in the colours of
+    those views.
     """
 
     name: ClassVar[str] = "dataset"
 
     points_from: PointsFrom = "all"
 
-    def set_points(self, model: pycolmap.Reconstruction, capture: Capture, output_dir: Path) -> TrainingPoints | None:
+    def set_points(
+        self, model: pycolmap.Reconstruction, capture: Capture, output_dir: Path
+    ) -> TrainingPoints | None:
         from gsbench.init.colmap.database import readable_images
         from gsbench.init.colmap.reconstruct import keep_training_points
 
         if model.num_points3D() == 0:
-            raise InputError(f"init=dataset: the model of scene {capture.name} has no points: use init=sfm or random")
+            raise InputError(
+                f"init=dataset: the model of scene {capture.name} has no points: use init=sfm or "
+                "random"
+            )
         if self.points_from == "all":
             return None
         work = output_dir / WORK_FOLDER
@@ -126,13 +141,16 @@ class Dataset(GivenCameras):
 
 
 class PlacedCloud(GivenCameras):
-    """Base of initialisers that put a new cloud under the reference's cameras. Subclasses are dataclasses."""
+    """Base of initialisers that put a new cloud under the reference's cameras. Subclasses are
+    dataclasses."""
 
     def needs_reference(self, capture: Capture) -> bool:
         """Return whether `run` needs a ``reference`` because the capture came without cameras."""
         return capture.model is None
 
-    def set_points(self, model: pycolmap.Reconstruction, capture: Capture, output_dir: Path) -> TrainingPoints | None:
+    def set_points(
+        self, model: pycolmap.Reconstruction, capture: Capture, output_dir: Path
+    ) -> TrainingPoints | None:
         import pycolmap
 
         cloud = self.cloud(capture, model)
@@ -148,9 +166,11 @@ class PlacedCloud(GivenCameras):
 
 @dataclass(frozen=True, kw_only=True)
 class Random(PlacedCloud):
-    """Uniform points and colours in a cube around the mean of the training cameras, under the reference cameras.
+    """Uniform points and colours in a cube around the mean of the training cameras, under the
+    reference cameras.
 
-    ``size`` is half the cube's edge in scene extents; 3 and 100,000 points are gsplat's defaults for a random start.
+    ``size`` is half the cube's edge in scene extents; 3 and 100,000 points are gsplat's defaults
+    for a random start.
     """
 
     name: ClassVar[str] = "random"
@@ -168,9 +188,13 @@ class Random(PlacedCloud):
         centers = [poses[name][0] for name in capture.train_names if name in poses]
         extent = report.training_extent(model, capture)
         if extent == 0:
-            raise InputError(f"init=random: the training cameras of scene {capture.name} are all at one place")
+            raise InputError(
+                f"init=random: the training cameras of scene {capture.name} are all at one place"
+            )
         generator = np.random.default_rng(self.seed)
-        points = np.mean(centers, axis=0) + self.size * extent * generator.uniform(-1.0, 1.0, (self.count, 3))
+        points = np.mean(centers, axis=0) + self.size * extent * generator.uniform(
+            -1.0, 1.0, (self.count, 3)
+        )
         return PointCloud(points, generator.integers(0, 256, (self.count, 3), dtype=np.uint8))
 
 
@@ -178,8 +202,8 @@ class Random(PlacedCloud):
 class Carved(Random):
     """`Random` without the points that fewer than ``seen_by`` training cameras have in view.
 
-    ``count`` points are drawn, so fewer remain. The idea is from Faster-GS: points that no camera sees cost time and
-    train nothing.
+    ``count`` points are drawn, so fewer remain. The idea is from Faster-GS: points that no camera
+    sees cost time and train nothing.
     """
 
     name: ClassVar[str] = "carved"
@@ -194,14 +218,19 @@ class Carved(Random):
         kept = num_cameras >= self.seen_by
         if not kept.any():
             raise InputError(
-                f"init=carved: of {self.count} points none is in view of {self.seen_by} training cameras of scene "
-                f"{capture.name}; take more (init.count), a smaller box (init.size) or fewer cameras (init.seen_by)"
+                f"init=carved: of {self.count} points none is in view of {self.seen_by} training "
+                "cameras of scene "
+                f"{capture.name}; take more (init.count), a smaller box (init.size) or fewer "
+                "cameras (init.seen_by)"
             )
         return PointCloud(cloud.points[kept], cloud.colors[kept])
 
 
-def points_in_view(points: Array, name: str, model: pycolmap.Reconstruction) -> tuple[NDArray[np.int64], Array, Array]:
-    """Indices [V], pixels [V, 2] and distances [V] of the ``points`` [P, 3] that project into the image ``name``.
+def points_in_view(
+    points: Array, name: str, model: pycolmap.Reconstruction
+) -> tuple[NDArray[np.int64], Array, Array]:
+    """Indices [V], pixels [V, 2] and distances [V] of the ``points`` [P, 3] that project into the
+    image ``name``.
 
     All three are empty if the image has no pose in the model. Occlusion is ignored.
     """
@@ -213,23 +242,30 @@ def points_in_view(points: Array, name: str, model: pycolmap.Reconstruction) -> 
     (ahead,) = np.nonzero(local[:, 2] > 0)
     pixels = np.asarray(camera.img_from_cam(local[ahead])).reshape(-1, 2)  # [A, 2]
     with np.errstate(invalid="ignore"):
-        inside = ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=1)  # NaN is outside
+        # NaN is outside
+        inside = ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=1)
     seen = ahead[inside]
     return seen, pixels[inside], np.linalg.norm(local[seen], axis=1)
 
 
-COLOR_NAMES = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
+COLOR_NAMES = (
+    ("red", "green", "blue"),
+    ("r", "g", "b"),
+    ("diffuse_red", "diffuse_green", "diffuse_blue"),
+)
 DC_NAMES = ("f_dc_0", "f_dc_1", "f_dc_2")
 SH_C0 = 0.5 / math.sqrt(math.pi)  # the constant spherical harmonic, by which 3DGS multiplies f_dc
 TEXT_SUFFIXES = (".xyz", ".txt", ".csv", ".pts")
 
 
 def read_points(path: Path) -> tuple[Array, NDArray[np.uint8] | None]:
-    """Points [P, 3] float64 and their colours [P, 3], None if the file has no colours; the suffix tells the format.
+    """Points [P, 3] float64 and their colours [P, 3], None if the file has no colours; the suffix
+    tells the format.
 
-    A ``.ply`` file, text or binary, has vertices with x, y, z in any order and type, and colours as whole numbers or in
-    [0, 1]. A text file has the columns x, y, z, optionally followed by red, green, blue. Raises ``InputError`` for a
-    file that cannot be read, holds no point, or has a coordinate or colour that is not a finite number.
+    A ``.ply`` file, text or binary, has vertices with x, y, z in any order and type, and colours as
+    whole numbers or in [0, 1]. A text file has the columns x, y, z, optionally followed by red,
+    green, blue. Raises ``InputError`` for a file that cannot be read, holds no point, or has a
+    coordinate or colour that is not a finite number.
     """
     suffix = path.suffix.lower()
     require_regular(path)
@@ -243,14 +279,18 @@ def read_points(path: Path) -> tuple[Array, NDArray[np.uint8] | None]:
             )
         else:
             raise ValueError(f"known are .ply, {', '.join(TEXT_SUFFIXES)}")
-    except Exception as error:  # readers may raise any exception on a damaged file, numpy even tokenizer errors
-        raise InputError(f"{path}: not a readable file of points ({one_line(str(error))})") from error
+    # readers may raise any exception on a damaged file, numpy even tokenizer errors
+    except Exception as error:
+        raise InputError(
+            f"{path}: not a readable file of points ({one_line(str(error))})"
+        ) from error
     if len(points) == 0:
         raise InputError(f"{path}: holds no point")
     bad = ~np.isfinite(points).all(axis=1)
     if bad.any():
         raise InputError(
-            f"{path}: {bad.sum():,} of {len(points):,} points have coordinates that are not finite numbers"
+            f"{path}: {bad.sum():,} of {len(points):,} points have coordinates that are not "
+            "finite numbers"
         )
     if colors is None:
         return points, None
@@ -277,12 +317,15 @@ def _read_ply(path: Path) -> tuple[Array, NDArray[np.generic] | None]:
 
 def _columns(table: NDArray[np.generic]) -> tuple[Array, NDArray[np.generic] | None]:
     if table.ndim != 2 or table.shape[1] not in (3, 6) or table.dtype.kind not in "fiu":
-        raise ValueError(f"must be a table of 3 or 6 columns of numbers, is {table.shape} {table.dtype}")
+        raise ValueError(
+            f"must be a table of 3 or 6 columns of numbers, is {table.shape} {table.dtype}"
+        )
     return table[:, :3].astype(np.float64), table[:, 3:] if table.shape[1] == 6 else None
 
 
 def _eight_bits(colors: NDArray[np.generic]) -> NDArray[np.uint8]:
-    """Colours from 0 to 255: 16-bit values are divided by 257, floats in [0, 1] multiplied by 255."""
+    """Colours from 0 to 255: 16-bit values are divided by 257, floats in [0, 1] multiplied by
+    255."""
     values = colors.astype(np.float64)
     if colors.dtype.kind == "f" and values.max() <= 1.0:
         values = values * 255
@@ -318,8 +361,8 @@ class CloudFromFile(PlacedCloud):
 class Points(CloudFromFile):
     """The points of a file, which must have the coordinates of the reference cameras.
 
-    At most ``max_points`` random points are kept. If the file has no colours, a point's colour comes from the
-    photograph of the nearest training camera that has it in view.
+    At most ``max_points`` random points are kept. If the file has no colours, a point's colour
+    comes from the photograph of the nearest training camera that has it in view.
     """
 
     name: ClassVar[str] = "points"
@@ -330,12 +373,15 @@ class Points(CloudFromFile):
     def cloud(self, capture: Capture, model: pycolmap.Reconstruction) -> PointCloud:
         points, colors = read_points(self.file)
         points = capture.normalization.apply(points)
-        chosen = np.sort(np.random.default_rng(self.seed).permutation(len(points))[: self.max_points])
+        chosen = np.sort(
+            np.random.default_rng(self.seed).permutation(len(points))[: self.max_points]
+        )
         points, colors = points[chosen], None if colors is None else colors[chosen]
         seen = seen_colors(points, capture, model)
         if (seen < 0).all():
             raise InputError(
-                f"init.path={self.path}: no point is in view of a training camera of scene {capture.name}: the cloud "
+                f"init.path={self.path}: no point is in view of a training camera of scene "
+                f"{capture.name}: the cloud "
                 "lies in other coordinates; bring it into those of the cameras"
             )
         if colors is None:
@@ -343,11 +389,14 @@ class Points(CloudFromFile):
         return PointCloud(points, colors)
 
 
-def seen_colors(points: Array, capture: Capture, model: pycolmap.Reconstruction) -> NDArray[np.int16]:
-    """Colours [P, 3] of ``points`` in the photograph of the nearest training camera that has them in view, else -1.
+def seen_colors(
+    points: Array, capture: Capture, model: pycolmap.Reconstruction
+) -> NDArray[np.int16]:
+    """Colours [P, 3] of ``points`` in the photograph of the nearest training camera that has them
+    in view, else -1.
 
-    Occlusion is ignored; the nearest camera is the least likely to be occluded. Pixels that a mask ignores give no
-    colour.
+    Occlusion is ignored; the nearest camera is the least likely to be occluded. Pixels that a mask
+    ignores give no colour.
     """
     colors = np.full((len(points), 3), -1, dtype=np.int16)
     nearest = np.full(len(points), np.inf)
@@ -369,7 +418,8 @@ def seen_colors(points: Array, capture: Capture, model: pycolmap.Reconstruction)
 class Ply(CloudFromFile):
     """The Gaussians of a 3DGS PLY file, which must have the coordinates of the reference cameras.
 
-    The model holds their means and colours as points. Training starts from the Gaussians in `GAUSSIANS_FILE`.
+    The model holds their means and colours as points. Training starts from the Gaussians in
+    `GAUSSIANS_FILE`.
     """
 
     name: ClassVar[str] = "ply"
@@ -380,13 +430,18 @@ class Ply(CloudFromFile):
 
         check_ply(self.file)
 
-    def set_points(self, model: pycolmap.Reconstruction, capture: Capture, output_dir: Path) -> TrainingPoints | None:
+    def set_points(
+        self, model: pycolmap.Reconstruction, capture: Capture, output_dir: Path
+    ) -> TrainingPoints | None:
         from gsbench.gaussians.ply import read_ply, write_ply
 
         if capture.normalization.is_identity:
             shutil.copyfile(self.file, output_dir / GAUSSIANS_FILE)
         else:
-            write_ply(read_ply(self.file, normalization=capture.normalization), output_dir / GAUSSIANS_FILE)
+            write_ply(
+                read_ply(self.file, normalization=capture.normalization),
+                output_dir / GAUSSIANS_FILE,
+            )
         return super().set_points(model, capture, output_dir)
 
     def cloud(self, capture: Capture, model: pycolmap.Reconstruction) -> PointCloud:

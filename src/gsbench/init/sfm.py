@@ -1,4 +1,5 @@
-"""Structure from motion by COLMAP: the base of initialisers that end in COLMAP, and those on COLMAP's SIFT features."""
+"""Structure from motion by COLMAP: the base of initialisers that end in COLMAP, and those on
+COLMAP's SIFT features."""
 
 from __future__ import annotations
 
@@ -14,7 +15,16 @@ from annotated_types import Ge, Interval
 from pydantic import PositiveFloat, PositiveInt
 
 from gsbench.errors import InputError
-from gsbench.init.base import WORK_FOLDER, Initializer, InitReport, PointsFrom, Poses, Preparation, Seed, Timer
+from gsbench.init.base import (
+    WORK_FOLDER,
+    Initializer,
+    InitReport,
+    PointsFrom,
+    Poses,
+    Preparation,
+    Seed,
+    Timer,
+)
 from gsbench.init.colmap.pairs import STRONGEST, Pairing, proposed_pairs
 from gsbench.logs import Progress, no_progress
 from gsbench.scene.options import MIN_IMAGES
@@ -33,7 +43,9 @@ logger = logging.getLogger(__name__)
 
 LOG_FILE = "colmap.log"
 CameraSharing = Literal["single", "per_folder", "per_image"]
-CameraModel = Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"]
+CameraModel = Literal[
+    "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"
+]
 Intrinsics = Literal["estimate", "reference"]
 MIN_DETECTION_SIZE = 32  # px: detectors find nothing in smaller images
 
@@ -42,16 +54,19 @@ MIN_DETECTION_SIZE = 32  # px: detectors find nothing in smaller images
 class ColmapInitializer(Initializer):
     """Base of `Sfm`, `SfmDense`, `Dim` and `SiftKornia`, with the settings that they share.
 
-    With ``poses=shared``, points are triangulated under the reference cameras. With ``poses=own``, cameras and points
-    are estimated; if there is a reference and ``align`` is set, a similarity then moves them into its gauge.
+    With ``poses=shared``, points are triangulated under the reference cameras. With ``poses=own``,
+    cameras and points are estimated; if there is a reference and ``align`` is set, a similarity
+    then moves them into its gauge.
 
-    With ``points_from=train``, test views contribute no points. Under given cameras their photographs are not read. If
-    cameras are estimated, all photographs are used for the cameras, and only points of training views are kept.
+    With ``points_from=train``, test views contribute no points. Under given cameras their
+    photographs are not read. If cameras are estimated, all photographs are used for the cameras,
+    and only points of training views are kept.
 
     The reference is the ``reference`` given to `run`, else the model that came with the capture.
     """
 
-    is_own_reference: ClassVar[bool] = False  # estimates the poses itself if poses=shared and there is no reference
+    # estimates the poses itself if poses=shared and there is no reference
+    is_own_reference: ClassVar[bool] = False
 
     poses: Poses = "shared"
     align: bool = True
@@ -76,7 +91,8 @@ class ColmapInitializer(Initializer):
 
     @abstractmethod
     def fill_database(self, task: DatabaseTask, progress: Progress, timer: Timer) -> dict[str, int]:
-        """Write features, matches and verified geometries, in the isolated process. Returns counts for the report."""
+        """Write features, matches and verified geometries, in the isolated process. Returns counts
+        for the report."""
 
     @property
     def num_threads(self) -> int:
@@ -92,8 +108,11 @@ class ColmapInitializer(Initializer):
         """Return whether at least the intrinsics are taken from the reference, if there is one."""
         return self.poses == "shared" or self.intrinsics == "reference"
 
-    def select_images(self, capture: Capture, reference: pycolmap.Reconstruction | None) -> list[str]:
-        """The sorted names of the images to use: all, or the images of the reference if its cameras are used."""
+    def select_images(
+        self, capture: Capture, reference: pycolmap.Reconstruction | None
+    ) -> list[str]:
+        """The sorted names of the images to use: all, or the images of the reference if its cameras
+        are used."""
         if reference is None or not self.uses_reference_cameras:
             return sorted(capture.image_names)
         names = sorted(image.name for image in reference.images.values() if image.has_pose)
@@ -119,8 +138,8 @@ class ColmapInitializer(Initializer):
     ) -> InitReport:
         """Write model and report (see `Initializer.run`).
 
-        ``work_dir`` keeps features and matches for a later run. Without it, they are kept in ``output_dir`` until the
-        run succeeds, so that an interrupted run continues there.
+        ``work_dir`` keeps features and matches for a later run. Without it, they are kept in
+        ``output_dir`` until the run succeeds, so that an interrupted run continues there.
 
         Raises ``InputError`` if no model can be made from the photographs with these settings.
         """
@@ -132,7 +151,9 @@ class ColmapInitializer(Initializer):
         from gsbench.init.colmap.mapping import ReconstructionJob, build_model
 
         job = ReconstructionJob(self, capture, output_dir, work, reference, preparation)
-        report = run_with_progress(build_model, job, progress, what=self.name, log=output_dir / LOG_FILE)
+        report = run_with_progress(
+            build_model, job, progress, what=self.name, log=output_dir / LOG_FILE
+        )
         if work_dir is None:
             shutil.rmtree(work)
         for warning in report.warnings:
@@ -140,24 +161,30 @@ class ColmapInitializer(Initializer):
         return report
 
     def check(self, capture: Capture, reference: Path | None) -> None:
-        """Raise ``InputError``, before any work, if this capture cannot be initialised with these settings."""
+        """Raise ``InputError``, before any work, if this capture cannot be initialised with these
+        settings."""
         if len(capture.image_names) < MIN_IMAGES:
             raise InputError(
-                f"scene {capture.name} has {counted(len(capture.image_names), 'image')}: {self.name} needs at least "
+                f"scene {capture.name} has {counted(len(capture.image_names), 'image')}: "
+                f"{self.name} needs at least "
                 f"{MIN_IMAGES}"
             )
         if reference is None and self.needs_reference(capture):
             raise InputError(
-                f"init={self.name} takes its cameras from a reference, and scene {capture.name} came without: "
+                f"init={self.name} takes its cameras from a reference, and scene {capture.name} "
+                "came without: "
                 "make one with init=sfm first, or set init.poses=own and init.intrinsics=estimate"
             )
 
-    def prepare(self, capture: Capture, work_dir: Path, reference: Path | None, progress: Progress) -> Preparation:
+    def prepare(
+        self, capture: Capture, work_dir: Path, reference: Path | None, progress: Progress
+    ) -> Preparation:
         """Do the work that comes before COLMAP; none by default."""
         return Preparation()
 
     def extend(self, model: pycolmap.Reconstruction, report: InitReport) -> InitReport:
-        """Change the model before it is written; returns its report. Runs in the isolated process."""
+        """Change the model before it is written; returns its report. Runs in the isolated
+        process."""
         return report
 
 
@@ -165,8 +192,9 @@ class ColmapInitializer(Initializer):
 class Sfm(ColmapInitializer):
     """SIFT, matching and incremental mapping by COLMAP.
 
-    ``max_image_size`` is in px of the longest side. Larger images are shrunk for detection, and keypoints are scaled
-    back to the files' size. With the same seed and ``mapper_threads=1`` two runs give the same model bit for bit.
+    ``max_image_size`` is in px of the longest side. Larger images are shrunk for detection, and
+    keypoints are scaled back to the files' size. With the same seed and ``mapper_threads=1`` two
+    runs give the same model bit for bit.
     """
 
     name: ClassVar[str] = "sfm"
@@ -182,18 +210,29 @@ class Sfm(ColmapInitializer):
     guided_matching: bool = False
 
     def fill_database(self, task: DatabaseTask, progress: Progress, timer: Timer) -> dict[str, int]:
-        from gsbench.init.colmap.database import colmap_masks, database_counts, strongest_descriptors
+        from gsbench.init.colmap.database import (
+            colmap_masks,
+            database_counts,
+            strongest_descriptors,
+        )
         from gsbench.init.colmap.sift import extract_sift, match_sift
 
         with timer.phase("extract"):
             masks = colmap_masks(task.capture.masks, task.work_dir)
-            extract_sift(task.database, task.images, task.names, self, self.num_threads, progress, masks)
+            extract_sift(
+                task.database, task.images, task.names, self, self.num_threads, progress, masks
+            )
         if database_counts(task.database)["features"] == 0:
-            raise InputError(f"{self.name}: no keypoint in any image: lower init.peak_threshold, or check the photos")
+            raise InputError(
+                f"{self.name}: no keypoint in any image: lower init.peak_threshold, or check the "
+                "photos"
+            )
         pairs, counts = task.pairs, {}
         if self.pairs == "auto":
             with timer.phase("preview"):
-                pairs = proposed_pairs(task.names, lambda name: strongest_descriptors(task.database, name, STRONGEST))
+                pairs = proposed_pairs(
+                    task.names, lambda name: strongest_descriptors(task.database, name, STRONGEST)
+                )
             counts = {"pairs_selected": len(pairs), "pairs_left_out": len(task.pairs) - len(pairs)}
         with timer.phase("match"):
             match_sift(task.database, pairs, self, self.num_threads, progress)
@@ -202,7 +241,8 @@ class Sfm(ColmapInitializer):
 
 @dataclass(frozen=True, kw_only=True)
 class SfmDense(Sfm):
-    """`Sfm` with loose detection thresholds, for many more points: a substitute for deep image matching."""
+    """`Sfm` with loose detection thresholds, for many more points: a substitute for deep image
+    matching."""
 
     name: ClassVar[str] = "sfm_dense"
     is_own_reference: ClassVar[bool] = False
@@ -217,8 +257,9 @@ class SfmDense(Sfm):
 class Jittered(Sfm):
     """`Sfm` with ``copies`` randomly shifted copies of each point, in the point's colour.
 
-    The shift is normal with standard deviation ``shift`` times the distance to the point's nearest neighbour. Copies
-    have no tracks, so the report's errors and track lengths are those of the original points.
+    The shift is normal with standard deviation ``shift`` times the distance to the point's nearest
+    neighbour. Copies have no tracks, so the report's errors and track lengths are those of the
+    original points.
     """
 
     name: ClassVar[str] = "jittered"
@@ -241,10 +282,13 @@ class Jittered(Sfm):
 
 
 def shifted_copies(points: Array, copies: int, shift: float, seed: int) -> Array:
-    """Shifted copies [copies P, 3] of ``points`` [P, 3]; each repetition holds all points in their order."""
+    """Shifted copies [copies P, 3] of ``points`` [P, 3]; each repetition holds all points in their
+    order."""
     from scipy.spatial import cKDTree  # takes a while to load
 
-    distances, _ = cKDTree(points).query(points, k=2)  # [P, 2], the first neighbour is the point itself
+    distances, _ = cKDTree(points).query(
+        points, k=2
+    )  # [P, 2], the first neighbour is the point itself
     spread = shift * distances[:, 1:]  # [P, 1] world units
     noise = np.random.default_rng(seed).standard_normal((copies, len(points), 3))
     return (points + spread * noise).reshape(-1, 3)

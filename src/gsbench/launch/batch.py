@@ -27,7 +27,10 @@ log = logging.getLogger(__name__)
 
 def run_batch(trials: Sequence[Trial]) -> list[Outcome]:
     """Run the trials that are not done by their launcher, and return the outcomes of all."""
-    runs, launcher = checked_runs_folder(trials[0].values["runs"]), trials[0].values["launch"]["name"]
+    runs, launcher = (
+        checked_runs_folder(trials[0].values["runs"]),
+        trials[0].values["launch"]["name"],
+    )
     with storage_errors(runs), stop_on_signals():
         # A wrong folder of weights is an error even if all trials are done.
         if launcher != "slurm" and (missing := missing_weights(trials)):
@@ -43,15 +46,20 @@ def run_batch(trials: Sequence[Trial]) -> list[Outcome]:
 
 
 def begin_for_another_launcher(trials: Sequence[Trial]) -> None:
-    """Check, plan and declare trials that another launcher (a Hydra plugin) will run, perhaps several at once."""
+    """Check, plan and declare trials that another launcher (a Hydra plugin) will run, perhaps
+    several at once."""
     with storage_errors(checked_runs_folder(trials[0].values["runs"])):
         _begin(trials, [trial for trial in trials if _why_not_done(trial)])
 
 
 def _begin(trials: Sequence[Trial], unfinished: Sequence[Trial]) -> None:
-    """Refuse trials that are known to fail; then make the runs folder, tidy the store, write plan and declarations."""
+    """Refuse trials that are known to fail; then make the runs folder, tidy the store, write plan
+    and declarations."""
     declared_metrics(trials)  # raises for two metrics in one experiment, before anything is written
-    runs, launcher = checked_runs_folder(trials[0].values["runs"]), trials[0].values["launch"]["name"]
+    runs, launcher = (
+        checked_runs_folder(trials[0].values["runs"]),
+        trials[0].values["launch"]["name"],
+    )
     # A node of a cluster may have folders and devices that this machine lacks.
     if launcher != "slurm" and (missing := missing_folders(unfinished)):
         raise InputError("; ".join(missing))
@@ -73,7 +81,8 @@ def _begin(trials: Sequence[Trial], unfinished: Sequence[Trial]) -> None:
 
 
 def _skip_finished(trials: Sequence[Trial]) -> tuple[list[Outcome], list[Trial]]:
-    """The outcomes of finished trials, and the unfinished ones; each folder once, since a sweep may repeat a value."""
+    """The outcomes of finished trials, and the unfinished ones; each folder once, since a sweep may
+    repeat a value."""
     outcomes: list[Outcome] = []
     unfinished: list[Trial] = []
     for folder, trial in {trial.folder: trial for trial in trials}.items():
@@ -86,12 +95,15 @@ def _skip_finished(trials: Sequence[Trial]) -> tuple[list[Outcome], list[Trial]]
 
 
 def _why_not_done(trial: Trial) -> str:
-    return trial.files.why_not_done(trial.values, lambda options: _unavailable(json.dumps(options, sort_keys=True)))
+    return trial.files.why_not_done(
+        trial.values, lambda options: _unavailable(json.dumps(options, sort_keys=True))
+    )
 
 
 @cache
 def _unavailable(options: str) -> frozenset[str]:
-    """The metrics that cannot be computed now. The cache searches for (and downloads) weights once per sweep."""
+    """The metrics that cannot be computed now. The cache searches for (and downloads) weights once
+    per sweep."""
     from gsbench.eval.options import EvalConfig
     from gsbench.pipeline.parts import make_evaluator
 
@@ -102,18 +114,29 @@ def _unavailable(options: str) -> frozenset[str]:
 
 
 def missing_folders(trials: Sequence[Trial]) -> list[str]:
-    """A line for each missing folder of photographs, model or weights that trials name, and how to get photographs."""
+    """A line for each missing folder of photographs, model or weights that trials name, and how to
+    get photographs."""
     from gsbench.datasets.catalog import how_to_get
     from gsbench.scene.readers import missing_folder, missing_model
 
-    scenes = [scene for scene in (trial.values["scene"] for trial in trials) if scene["kind"] != "courtyard"]
+    scenes = [
+        scene
+        for scene in (trial.values["scene"] for trial in trials)
+        if scene["kind"] != "courtyard"
+    ]
     named_paths = {(scene["name"], scene["path"]) for scene in scenes}
     folders = [(name, Path(path).expanduser()) for name, path in sorted(named_paths, key=str)]
     missing = [(name, folder) for name, folder in folders if not folder.is_dir()]
     lines = [missing_folder(name, folder) for name, folder in missing]
-    models = {(scene["name"], scene["path"], scene["sparse"]) for scene in scenes if scene["kind"] == "colmap"}
+    models = {
+        (scene["name"], scene["path"], scene["sparse"])
+        for scene in scenes
+        if scene["kind"] == "colmap"
+    }
     for name, path, sparse in sorted(models, key=str):
-        if (root := Path(path).expanduser()).is_dir() and (line := missing_model(name, root, sparse)):
+        if (root := Path(path).expanduser()).is_dir() and (
+            line := missing_model(name, root, sparse)
+        ):
             lines.append(line)
     return lines + ([how_to_get(missing)] if missing else []) + missing_weights(trials)
 
@@ -127,7 +150,8 @@ def missing_weights(trials: Sequence[Trial]) -> list[str]:
         if folder is not None
     }
     return [
-        f"{group}.weights={folder}: no such folder; without it, weights are looked for where gsbench keeps them"
+        f"{group}.weights={folder}: no such folder; without it, weights are looked for where "
+        "gsbench keeps them"
         for group, folder in sorted(folders)
         if not Path(folder).expanduser().is_dir()
     ]
@@ -146,13 +170,19 @@ def check_parts(trials: Sequence[Trial], on_this_machine: bool) -> None:
 
 def check_trackers(trials: Sequence[Trial]) -> None:
     """Raise InputError if a trial's tracker needs a package that is not installed."""
-    for sink in sorted({t.values["tracking"]["sink"] for t in trials if t.values["tracking"]["enabled"]}):
+    for sink in sorted(
+        {t.values["tracking"]["sink"] for t in trials if t.values["tracking"]["enabled"]}
+    ):
         if importlib.util.find_spec(sink) is None:
-            raise InputError(f"tracking.sink={sink} needs a package: {install_command(sink)} (or pip install {sink})")
+            raise InputError(
+                f"tracking.sink={sink} needs a package: {install_command(sink)} (or pip install "
+                f"{sink})"
+            )
 
 
 def borrowed_names(trials: Sequence[Trial]) -> list[str]:
-    """A line for each of the user's classes whose name in tables would be that of a class of gsbench."""
+    """A line for each of the user's classes whose name in tables would be that of a class of
+    gsbench."""
     classes = {
         (group, str(part.get("name")), str(part["_target_"]))
         for trial in trials
@@ -168,7 +198,8 @@ def borrowed_names(trials: Sequence[Trial]) -> list[str]:
 
 
 def need_no_check(trials: Sequence[Trial]) -> bool:
-    """Return whether all components have their shipped options, which gsbench's own tests have checked.
+    """Return whether all components have their shipped options, which gsbench's own tests have
+    checked.
 
     Then a dry run need not load torch.
     """
@@ -176,6 +207,8 @@ def need_no_check(trials: Sequence[Trial]) -> bool:
         key, _, value = word.lstrip("+~").partition("=")
         group = re.split("[./@]", key)[0]
         # Hydra's own settings change no component, unless they bring files from elsewhere.
-        if key == "hydra.searchpath" or (group in (*COMPONENTS, "raster", "train") and value not in options(key)):
+        if key == "hydra.searchpath" or (
+            group in (*COMPONENTS, "raster", "train") and value not in options(key)
+        ):
             return False
     return True

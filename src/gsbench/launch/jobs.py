@@ -1,7 +1,7 @@
 """Running trials: one after the other in this process, in processes of this machine, or in Slurm.
 
-For the last two, a trial is a job of submitit, which returns the trial's outcome. Whether a trial is done is decided by
-its files alone, since a scheduler may report a process wrongly.
+For the last two, a trial is a job of submitit, which returns the trial's outcome. Whether a trial
+is done is decided by its files alone, since a scheduler may report a process wrongly.
 """
 
 from __future__ import annotations
@@ -37,7 +37,13 @@ from gsbench.system.isolate import error_tail
 from gsbench.system.locks import BusyError, hold
 from gsbench.system.own_modules import adopt_modules, allowed_modules
 from gsbench.system.resources import assign_gpu, assign_threads, names_one_gpu, take_slot
-from gsbench.system.stopping import SIGNALS, SIGNALS_WITHOUT_INTERRUPT, Stopped, interrupts_ignored, stop_on_signals
+from gsbench.system.stopping import (
+    SIGNALS,
+    SIGNALS_WITHOUT_INTERRUPT,
+    Stopped,
+    interrupts_ignored,
+    stop_on_signals,
+)
 from gsbench.tracking import Mirror
 from gsbench.words import counted
 
@@ -55,8 +61,8 @@ Status = Literal["done", "failed", "queued"]
 class Outcome:
     """The end of a trial: ``message`` has its metrics, or why it failed.
 
-    ``bad_input`` says that the user's files or settings are the cause. A "queued" trial was left to Slurm, in the job
-    that ``message`` names; it may be running by now.
+    ``bad_input`` says that the user's files or settings are the cause. A "queued" trial was left to
+    Slurm, in the job that ``message`` names; it may be running by now.
     """
 
     folder: Path
@@ -84,7 +90,8 @@ def outcome_of_error(folder: Path, error: Exception) -> Outcome:
 
 
 def run_serial(trials: Sequence[Trial], mirror: Mirror) -> list[Outcome]:
-    """Run the trials. A trial that another process is running comes last, so that two sweeps share the work."""
+    """Run the trials. A trial that another process is running comes last, so that two sweeps share
+    the work."""
     outcomes: list[Outcome] = []
     busy: list[Trial] = []
     for number, trial in enumerate(trials, 1):
@@ -105,7 +112,8 @@ def run_one(trial: Trial, mirror: Mirror, wait: bool) -> Outcome:
     """
     mirror.follow(trial.folder, trial.values["tracking"])
     try:
-        from gsbench.pipeline.trial import run_trial  # here, because a sweep that is done needs no torch
+        # here, because a sweep that is done needs no torch
+        from gsbench.pipeline.trial import run_trial
 
         return outcome_of_results(trial.folder, run_trial(trial, wait))
     except (BusyError, DiskFullError):
@@ -122,7 +130,8 @@ DAYS = 24 * 60  # minutes
 
 @dataclass
 class TrialJob:
-    """The callable that submitit runs. When its time is up, submitit requeues what ``checkpoint`` returns."""
+    """The callable that submitit runs. When its time is up, submitit requeues what ``checkpoint``
+    returns."""
 
     values: dict[str, Any]
     path: list[str]  # sys.path of the submitting process
@@ -134,23 +143,30 @@ class TrialJob:
         adopt_modules(self.own)
         set_up_logging()
         launch = self.values["launch"]
-        # submitit's own handler requeues the job; it is called below, after the trial has saved a checkpoint.
+        # submitit's own handler requeues the job; it is called below, after the trial has saved a
+        # checkpoint.
         requeue = signal.getsignal(signal.SIGUSR2) if hasattr(signal, "SIGUSR2") else None
         try:
             with (
-                stop_on_signals(SIGNALS_WITHOUT_INTERRUPT if launch["name"] == "local" else SIGNALS),
+                stop_on_signals(
+                    SIGNALS_WITHOUT_INTERRUPT if launch["name"] == "local" else SIGNALS
+                ),
                 ExitStack() as stack,
             ):
                 if launch["name"] == "local":
-                    slot = stack.enter_context(take_slot(TrialFolder.of(self.values).runs, launch["parallel"]))
-                    if not names_one_gpu(self.values["device"]):  # else its number counts the GPUs of the parent
+                    slot = stack.enter_context(
+                        take_slot(TrialFolder.of(self.values).runs, launch["parallel"])
+                    )
+                    # else its number counts the GPUs of the parent
+                    if not names_one_gpu(self.values["device"]):
                         assign_gpu(slot, self.visible_gpus)
                 assign_threads(self.values["threads"], launch["parallel"])
                 # With launch=local, the sweep's own process mirrors all of its trials.
                 mirror = stack.enter_context(Mirror(idle=launch["name"] == "local"))
                 outcome = run_one(Trial(self.values, ()), mirror, wait=True)
                 if outcome.status == "failed":
-                    print(outcome.message, file=sys.stderr)  # for the job's log: the trial's folder may lack the reason
+                    # for the job's log: the trial's folder may lack the reason
+                    print(outcome.message, file=sys.stderr)
                 if launch["name"] == "slurm":
                     with suppress(OSError):
                         forget_submission(outcome.folder)
@@ -167,14 +183,18 @@ class TrialJob:
 
 
 def run_local(trials: Sequence[Trial], mirror: Mirror) -> list[Outcome]:
-    """Run the trials in processes of this machine, ``launch.parallel`` at once; return when all have ended."""
+    """Run the trials in processes of this machine, ``launch.parallel`` at once; return when all
+    have ended."""
     values = trials[0].values
     parallel, name = values["launch"]["parallel"], values["name"]
     import submitit
 
     # Nothing else is printed until the first trial ends, since trials write to their own logs.
     log.info(
-        "%s, %d at once; to see how far they are: gsbench status %s", counted(len(trials), "trial"), parallel, name
+        "%s, %d at once; to see how far they are: gsbench status %s",
+        counted(len(trials), "trial"),
+        parallel,
+        name,
     )
     executor = submitit.LocalExecutor(job_folder(values))
     executor.update_parameters(timeout_min=values["launch"]["timeout_min"] or 365 * DAYS)
@@ -186,7 +206,8 @@ def job_folder(values: dict[str, Any]) -> Path:
     runs = TrialFolder.of(values).runs
     folder = runs / JOBS / values["name"]
     require_no_links(runs, folder)
-    # submitit leaves a link to each job script. Nobody reads it again, and `require_no_links` below would refuse it.
+    # submitit leaves a link to each job script. Nobody reads it again, and `require_no_links` below
+    # would refuse it.
     for link in folder.glob(".submission_file_*.sh"):
         if link.is_symlink():
             link.unlink(missing_ok=True)
@@ -195,28 +216,39 @@ def job_folder(values: dict[str, Any]) -> Path:
     return folder
 
 
-def _run(trials: Sequence[Trial], executor: Executor, parallel: int, mirror: Mirror) -> list[Outcome]:
-    """Run at most ``parallel`` processes at once. If this process is stopped it stops them; if killed, they go on."""
+def _run(
+    trials: Sequence[Trial], executor: Executor, parallel: int, mirror: Mirror
+) -> list[Outcome]:
+    """Run at most ``parallel`` processes at once. If this process is stopped it stops them; if
+    killed, they go on."""
     waiting, running, outcomes = clouds_first(trials), dict[Path, "Job[Outcome]"](), list[Outcome]()
     try:
         while waiting or running:
             while waiting and len(running) < parallel:
                 trial = waiting.pop(0)
-                # Ctrl-C reaches all processes of a terminal: jobs ignore it, and this process passes it on below.
+                # Ctrl-C reaches all processes of a terminal: jobs ignore it, and this process
+                # passes it on below.
                 with interrupts_ignored():
                     running[trial.folder] = executor.submit(job_of(trial))
                 mirror.follow(trial.folder, trial.values["tracking"])
             ended = [folder for folder, job in running.items() if job.done()]
             for folder in ended:
                 outcomes.append(collect(running.pop(folder), folder, trials))
-                log.info("%s: %s  (%d of %d)", outcomes[-1].label, outcomes[-1].message, len(outcomes), len(trials))
+                log.info(
+                    "%s: %s  (%d of %d)",
+                    outcomes[-1].label,
+                    outcomes[-1].message,
+                    len(outcomes),
+                    len(trials),
+                )
             if not ended:
                 time.sleep(SECONDS_BETWEEN_POLLS)
     except KeyboardInterrupt:
         for job in running.values():
             process = getattr(job, "_process", None)
             if process is not None and process.poll() is None:
-                process.send_signal(signal.SIGTERM)  # submitit's controller passes it on; the trial saves a checkpoint
+                # submitit's controller passes it on; the trial saves a checkpoint
+                process.send_signal(signal.SIGTERM)
         raise
     return outcomes
 
@@ -224,7 +256,8 @@ def _run(trials: Sequence[Trial], executor: Executor, parallel: int, mirror: Mir
 def clouds_first(trials: Sequence[Trial]) -> list[Trial]:
     """The trials, reordered: one of each scene and initialiser comes first.
 
-    Trials with the same initial cloud wait for each other, so running them at once would leave processes idle.
+    Trials with the same initial cloud wait for each other, so running them at once would leave
+    processes idle.
     """
     by_cloud: dict[str, Trial] = {}
     for trial in trials:
@@ -234,11 +267,13 @@ def clouds_first(trials: Sequence[Trial]) -> list[Trial]:
 
 
 def collect(job: Job[Outcome], folder: Path, trials: Sequence[Trial]) -> Outcome:
-    """The outcome of an ended job, from the trial's files, or else from the end of the job's log."""
+    """The outcome of an ended job, from the trial's files, or else from the end of the job's
+    log."""
     values = next(trial.values for trial in trials if trial.folder == folder)
     files, log_file = TrialFolder(folder), job.paths.stderr
     record = files.sound_record()
-    unavailable = () if record is None else record.awaited  # the trial has just ended, so they are still unavailable
+    # the trial has just ended, so they are still unavailable
+    unavailable = () if record is None else record.awaited
     reason = files.why_not_done(values, lambda options: unavailable)
     if record is not None and not reason:
         return outcome_of_results(folder, record)
@@ -246,10 +281,14 @@ def collect(job: Job[Outcome], folder: Path, trials: Sequence[Trial]) -> Outcome
         failure = files.failure()
         return Outcome(folder, "failed", f"{failure.reason}; log: {log_file}", failure.bad_input)
     if record is not None:
-        return Outcome(folder, "failed", f"its results no longer hold ({reason}): give the command again")
+        return Outcome(
+            folder, "failed", f"its results no longer hold ({reason}): give the command again"
+        )
     tail = f"; its last lines: {error_tail(log_file)}" if log_file.is_file() else ""
     return Outcome(
-        folder, "failed", f"the process ended without a result (killed, or out of memory){tail}; log: {log_file}"
+        folder,
+        "failed",
+        f"the process ended without a result (killed, or out of memory){tail}; log: {log_file}",
     )
 
 
@@ -259,17 +298,21 @@ def job_of(trial: Trial) -> TrialJob:
     return TrialJob(trial.values, path, allowed_modules(), os.environ.get("CUDA_VISIBLE_DEVICES"))
 
 
-# ---- tasks of a Slurm array job: submitted once, then awaited, or left to Slurm (``launch.wait=false``)
+# ---- tasks of a Slurm array job: submitted once, then awaited or left to Slurm
 
-SUBMIT_LOCK = ".submit.lock"  # in the folder of the jobs' output, so that two commands do not submit a trial twice
+# in the folder of the jobs' output, so that two commands do not submit a trial twice
+SUBMIT_LOCK = ".submit.lock"
 SECONDS_BETWEEN_QUEUE_CHECKS = 20.0
-CHECKS_UNTIL_LOST = 2  # a job without a result is lost if it is missing in the queue so many times in a row
+# a job without a result is lost if it is missing in the queue so many times in a row
+CHECKS_UNTIL_LOST = 2
 
 
 def run_slurm(trials: Sequence[Trial]) -> list[Outcome]:
-    """Run the trials in Slurm; those that an earlier command submitted are awaited, not submitted again.
+    """Run the trials in Slurm; those that an earlier command submitted are awaited, not submitted
+    again.
 
-    Returns when all have ended; with ``launch.wait=false``, after submitting, with outcomes of status "queued".
+    Returns when all have ended; with ``launch.wait=false``, after submitting, with outcomes of
+    status "queued".
     """
     values = trials[0].values
     executor = make_executor(values["launch"], job_folder(values))
@@ -277,14 +320,23 @@ def run_slurm(trials: Sequence[Trial]) -> list[Outcome]:
         jobs = _submit(trials, executor)
     array = sorted({job.job_id.split("_")[0] for job in jobs.values()})
     if not values["launch"].get("wait", True):
-        print(f"Slurm job {', '.join(array)}: {counted(len(jobs), 'trial')}; see gsbench status {values['name']}")
+        print(
+            f"Slurm job {', '.join(array)}: {counted(len(jobs), 'trial')}; see gsbench status "
+            f"{values['name']}"
+        )
         return [Outcome(folder, "queued", job.job_id) for folder, job in jobs.items()]
-    log.info("%s in Slurm, job %s; logs: %s", counted(len(jobs), "trial"), ", ".join(array), executor.folder)
+    log.info(
+        "%s in Slurm, job %s; logs: %s",
+        counted(len(jobs), "trial"),
+        ", ".join(array),
+        executor.folder,
+    )
     try:
         return _wait(jobs, trials)
     except KeyboardInterrupt:
         log.info(
-            "the jobs stay in Slurm: the same command waits for them again, `scancel %s` ends them", " ".join(array)
+            "the jobs stay in Slurm: the same command waits for them again, `scancel %s` ends them",
+            " ".join(array),
         )
         raise
 
@@ -296,7 +348,9 @@ def make_executor(launch: dict[str, Any], folder: Path) -> SlurmExecutor:
     try:
         slurm = submitit.SlurmExecutor(folder, max_num_timeout=launch["max_requeues"])
     except RuntimeError:
-        raise InputError("launch=slurm: there is no srun here; start gsbench on a login node of the cluster") from None
+        raise InputError(
+            "launch=slurm: there is no srun here; start gsbench on a login node of the cluster"
+        ) from None
     wanted = {
         "job_name": "gsbench",
         "partition": launch["partition"],
@@ -316,13 +370,17 @@ def make_executor(launch: dict[str, Any], folder: Path) -> SlurmExecutor:
 
 
 def _submit(trials: Sequence[Trial], executor: SlurmExecutor) -> dict[Path, Job[Outcome]]:
-    """The job of each trial by the trial's folder: its job in the queue, or else a task of a new array job."""
+    """The job of each trial by the trial's folder: its job in the queue, or else a task of a new
+    array job."""
     import submitit
 
     folders = [trial.folder for trial in trials]
     queue = ask_queue(folders)
     if queue is None:
-        raise InputError("Slurm does not list its jobs (squeue failed), so nothing was submitted: try again later")
+        raise InputError(
+            "Slurm does not list its jobs (squeue failed), so nothing was submitted: try again "
+            "later"
+        )
     jobs: dict[Path, Job[Outcome]] = {}
     to_submit: dict[Path, Trial] = {}
     for folder, trial in zip(folders, trials, strict=True):
@@ -335,7 +393,9 @@ def _submit(trials: Sequence[Trial], executor: SlurmExecutor) -> dict[Path, Job[
         try:
             submitted = executor.submit_array([job_of(trial) for trial in to_submit.values()])
         except Exception as error:
-            raise InputError(f"Slurm refused the job: {' '.join(str(error).split())[:300]}") from error
+            raise InputError(
+                f"Slurm refused the job: {' '.join(str(error).split())[:300]}"
+            ) from error
         for folder, job in zip(to_submit, submitted, strict=True):
             record_submission(folder, job.job_id, job.paths.stderr)
             jobs[folder] = job
@@ -356,12 +416,22 @@ def _wait(jobs: dict[Path, Job[Outcome]], trials: Sequence[Trial]) -> list[Outco
             if queue is not None:  # while the scheduler does not answer, no job counts as lost
                 for folder, job in jobs.items():
                     unseen[folder] = 0 if job.job_id in queue else unseen[folder] + 1
-            ended += [folder for folder in jobs if unseen[folder] >= CHECKS_UNTIL_LOST and folder not in ended]
+            ended += [
+                folder
+                for folder in jobs
+                if unseen[folder] >= CHECKS_UNTIL_LOST and folder not in ended
+            ]
         for folder in ended:
             outcomes.append(collect(jobs.pop(folder), folder, trials))
             with suppress(OSError):
                 forget_submission(folder)
-            log.info("%s: %s  (%d of %d)", outcomes[-1].label, outcomes[-1].message, len(outcomes), len(trials))
+            log.info(
+                "%s: %s  (%d of %d)",
+                outcomes[-1].label,
+                outcomes[-1].message,
+                len(outcomes),
+                len(trials),
+            )
         if not ended:
             time.sleep(SECONDS_BETWEEN_POLLS)
     return outcomes

@@ -1,4 +1,5 @@
-"""The progress of a sweep: the states of its trials by arm and scene, its speed, time left and leading arm."""
+"""The progress of a sweep: the states of its trials by arm and scene, its speed, time left and
+leading arm."""
 
 from __future__ import annotations
 
@@ -31,9 +32,9 @@ WAITING = "waiting"
 class Progress:
     """The progress of a sweep.
 
-    ``cells`` has the number of trials by (arm, scene) and state (`COUNTED` or ``waiting``), ``speeds`` the iterations
-    per second of running trainings. ``seconds_left`` is None as long as no trial is done. ``leader`` says which arm
-    is best so far; "" if that cannot be said.
+    ``cells`` has the number of trials by (arm, scene) and state (`COUNTED` or ``waiting``),
+    ``speeds`` the iterations per second of running trainings. ``seconds_left`` is None as long as
+    no trial is done. ``leader`` says which arm is best so far; "" if that cannot be said.
     """
 
     cells: dict[Name, dict[str, int]]
@@ -48,16 +49,23 @@ class Progress:
 
 
 def progress_frame(runs: Path, experiment: str) -> pd.DataFrame:
-    """A row for each arm and scene of an experiment in the folder ``runs``, as ``gsbench status --watch`` shows it.
+    """A row for each arm and scene of an experiment in the folder ``runs``, as ``gsbench status
+    --watch`` shows it.
 
-    Its columns are arm, scene, done, running, failed, waiting (numbers of trials) and iterations_per_second (of
-    running trainings, else 0). ``attrs`` has seconds_left and leader. Raises InputError for an unknown experiment.
+    Its columns are arm, scene, done, running, failed, waiting (numbers of trials) and
+    iterations_per_second (of running trainings, else 0). ``attrs`` has seconds_left and leader.
+    Raises InputError for an unknown experiment.
     """
     import pandas as pd
 
     found = progress_of(experiment_home(runs, experiment))
     rows = [
-        {"arm": arm, "scene": scene, **cell, "iterations_per_second": found.speeds.get((arm, scene), 0.0)}
+        {
+            "arm": arm,
+            "scene": scene,
+            **cell,
+            "iterations_per_second": found.speeds.get((arm, scene), 0.0),
+        }
         for (arm, scene), cell in found.cells.items()
     ]
     frame = pd.DataFrame(rows)
@@ -69,14 +77,18 @@ def progress_of(home: Path) -> Progress:
     """The progress of the experiment in ``home``, from its files."""
     states = [state for state in states_of_experiment(home) if state.state != "superseded"]
     names = _names([state.folder for state in states])
-    cells: dict[Name, dict[str, int]] = {name: dict.fromkeys((*COUNTED, WAITING), 0) for name in sorted(names.values())}
+    cells: dict[Name, dict[str, int]] = {
+        name: dict.fromkeys((*COUNTED, WAITING), 0) for name in sorted(names.values())
+    }
     speeds: dict[Name, float] = defaultdict(float)
     for state in states:
         cells[names[state.folder]][state.state if state.state in COUNTED else WAITING] += 1
         if state.state == "running":
             speeds[names[state.folder]] += _training(state.folder)[1]
     trials = [trial for trial in read_experiment(home).trials if trial.path in names]
-    return Progress(cells, dict(speeds), _seconds_left(states, names, trials), _leader(home, names, trials))
+    return Progress(
+        cells, dict(speeds), _seconds_left(states, names, trials), _leader(home, names, trials)
+    )
 
 
 def _names(folders: Sequence[Path]) -> dict[Path, Name]:
@@ -93,7 +105,8 @@ def _names(folders: Sequence[Path]) -> dict[Path, Name]:
 
 
 def _training(folder: Path) -> tuple[int, float]:
-    """The last iteration of the training in progress, and its iterations per second; zeros if there is none."""
+    """The last iteration of the training in progress, and its iterations per second; zeros if there
+    is none."""
     building = TrialFolder(folder).building()
     file = Path(building.folder, CURVES) if building.folder else None
     rows = read_rows(file) if file is not None and file.exists() else []
@@ -103,7 +116,9 @@ def _training(folder: Path) -> tuple[int, float]:
     return step, step / seconds if seconds > 0 else 0.0
 
 
-def _seconds_left(states: Sequence[TrialState], names: dict[Path, Name], trials: Sequence[TrialResult]) -> float | None:
+def _seconds_left(
+    states: Sequence[TrialState], names: dict[Path, Name], trials: Sequence[TrialResult]
+) -> float | None:
     """The seconds until all trials have ended, if as many run at once as now.
 
     A trial takes as long as the finished ones of its arm and scene, else of its arm, else of all.
@@ -121,7 +136,9 @@ def _seconds_left(states: Sequence[TrialState], names: dict[Path, Name], trials:
         if state.state in ("done", "failed"):
             continue
         arm, scene = names[state.folder]
-        seconds = fmean(next(known[name] for name in ((arm, scene), (arm, ""), ("", "")) if name in known))
+        seconds = fmean(
+            next(known[name] for name in ((arm, scene), (arm, ""), ("", "")) if name in known)
+        )
         total += seconds * (1 - _share_done(state) if state.state == "running" else 1)
     return total / max(1, sum(state.state == "running" for state in states))
 
@@ -155,6 +172,7 @@ def _in_words(means: dict[str, float], metric: Quantity, shared: int) -> str:
     if len({metric.format(mean) for mean in means.values()}) == 1:
         return f"no arm leads in {metric.name}; {shared} trials of each are compared"
     return (
-        f"{best} leads so far: {metric.name} {metric.format(means[best])}, mean of the {shared} scenes and seeds that "
+        f"{best} leads so far: {metric.name} {metric.format(means[best])}, mean of the {shared} "
+        "scenes and seeds that "
         "all arms have. This is not a verdict."
     )

@@ -1,7 +1,8 @@
 """Plan and declarations, which a command writes before its trials run. Loads no torch.
 
-``<runs>/<experiment>/plan.json`` maps the folder of every trial of all commands to the overrides that describe it, so
-that missing trials can be listed. For ``declared.jsonl`` see `gsbench.runs.experiments`.
+``<runs>/<experiment>/plan.json`` maps the folder of every trial of all commands to the overrides
+that describe it, so that missing trials can be listed. For ``declared.jsonl`` see
+`gsbench.runs.experiments`.
 """
 
 import logging
@@ -39,7 +40,8 @@ LEVELS = 3  # folders of scene, arm and trial
 
 @dataclass(frozen=True, kw_only=True)
 class PlannedTrial(Record):
-    """A planned trial: its overrides, the folder in which the command was given, and the Unix time."""
+    """A planned trial: its overrides, the folder in which the command was given, and the Unix
+    time."""
 
     overrides: tuple[str, ...]
     cwd: str
@@ -63,12 +65,15 @@ class PlanFile(Record):
 def add_to_plan(trials: Sequence[Trial]) -> None:
     """Add the trials to the plans of their experiments.
 
-    A trial without overrides, which was read from its own record, is not added: as a plan they would mean the defaults.
+    A trial without overrides, which was read from its own record, is not added: as a plan they
+    would mean the defaults.
     """
     by_home: dict[Path, dict[Path, PlannedTrial]] = {}
     for trial in trials:
         if trial.overrides:
-            planned = PlannedTrial(overrides=tuple(trial.overrides), cwd=os.getcwd(), time=time.time())
+            planned = PlannedTrial(
+                overrides=tuple(trial.overrides), cwd=os.getcwd(), time=time.time()
+            )
             by_home.setdefault(trial.files.home, {})[trial.folder] = planned
     for home, added in by_home.items():
         make_home(home)
@@ -80,7 +85,10 @@ def forget(home: Path, folders: Iterable[Path]) -> None:
     """Drop trials from the plan of the experiment in ``home``."""
     dropped = set(folders)
     with hold(home / f".{PLAN}.lock", "the plan"):
-        _write_plan(home, {folder: trial for folder, trial in read_plan(home).items() if folder not in dropped})
+        _write_plan(
+            home,
+            {folder: trial for folder, trial in read_plan(home).items() if folder not in dropped},
+        )
 
 
 def remove(home: Path, folders: Iterable[Path]) -> None:
@@ -91,7 +99,8 @@ def remove(home: Path, folders: Iterable[Path]) -> None:
     folders = list(folders)
     for folder in folders:
         require_no_links(home.parent, folder)
-        (folder / RESULTS).unlink(missing_ok=True)  # first: a half-deleted trial must not look complete
+        # first: a half-deleted trial must not look complete
+        (folder / RESULTS).unlink(missing_ok=True)
         shutil.rmtree(folder)
     forget(home, folders)
 
@@ -99,7 +108,8 @@ def remove(home: Path, folders: Iterable[Path]) -> None:
 def read_plan(home: Path) -> dict[Path, PlannedTrial]:
     """The planned trials of the experiment in ``home`` by their folders; {} without a plan.
 
-    A damaged plan gives {} with a warning: trials that have begun are found by their folders anyway.
+    A damaged plan gives {} with a warning: trials that have begun are found by their folders
+    anyway.
     """
     try:
         trials = read_typed(home / PLAN, PlanFile).trials
@@ -120,7 +130,8 @@ def _write_plan(home: Path, trials: dict[Path, PlannedTrial]) -> None:
 
 
 def declared_metrics(trials: Sequence[Trial]) -> dict[Path, str | None]:
-    """The metric that each experiment's trials declare (``eval.primary``), by the experiment's folder, or None.
+    """The metric that each experiment's trials declare (``eval.primary``), by the experiment's
+    folder, or None.
 
     Raises InputError if trials of one experiment declare different metrics.
     """
@@ -130,7 +141,8 @@ def declared_metrics(trials: Sequence[Trial]) -> dict[Path, str | None]:
         metric, before = trial.values["eval"].get("primary"), metrics.get(home)
         if metric and before and metric != before:
             raise InputError(
-                f"trials of {home.name} declare eval.primary={before} and eval.primary={metric}: a verdict is about "
+                f"trials of {home.name} declare eval.primary={before} and eval.primary={metric}: "
+                "a verdict is about "
                 "one metric, so give one of them, or run two experiments (name=…)"
             )
         metrics[home] = before or metric
@@ -138,10 +150,12 @@ def declared_metrics(trials: Sequence[Trial]) -> dict[Path, str | None]:
 
 
 def declare(trials: Sequence[Trial]) -> None:
-    """Add a declaration to each experiment's record, unless the latest one already covers these trials.
+    """Add a declaration to each experiment's record, unless the latest one already covers these
+    trials.
 
-    It has the metric (`declared_metrics`) and all trials, done or not. A command without a metric keeps the declared
-    one: the trials that it adds are declared with that metric, with their own time.
+    It has the metric (`declared_metrics`) and all trials, done or not. A command without a metric
+    keeps the declared one: the trials that it adds are declared with that metric, with their own
+    time.
     """
     for home, given in declared_metrics(trials).items():
         seeds: dict[str, set[int]] = {}
@@ -161,20 +175,26 @@ def declare(trials: Sequence[Trial]) -> None:
             before = {} if latest is None else latest.planned
             together = merge_planned(before, asked)
             same_metric = latest is not None and latest.primary == metric
-            if latest is not None and same_metric and (together == before or not latest.names_trials):
+            if (
+                latest is not None
+                and same_metric
+                and (together == before or not latest.names_trials)
+            ):
                 continue
             added = declared_now(questions=(open_question(metric),), trials=dict(together))
             write_text(home / DECLARED, record_text([*declarations, added]))
         if same_metric:
             log.warning(
-                "%s: trials are added to those declared with %s; if there are results already, it no longer decides "
+                "%s: trials are added to those declared with %s; if there are results already, it "
+                "no longer decides "
                 "the verdict alone",
                 home.name,
                 metric,
             )
         elif latest is not None:
             log.warning(
-                "%s: the verdict is from now on about %s, and the report will say that %s was declared before",
+                "%s: the verdict is from now on about %s, and the report will say that %s was "
+                "declared before",
                 home.name,
                 metric,
                 latest.primary,
@@ -182,9 +202,11 @@ def declare(trials: Sequence[Trial]) -> None:
 
 
 def declare_questions(home: Path, asked: Declaration) -> Declaration:
-    """Add questions to the experiment's record: of a file of claims, of a sweep in looks, or of people's votes.
+    """Add questions to the experiment's record: of a file of claims, of a sweep in looks, or of
+    people's votes.
 
-    Returns the recorded declaration: if the latest one of its kind is equal, that one with its earlier time.
+    Returns the recorded declaration: if the latest one of its kind is equal, that one with its
+    earlier time.
     """
     if not asked.questions:
         return asked
@@ -197,7 +219,8 @@ def declare_questions(home: Path, asked: Declaration) -> Declaration:
         write_text(home / DECLARED, record_text([*declarations, asked]))
     if same_kind and asked.kind != "votes":  # votes are judged by their own round alone
         log.warning(
-            "%s: other questions were declared before: trials that were measured under them count as looked at",
+            "%s: other questions were declared before: trials that were measured under them count "
+            "as looked at",
             home.name,
         )
     return asked

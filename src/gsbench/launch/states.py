@@ -1,4 +1,5 @@
-"""The states of trials, from their folders and from Slurm's queue, and the listing of a dry run. Loads no torch.
+"""The states of trials, from their folders and from Slurm's queue, and the listing of a dry run.
+Loads no torch.
 
 A file in a trial's folder names its Slurm job.
 """
@@ -34,8 +35,8 @@ from gsbench.words import counted, readable_time
 class TrialState:
     """A trial's state, since when it has it (Unix time), and a note.
 
-    A ``queued`` trial waits in Slurm's queue. A finished trial is ``superseded`` if its code is no longer the present
-    code; a failed one if a trial of later code has the same settings.
+    A ``queued`` trial waits in Slurm's queue. A finished trial is ``superseded`` if its code is no
+    longer the present code; a failed one if a trial of later code has the same settings.
     """
 
     folder: Path
@@ -47,14 +48,19 @@ class TrialState:
 def states_of_experiment(home: Path) -> list[TrialState]:
     """The states of all trials of the experiment in ``home``, planned or with a folder."""
     planned = {folder: trial.time for folder, trial in read_plan(home).items()}
-    begun = {path for path in map(Path, trial_folders(home)) if SEED in path.name and (path / CONFIG).exists()}
+    begun = {
+        path
+        for path in map(Path, trial_folders(home))
+        if SEED in path.name and (path / CONFIG).exists()
+    }
     folders = sorted({*planned, *begun})
     queue = ask_queue(folders)
     return _mark_superseded([_state(folder, planned.get(folder), queue) for folder in folders])
 
 
 def _mark_superseded(trials: Sequence[TrialState]) -> list[TrialState]:
-    """The states, in which failed and stopped trials are superseded if a trial of the same settings got further.
+    """The states, in which failed and stopped trials are superseded if a trial of the same settings
+    got further.
 
     Such trials differ only in the code of a user's class, which was repaired in between.
     """
@@ -90,13 +96,19 @@ def _state(folder: Path, planned: float | None, queue: Queue | None) -> TrialSta
     """The state of the trial in ``folder``; ``planned`` is the time of its plan."""
     state = TrialFolder(folder).state()
     if state == "done":
-        return TrialState(folder, state, _changed(folder / RESULTS), TrialFolder(folder).record().remark)
+        return TrialState(
+            folder, state, _changed(folder / RESULTS), TrialFolder(folder).record().remark
+        )
     if state == "running":
         holder = read_holder(folder / LOCK)
-        since, process = (None, "process ? on ?") if holder is None else (holder.since, holder.description)
+        since, process = (
+            (None, "process ? on ?") if holder is None else (holder.since, holder.description)
+        )
         return TrialState(folder, state, since, f"{_progress(folder)} {process}".strip())
     if state == "damaged":
-        return TrialState(folder, state, _changed(folder / RESULTS), TrialFolder(folder).why_not_done({}))
+        return TrialState(
+            folder, state, _changed(folder / RESULTS), TrialFolder(folder).why_not_done({})
+        )
     submission = read_submission(folder)
     lost = ""
     if submission:
@@ -107,16 +119,24 @@ def _state(folder: Path, planned: float | None, queue: Queue | None) -> TrialSta
             return TrialState(folder, in_queue, _changed(folder / SUBMITTED), note)
         lost = f"; Slurm job {submission.job} has ended, log: {submission.log}"
     if state == "failed":
-        return TrialState(folder, state, _changed(folder / FAILED), TrialFolder(folder).failure().reason)
+        return TrialState(
+            folder, state, _changed(folder / FAILED), TrialFolder(folder).failure().reason
+        )
     if state == "partial":
-        return TrialState(folder, state, _changed(folder / CONFIG), f"stopped {_progress(folder)}".strip() + lost)
+        return TrialState(
+            folder, state, _changed(folder / CONFIG), f"stopped {_progress(folder)}".strip() + lost
+        )
     return TrialState(folder, state, planned, "never started" + lost)
 
 
 def _progress(folder: Path) -> str:
     """``in train at iteration 7000``; "" if no stage has begun."""
     stage, step = TrialFolder(folder).stage_and_step()
-    return f"in {stage}" + (f" at iteration {step}" if stage == "train" and step else "") if stage else ""
+    return (
+        f"in {stage}" + (f" at iteration {step}" if stage == "train" and step else "")
+        if stage
+        else ""
+    )
 
 
 def _changed(path: Path) -> float | None:
@@ -129,7 +149,15 @@ def _changed(path: Path) -> float | None:
 # ---- Slurm's queue
 
 SECONDS_TO_ANSWER = 60.0
-WAITING = ("PENDING", "CONFIGURING", "REQUEUED", "REQUEUE_HOLD", "REQUEUE_FED", "RESV_DEL_HOLD", "SPECIAL_EXIT")
+WAITING = (
+    "PENDING",
+    "CONFIGURING",
+    "REQUEUED",
+    "REQUEUE_HOLD",
+    "REQUEUE_FED",
+    "RESV_DEL_HOLD",
+    "SPECIAL_EXIT",
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,7 +171,8 @@ class Submission(Record):
 
 @dataclass(frozen=True)
 class QueuedJob:
-    """A job or array task in the queue: its state as Slurm names it, and the reason why it waits."""
+    """A job or array task in the queue: its state as Slurm names it, and the reason why it
+    waits."""
 
     state: str
     reason: str
@@ -169,7 +198,8 @@ def record_submission(folder: Path, job: str, log: Path) -> None:
 
 
 def read_submission(folder: Path) -> Submission | None:
-    """The last job of the trial in ``folder``; None if it was never submitted, or if the job has ended normally."""
+    """The last job of the trial in ``folder``; None if it was never submitted, or if the job has
+    ended normally."""
     return read_if_sound(folder / SUBMITTED, Submission)
 
 
@@ -181,7 +211,11 @@ def forget_submission(folder: Path) -> None:
 def ask_queue(folders: Iterable[Path]) -> Queue | None:
     """The queue of all users who submitted trials in ``folders``; None if Slurm does not answer."""
     submissions = list(filter(None, map(read_submission, folders)))
-    return read_queue({submission.user or current_user() for submission in submissions}) if submissions else {}
+    return (
+        read_queue({submission.user or current_user() for submission in submissions})
+        if submissions
+        else {}
+    )
 
 
 def state_in_queue(folder: Path, queue: Queue | None) -> Literal["queued", "running"] | None:
@@ -196,10 +230,19 @@ def state_in_queue(folder: Path, queue: Queue | None) -> Literal["queued", "runn
 
 
 def read_queue(users: Iterable[str]) -> Queue | None:
-    """The jobs and array tasks of ``users`` by id; None if there is no Slurm, or if it does not answer."""
-    command = ["squeue", f"--user={','.join(sorted(users))}", "--noheader", "--array", "--format=%i|%T|%r"]
+    """The jobs and array tasks of ``users`` by id; None if there is no Slurm, or if it does not
+    answer."""
+    command = [
+        "squeue",
+        f"--user={','.join(sorted(users))}",
+        "--noheader",
+        "--array",
+        "--format=%i|%T|%r",
+    ]
     try:
-        listing = subprocess.run(command, capture_output=True, text=True, timeout=SECONDS_TO_ANSWER, check=True)
+        listing = subprocess.run(
+            command, capture_output=True, text=True, timeout=SECONDS_TO_ANSWER, check=True
+        )
     except (OSError, subprocess.SubprocessError):
         return None
     lines = [line.split("|") for line in listing.stdout.splitlines() if line.count("|") == 2]
@@ -211,9 +254,10 @@ def current_user() -> str:
     return psutil.Process().username()
 
 
-# ---- a dry run: all finished trials are read once, so that ten thousand planned ones can be compared with them
+# ---- a dry run: all finished trials are read once, to compare ten thousand planned ones with them
 
-STATES = ("done", "partial", "missing", "running", "queued", "failed", "damaged")  # in the order of a summary
+# in the order of a summary
+STATES = ("done", "partial", "missing", "running", "queued", "failed", "damaged")
 
 
 class FinishedTrials:
@@ -221,7 +265,8 @@ class FinishedTrials:
 
     def __init__(self, runs: Path) -> None:
         self._folders: dict[str, list[Path]] = defaultdict(list)
-        self._seconds: dict[str, list[float]] = defaultdict(list)  # for an iteration, by `_similarities`
+        # for an iteration, by `_similarities`
+        self._seconds: dict[str, list[float]] = defaultdict(list)
         for path in runs.glob(f"*/{TRIAL_GLOB}/{RESULTS}"):
             files = TrialFolder(path.parent)
             record = files.sound_record()
@@ -235,15 +280,20 @@ class FinishedTrials:
                         self._seconds[similarity].append(seconds / record.iterations)
 
     def elsewhere(self, trial: TrialFolder) -> str | None:
-        """Another experiment that has finished the same trial, so that its stages are reused; None if there is none."""
-        others = (folder for folder in self._folders.get(trial.path.name, ()) if folder != trial.path)
+        """Another experiment that has finished the same trial, so that its stages are reused; None
+        if there is none."""
+        others = (
+            folder for folder in self._folders.get(trial.path.name, ()) if folder != trial.path
+        )
         return next((folder.relative_to(trial.runs).parts[0] for folder in others), None)
 
     def estimate(self, values: Mapping[str, Any]) -> tuple[float, int]:
-        """Seconds for the whole trial with ``values``, and the number of finished trials that this is known from.
+        """Seconds for the whole trial with ``values``, and the number of finished trials that this
+        is known from.
 
-        These have the same scene at the same size, the same rasterizer and, if possible, the same densifier. Times are
-        taken per iteration. Without such trials there is no estimate, ``(0, 0)``.
+        These have the same scene at the same size, the same rasterizer and, if possible, the same
+        densifier. Times are taken per iteration. Without such trials there is no estimate, ``(0,
+        0)``.
         """
         for similarity in _similarities(values):
             if seconds := self._seconds.get(similarity):
@@ -252,7 +302,8 @@ class FinishedTrials:
 
 
 def _similarities(settings: Mapping[str, Any]) -> tuple[str, str]:
-    """What trials with similar times have in common: scene, rasterizer and densifier; scene and rasterizer."""
+    """What trials with similar times have in common: scene, rasterizer and densifier; scene and
+    rasterizer."""
     shared = [settings["scene"], settings["raster"]["name"]]
     return sha256_of([*shared, settings["densify"]["name"]]), sha256_of(shared)
 
@@ -288,11 +339,16 @@ def describe_plan(trials: Sequence[Trial], parallel: int = 1) -> list[str]:
     if counts["done"] == len(trials):
         return lines
     if without_estimate:
-        time = "no estimate: no finished trial of this scene with this rasterizer tells how long one takes here"
+        time = (
+            "no estimate: no finished trial of this scene with this rasterizer tells how long "
+            "one takes here"
+        )
     elif learned_from == 0:
         time = "seconds, since other experiments have the results"
     else:
         at_once = f", {parallel} at once" if parallel > 1 else ""
         duration = readable_time(remaining / parallel)
-        time = f"about {duration}{at_once}, estimated from {counted(learned_from, 'finished trial')}"
+        time = (
+            f"about {duration}{at_once}, estimated from {counted(learned_from, 'finished trial')}"
+        )
     return [*lines, f"time: {time}"]

@@ -1,4 +1,5 @@
-"""The parts of a trial: the objects that its configuration describes. Errors name the configuration's key."""
+"""The parts of a trial: the objects that its configuration describes. Errors name the
+configuration's key."""
 
 import dataclasses
 import inspect
@@ -32,7 +33,14 @@ from gsbench.init.base import Initializer
 from gsbench.raster import EXECUTORS, Rasterizer
 from gsbench.raster.executors import AUTO, offers, resolve
 from gsbench.runs.experiments import metric_and_question
-from gsbench.runs.keys import OWN, UserCode, module_digest, targets_in, unnamed_modules, user_modules
+from gsbench.runs.keys import (
+    OWN,
+    UserCode,
+    module_digest,
+    targets_in,
+    unnamed_modules,
+    user_modules,
+)
 from gsbench.scene.options import SceneConfig
 from gsbench.settings import check_values, unknown_setting
 from gsbench.system.device import select_device
@@ -43,11 +51,17 @@ from gsbench.words import did_you_mean
 
 log = logging.getLogger(__name__)
 
-# Features of a render that not every rasterizer has: the densifier's attribute that asks for it -> (the rasterizer's
-# attribute that offers it, the error's words).
+# Features of a render that not every rasterizer has: the densifier's attribute that asks for it ->
+# (the rasterizer's attribute that offers it, the error's words).
 OPTIONAL_FEATURES = {
-    "needs_footprint": ("has_footprint", "needs the pixels that a Gaussian covers, and raster={} does not give them"),
-    "needs_splitting_matrix": ("has_splitting_matrix", "needs splitting matrices, and raster={} does not give them"),
+    "needs_footprint": (
+        "has_footprint",
+        "needs the pixels that a Gaussian covers, and raster={} does not give them",
+    ),
+    "needs_splitting_matrix": (
+        "has_splitting_matrix",
+        "needs splitting matrices, and raster={} does not give them",
+    ),
 }
 RESERVED = ("_target_", "name", "switches")  # keys of a group that are not options of its class
 REQUIRED_METHODS = {  # of a user's class, by the group that names it
@@ -59,13 +73,16 @@ REQUIRED_METHODS = {  # of a user's class, by the group that names it
 
 
 class Parts:
-    """The objects that the resolved configuration ``values`` describes. Each is made at its first use and kept.
+    """The objects that the resolved configuration ``values`` describes. Each is made at its first
+    use and kept.
 
-    The first use raises InputError for a wrong key. It also runs the user's code if the class is the user's own.
+    The first use raises InputError for a wrong key. It also runs the user's code if the class is
+    the user's own.
     """
 
     def __init__(self, values: dict[str, Any]) -> None:
-        check_permissions(values)  # again: `values` may come from a config.yaml that nobody has composed
+        # again: `values` may come from a config.yaml that nobody has composed
+        check_permissions(values)
         self.values = values
         self.seed: int = values["seed"]
         self._allowed: list[str] = values["allow_targets"]
@@ -85,14 +102,16 @@ class Parts:
     @cached_property
     def initializer(self) -> Initializer:
         values = self.values["init"]
-        if values.get("threads") == "auto" and values["_target_"].startswith(OWN):  # else COLMAP takes all cores
+        # else COLMAP takes all cores
+        if values.get("threads") == "auto" and values["_target_"].startswith(OWN):
             values = values | {"threads": self.threads}
         initializer: Initializer = build("init", values, self._allowed)
         return initializer
 
     @cached_property
     def trainer(self) -> Densifier | External:
-        """The trainer that the group densify describes: a densifier of gsbench's own trainer, or another program."""
+        """The trainer that the group densify describes: a densifier of gsbench's own trainer, or
+        another program."""
         trainer: Densifier | External = build("densify", self.values["densify"], self._allowed)
         return trainer
 
@@ -120,7 +139,11 @@ class Parts:
     def threads(self) -> int:
         """The CPU threads that the trial may use on this machine."""
         wanted = self.values["threads"]
-        return available_threads(self.values["launch"]["parallel"]) if wanted == "auto" else int(wanted)
+        return (
+            available_threads(self.values["launch"]["parallel"])
+            if wanted == "auto"
+            else int(wanted)
+        )
 
     @cached_property
     def raster(self) -> Proven:
@@ -151,9 +174,11 @@ class Parts:
         return sorted({step for step in self.eval.at if step < self.train.iterations})
 
     def check(self, on_this_machine: bool) -> None:
-        """Raise InputError, which names the key, for what is known to fail. Call it before any work.
+        """Raise InputError, which names the key, for what is known to fail. Call it before any
+        work.
 
-        With ``on_this_machine`` the trial will run on this machine, so its devices and programs are checked too.
+        With ``on_this_machine`` the trial will run on this machine, so its devices and programs are
+        checked too.
         """
         _ = self.initializer, self.trainer, self.metrics
         name, own = self.values["raster"]["name"], self.own_rasterizer
@@ -169,17 +194,23 @@ class Parts:
     def _check_features(self, raster: str) -> None:
         """Raise InputError if the densifier needs a feature that raster=``raster`` lacks."""
         for need, (offer, words) in OPTIONAL_FEATURES.items():
-            if getattr(self.trainer, need, False) and not offers(raster, offer, self.own_rasterizer):
-                able = " or ".join(f"raster={executor.name}" for executor in EXECUTORS if getattr(executor, offer))
-                raise InputError(f"densify={self.values['densify']['name']} {words.format(raster)}; take {able}")
+            if getattr(self.trainer, need, False) and not offers(
+                raster, offer, self.own_rasterizer
+            ):
+                able = " or ".join(
+                    f"raster={executor.name}" for executor in EXECUTORS if getattr(executor, offer)
+                )
+                raise InputError(
+                    f"densify={self.values['densify']['name']} {words.format(raster)}; take {able}"
+                )
 
 
 def build(group: str, values: dict[str, Any], allow_targets: list[str]) -> Any:
     """The object that ``values`` of ``group`` (init, densify, raster, eval.extra.NAME) describes.
 
-    ``_target_`` names a class by its import path; the other keys are its arguments. gsbench's own classes check them
-    against their annotations. For a user's dataclass this is done here, before its code sees them. Raises InputError
-    naming the key that is unknown or wrong.
+    ``_target_`` names a class by its import path; the other keys are its arguments. gsbench's own
+    classes check them against their annotations. For a user's dataclass this is done here, before
+    its code sees them. Raises InputError naming the key that is unknown or wrong.
     """
     target = values["_target_"]
     for place, nested_target in targets_in(values, tuple(group.split("."))):
@@ -195,7 +226,8 @@ def build(group: str, values: dict[str, Any], allow_targets: list[str]) -> Any:
         options = check_values(cls, options, group)
     elif options and not own:
         raise InputError(
-            f"{group}._target_={target} has options but is not a dataclass: make it one, so that results are stored "
+            f"{group}._target_={target} has options but is not a dataclass: make it one, so that "
+            "results are stored "
             "under their values"
         )
     try:
@@ -207,7 +239,9 @@ def build(group: str, values: dict[str, Any], allow_targets: list[str]) -> Any:
     except (Exception, SystemExit) as error:  # a user's class may raise anything
         if own:
             raise
-        raise InputError(f"{group}: {target} cannot be made ({type(error).__name__}: {error})") from error
+        raise InputError(
+            f"{group}: {target} cannot be made ({type(error).__name__}: {error})"
+        ) from error
 
 
 def build_own_rasterizer(values: dict[str, Any], allow_targets: list[str]) -> Rasterizer | None:
@@ -218,21 +252,24 @@ def build_own_rasterizer(values: dict[str, Any], allow_targets: list[str]) -> Ra
     target, name = values["_target_"], getattr(rasterizer, "name", None)
     if not isinstance(name, str) or any(name == executor.name for executor in EXECUTORS):
         raise InputError(
-            f"raster._target_={target} needs an attribute name, a text that results and tables show and that no other "
+            f"raster._target_={target} needs an attribute name, a text that results and tables "
+            "show and that no other "
             f"rasterizer has; it has {name!r}"
         )
     return rasterizer
 
 
 def build_metrics(values: dict[str, Any], allow_targets: list[str]) -> dict[str, Metric]:
-    """The user's own metrics that the settings ``eval`` name. Raises InputError for an unusable one."""
+    """The user's own metrics that the settings ``eval`` name. Raises InputError for an unusable
+    one."""
     metrics: dict[str, Metric] = {}
     for name, options in values.get("extra", {}).items():
         metrics[name] = build(f"eval.extra.{name}", options, allow_targets)
         primary = values.get("primary") or ""
         if facts_of(name, metrics[name]).direction == 0 and metric_and_question(primary)[0] == name:
             raise InputError(
-                f"eval.primary={primary}: {options['_target_']} does not say whether more or less is better "
+                f"eval.primary={primary}: {options['_target_']} does not say whether more or less "
+                "is better "
                 "(direction), so no verdict can be about it"
             )
     return metrics
@@ -241,23 +278,28 @@ def build_metrics(values: dict[str, Any], allow_targets: list[str]) -> dict[str,
 def _check_names(cls: Any, target: str, options: dict[str, Any], group: str) -> None:
     """Raise InputError for an option that the constructor of ``cls`` does not take.
 
-    An option that a user's class lacks mostly belongs to the choice (``densify=adc``) whose class the user replaced.
+    An option that a user's class lacks mostly belongs to the choice (``densify=adc``) whose class
+    the user replaced.
     """
     parameters = inspect.signature(cls).parameters
     unknown = next((name for name in options if name not in parameters), None)
-    if unknown is None or any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values()):
+    if unknown is None or any(
+        parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values()
+    ):
         return
     key = f"{group}.{unknown}"
     if target.startswith(OWN):
         raise InputError(unknown_setting(key, unknown, parameters))
     raise InputError(
-        f"{key} is not a setting{did_you_mean(unknown, parameters)} ({target} has: {', '.join(parameters) or 'none'}); "
+        f"{key} is not a setting{did_you_mean(unknown, parameters)} ({target} has: "
+        f"{', '.join(parameters) or 'none'}); "
         f"remove it by ~{key}, or start from another choice, {group}=NAME"
     )
 
 
 def locate(target: str, group: str, allow_targets: list[str]) -> type:
-    """The class at the import path ``package.module.Class``. Raises InputError if ``group`` cannot use it.
+    """The class at the import path ``package.module.Class``. Raises InputError if ``group`` cannot
+    use it.
 
     Warns of code whose version the results cannot record.
     """
@@ -271,20 +313,25 @@ def locate(target: str, group: str, allow_targets: list[str]) -> type:
     if target.startswith(OWN):
         return cls
     module, permitted = target.split(".")[0], {name.split(".")[0] for name in allow_targets}
-    # The first call keeps the digest of the files. It must come right after the import: later they may be edited, and
-    # the digest would be of code that does not run.
+    # The first call keeps the digest of the files. It must come right after the import: later they
+    # may be edited, and the digest would be of code that does not run.
     if module_digest(module) is None:
         log.warning("no file of %s was found: results do not record its version", target)
     if unnamed := unnamed_modules(loaded_before, {module, *permitted}):
         words = ", ".join(unnamed)
         log.warning(
-            "%s imports %s, and results do not record their versions: name them in allow_targets too", target, words
+            "%s imports %s, and results do not record their versions: name them in allow_targets "
+            "too",
+            target,
+            words,
         )
     return cls
 
 
 def make_evaluator(
-    options: EvalConfig, device: torch.device | str = "cpu", extra: Mapping[str, Metric] = MappingProxyType({})
+    options: EvalConfig,
+    device: torch.device | str = "cpu",
+    extra: Mapping[str, Metric] = MappingProxyType({}),
 ) -> Evaluator:
     """The evaluator that the settings ``eval`` describe, with the user's own metrics ``extra``.
 

@@ -1,4 +1,5 @@
-"""One trial: its steps in order, how it gets from a configuration to ``results.json``, and the content of that file."""
+"""One trial: its steps in order, how it gets from a configuration to ``results.json``, and the
+content of that file."""
 
 import logging
 import sys
@@ -17,7 +18,14 @@ from gsbench import __version__
 from gsbench.config.compose import Trial
 from gsbench.errors import GsbenchError, InputError, TrainingError
 from gsbench.events import sum_events
-from gsbench.files import link_or_copy, remove_temporaries, require_no_links, storage_errors, write_json, write_text
+from gsbench.files import (
+    link_or_copy,
+    remove_temporaries,
+    require_no_links,
+    storage_errors,
+    write_json,
+    write_text,
+)
 from gsbench.gaussians.ply import read_ply, write_ply
 from gsbench.init import Sfm
 from gsbench.init.base import GAUSSIANS_FILE, MODEL_FOLDER, PICTURE_FILE, REPORT_FILE
@@ -65,8 +73,13 @@ from gsbench.system.stopping import reinstall_handlers
 log = logging.getLogger(__name__)
 
 PUBLISHED_TRAINING = (
-    layout.POINT_CLOUD, layout.LINEAGE, layout.CURVES, layout.EVENTS, layout.HISTOGRAMS, layout.TRAINER_LOG
-)  # fmt: skip
+    layout.POINT_CLOUD,
+    layout.LINEAGE,
+    layout.CURVES,
+    layout.EVENTS,
+    layout.HISTOGRAMS,
+    layout.TRAINER_LOG,
+)
 
 
 class TrialSteps:
@@ -74,17 +87,20 @@ class TrialSteps:
 
     # `steps` sets these three as it goes.
     photographs: Capture  # the photographs as the user gave them
-    capture: Capture  # the photographs as the steps see them: masked and transparent pixels are replaced
+    # the photographs as the steps see them: masked and transparent pixels are replaced
+    capture: Capture
     views: Views
 
     def __init__(self, parts: Parts, store: Store) -> None:
         self.parts, self.store = parts, store
 
     def steps(self) -> Iterator[keys.Step]:
-        """The steps in order. A caller that wants results builds each step before it asks for the next.
+        """The steps in order. A caller that wants results builds each step before it asks for the
+        next.
 
-        Keys are known without building, with one exception: the courtyard's photographs must be rendered before their
-        fingerprint is known. While they are missing from the store, the step that renders them is the last.
+        Keys are known without building, with one exception: the courtyard's photographs must be
+        rendered before their fingerprint is known. While they are missing from the store, the step
+        that renders them is the last.
         """
         parts, store = self.parts, self.store
         source = CaptureSource(parts.scene)
@@ -93,7 +109,9 @@ class TrialSteps:
             yield capture_step
             if store.find(capture_step) is None:
                 return
-        self.capture = self.photographs = source.read(None if capture_step is None else store.path(capture_step))
+        self.capture = self.photographs = source.read(
+            None if capture_step is None else store.path(capture_step)
+        )
         masking = masking_step(self.photographs, parts.scene.transparent)
         if masking is not None:
             yield masking
@@ -110,7 +128,11 @@ class TrialSteps:
         yield init
         self.views = Views(store, self.capture, init, parts.scene)
         program = parts.program
-        trained = train_step(self.views, parts) if program is None else external_step(self.views, program, parts)
+        trained = (
+            train_step(self.views, parts)
+            if program is None
+            else external_step(self.views, program, parts)
+        )
         yield trained
         yield ground_truth_step(self.views)
         yield evaluate_step(self.views, trained, parts)
@@ -119,8 +141,9 @@ class TrialSteps:
 def run_trial(trial: Trial, wait: bool = True) -> TrialRecord:
     """Run the trial unless it is done; returns what ``results.json`` holds.
 
-    On failure, ``failed.json`` and ``log.txt`` in the trial's folder say why, and the error is raised again. If another
-    process runs this trial, this waits for it, or raises BusyError if ``wait`` is False.
+    On failure, ``failed.json`` and ``log.txt`` in the trial's folder say why, and the error is
+    raised again. If another process runs this trial, this waits for it, or raises BusyError if
+    ``wait`` is False.
     """
     reinstall_handlers()
     folder = trial.files
@@ -138,17 +161,22 @@ def run_trial(trial: Trial, wait: bool = True) -> TrialRecord:
 
 @contextmanager
 def _recorded_failures(values: dict[str, Any], folder: TrialFolder) -> Iterator[None]:
-    """Write ``failed.json`` if the block fails. Code that ends the process has failed, even with exit code 0."""
+    """Write ``failed.json`` if the block fails. Code that ends the process has failed, even with
+    exit code 0."""
     try:
         with storage_errors(folder.runs):
             try:
                 yield
             except SystemExit as ended:
-                text = f"code of the trial ended the process (exit code {ended.code}) instead of returning"
+                text = (
+                    f"code of the trial ended the process (exit code {ended.code}) instead of "
+                    "returning"
+                )
                 raise TrainingError(text) from ended
             except torch.OutOfMemoryError as error:
                 raise TrainingError(
-                    f"the memory of device={values['device']} is full: lower scene.max_size or the number of trials at "
+                    f"the memory of device={values['device']} is full: lower scene.max_size or "
+                    "the number of trials at "
                     "once (launch.parallel), or end other programs on that device"
                 ) from error
     except Exception as error:
@@ -174,7 +202,8 @@ def _run(trial: Trial, folder: TrialFolder) -> TrialRecord:
     with _recorded_failures(values, folder):
         parts = Parts(values)
         parts.check(on_this_machine=True)
-        _ = parts.rasterizer  # raises now, not after hours of work, if it cannot run on this machine
+        # raises now, not after hours of work, if it cannot run on this machine
+        _ = parts.rasterizer
         torch.set_num_threads(parts.threads)
 
         def announce(stage: keys.Stage, place: Path) -> None:
@@ -189,13 +218,27 @@ def _run(trial: Trial, folder: TrialFolder) -> TrialRecord:
         for step in trial_steps.steps():
             if step.stage.name == keys.TRAIN.name:
                 scene = trial_steps.views.scene
-                log.info("%s: %d training and %d test views", folder.label, len(scene.train), len(scene.test))
+                log.info(
+                    "%s: %d training and %d test views",
+                    folder.label,
+                    len(scene.train),
+                    len(scene.test),
+                )
             entries[step.stage.name] = entry = store.get(step)
             code |= step.code
             if step.stage is keys.INIT:
                 link_or_copy(entry.path / REPORT_FILE, folder.path / layout.INIT_REPORT)
-        results = results_of(values, trial_steps.capture, trial_steps.views.scene, parts.rasterizer.name, entries, code)
-        results = replace(results, raster_proof=parts.raster.proof, raster_passed_over=[*parts.raster.passed_over])
+        results = results_of(
+            values,
+            trial_steps.capture,
+            trial_steps.views.scene,
+            parts.rasterizer.name,
+            entries,
+            code,
+        )
+        results = replace(
+            results, raster_proof=parts.raster.proof, raster_passed_over=[*parts.raster.passed_over]
+        )
         published = _publish(folder.path, entries, trial_steps.capture.normalization)
         made_of = {name: entry.path for name, entry in entries.items() if name != keys.CAPTURE.name}
         sources = source_files(trial_steps.photographs, store)
@@ -210,25 +253,36 @@ def _run(trial: Trial, folder: TrialFolder) -> TrialRecord:
 
 
 def source_files(capture: Capture, store: Store) -> list[Path]:
-    """The user's files from which a capture was read; none for a scene that gsbench made in the store."""
+    """The user's files from which a capture was read; none for a scene that gsbench made in the
+    store."""
     if capture.images.resolve().is_relative_to(store.root.resolve()):
         return []
     images = [(capture.images / name).resolve() for name in capture.image_names]
     images += [file.resolve() for file in (*capture.masks.values(), *capture.read_from)]
-    return images + ([] if capture.model is None else [path.resolve() for path in model_files(capture.model)])
+    return images + (
+        [] if capture.model is None else [path.resolve() for path in model_files(capture.model)]
+    )
 
 
-def _publish(folder: Path, entries: Mapping[str, StoredResult], normalization: Normalization) -> list[Path]:
+def _publish(
+    folder: Path, entries: Mapping[str, StoredResult], normalization: Normalization
+) -> list[Path]:
     """Link the steps' files into the trial's folder, or copy them; returns the new paths.
 
     The model gets the coordinates in which the scene was given.
     """
-    init, trained, evaluated = (entries[stage.name].path for stage in (keys.INIT, keys.TRAIN, keys.EVALUATE))
-    links = {folder / name: trained / name for name in PUBLISHED_TRAINING if (trained / name).exists()}
+    init, trained, evaluated = (
+        entries[stage.name].path for stage in (keys.INIT, keys.TRAIN, keys.EVALUATE)
+    )
+    links = {
+        folder / name: trained / name for name in PUBLISHED_TRAINING if (trained / name).exists()
+    }
     links[folder / layout.PER_VIEW] = evaluated / layout.PER_VIEW
     pictures = {name: evaluated / name for name in (layout.RENDERS, layout.FIGURES)}
     truth = entries[keys.GROUND_TRUTH.name].path
-    for name, source in (pictures | {layout.GROUND_TRUTH: truth, layout.MASKS: truth / layout.MASKS}).items():
+    for name, source in (
+        pictures | {layout.GROUND_TRUTH: truth, layout.MASKS: truth / layout.MASKS}
+    ).items():
         links |= {folder / name / file.name: file for file in sorted(source.glob("*.png"))}
     if (init / PICTURE_FILE).exists():
         links[folder / layout.FIGURES / layout.INITIAL_CLOUD] = init / PICTURE_FILE
@@ -243,7 +297,8 @@ def _publish(folder: Path, entries: Mapping[str, StoredResult], normalization: N
 
 # ---- the content of results.json
 
-PACKAGES = ("torch", "numpy", "numba", "pycolmap", "kornia", "gsplat")  # on whose versions a result depends
+# on whose versions a result depends
+PACKAGES = ("torch", "numpy", "numba", "pycolmap", "kornia", "gsplat")
 
 
 def results_of(
@@ -256,16 +311,27 @@ def results_of(
 ) -> TrialRecord:
     """The results of the trial with the configuration ``values``.
 
-    ``capture`` are the photographs, ``raster`` names the executor that rendered, ``entries`` are the steps' store
-    entries by stage. ``code`` maps the parts of gsbench's source that the steps used to their states.
+    ``capture`` are the photographs, ``raster`` names the executor that rendered, ``entries`` are
+    the steps' store entries by stage. ``code`` maps the parts of gsbench's source that the steps
+    used to their states.
     """
-    init, trained, evaluated = entries[keys.INIT.name], entries[keys.TRAIN.name], entries[keys.EVALUATE.name]
+    init, trained, evaluated = (
+        entries[keys.INIT.name],
+        entries[keys.TRAIN.name],
+        entries[keys.EVALUATE.name],
+    )
     training = read_typed(trained.path / layout.TRAINING, Training)
     evaluation = read_typed(evaluated.path / layout.METRICS, Evaluation)
     manifest = read_manifest(evaluated.path)
-    primary, declarations = values["eval"].get("primary"), read_declarations(TrialFolder.of(values).home)
+    primary, declarations = (
+        values["eval"].get("primary"),
+        read_declarations(TrialFolder.of(values).home),
+    )
     declared = [one for one in declarations if one.kind == "sweep" and one.primary == primary]
-    sizes = sorted({(view.camera.width, view.camera.height) for view in [*scene.train, *scene.test]}, reverse=True)
+    sizes = sorted(
+        {(view.camera.width, view.camera.height) for view in [*scene.train, *scene.test]},
+        reverse=True,
+    )
     seconds = {"init": init.seconds, "train": training.seconds, "evaluate": evaluated.seconds}
     evaluated_from, unknown = training.evaluated_from, dict[str, str]()
     if evaluated_from == FROM_RENDERS:
@@ -275,7 +341,9 @@ def results_of(
     if training.trained_by is None and not training.iterations:  # a ready-made model
         del seconds[keys.TRAIN.name]
         evaluated_from = FROM_MODEL
-        unknown |= dict.fromkeys(("train_time", "total_time"), f"{MADE_ELSEWHERE}: not trained here")
+        unknown |= dict.fromkeys(
+            ("train_time", "total_time"), f"{MADE_ELSEWHERE}: not trained here"
+        )
     return TrialRecord(
         status="complete",
         experiment=values["name"],
@@ -298,7 +366,9 @@ def results_of(
         causes=training.causes,
         one_color_psnr=evaluation.one_color_psnr,
         initial_cloud=training.initial_cloud,
-        twins=TwinViews(left_out={**capture.left_out, **scene.twins.left_out}, near=dict(scene.twins.near)),
+        twins=TwinViews(
+            left_out={**capture.left_out, **scene.twins.left_out}, near=dict(scene.twins.near)
+        ),
         scene_extent=training.scene_extent,
         seconds=seconds,
         peak_memory_mb=training.peak_memory_mb,
@@ -350,4 +420,6 @@ def cloud_hash(init: Path) -> str:
 def versions() -> dict[str, str]:
     """Versions of what a result depends on."""
     own = {"python": sys.version.split()[0], "gsbench": __version__}
-    return own | {package: version for package in PACKAGES if (version := version_of(package)) is not None}
+    return own | {
+        package: version for package in PACKAGES if (version := version_of(package)) is not None
+    }

@@ -1,4 +1,5 @@
-"""Rasterizers: one contract (``raster.base``) and several executors (``raster.executors``), chosen by name.
+"""Rasterizers: one contract (``raster.base``) and several executors (``raster.executors``), chosen
+by name.
 
 Does not import torch until a rasterizer is made.
 """
@@ -16,13 +17,22 @@ if TYPE_CHECKING:
 
 
 def create_rasterizer(name: str, device: torch.device, threads: int | None = None) -> Rasterizer:
-    """Make the rasterizer that ``name``, perhaps ``auto``, selects on ``device``; ``threads`` limits the CPU threads of
-    ``cpu``."""
+    """Make the rasterizer that ``name``, perhaps ``auto``, selects on ``device``; ``threads``
+    limits the CPU threads of ``cpu``."""
     executor = resolve(name, device.type)
     module, _, attribute = executor.target.rpartition(".")
     rasterizer_class = getattr(importlib.import_module(module), attribute)
-    rasterizer: Rasterizer = rasterizer_class(threads=threads) if executor.takes_threads else rasterizer_class()
+    rasterizer: Rasterizer = (
+        rasterizer_class(threads=threads) if executor.takes_threads else rasterizer_class()
+    )
     return rasterizer
 
 
-__all__ = ["CONSTANTS", "EXECUTORS", "RasterConstants", "Rasterizer", "RenderOutput", "create_rasterizer"]
+__all__ = [
+    "CONSTANTS",
+    "EXECUTORS",
+    "RasterConstants",
+    "Rasterizer",
+    "RenderOutput",
+    "create_rasterizer",
+]

@@ -1,4 +1,5 @@
-"""The contract of every rasterizer: inputs, outputs, and the constants of 3DGS. Does not import torch."""
+"""The contract of every rasterizer: inputs, outputs, and the constants of 3DGS. Does not import
+torch."""
 
 from __future__ import annotations
 
@@ -19,21 +20,25 @@ class RasterConstants:
     """Constants of the 2023 code of 3DGS (Kerbl et al.), in the order of the pipeline."""
 
     near: float = 0.2  # world units; a Gaussian whose centre has view z <= near is culled
-    fov_margin: float = 0.3  # the Jacobian's x/z, y/z are clamped to the image plus 0.3 tan(fov/2) on each side
+    # the Jacobian's x/z, y/z are clamped to the image plus 0.3 tan(fov/2) on each side
+    fov_margin: float = 0.3
     blur: float = 0.3  # px^2, added to the diagonal of the 2D covariance
     sigma_extent: float = 3.0  # radius = ceil(3 sqrt(lambda_max)) px
     eigenvalue_floor: float = 0.1  # inside the square root of lambda_max
-    tile: int = 16  # px; a Gaussian reaches all pixels of the tiles that its square of side 2 radius touches
+    # px; a Gaussian reaches all pixels of the tiles that its square of side 2 radius touches
+    tile: int = 16
     alpha_min: float = 1.0 / 255.0  # a smaller alpha is skipped
     alpha_max: float = 0.99  # a larger alpha is clamped to it (its gradient passes, as in 3DGS)
-    transmittance_min: float = 1e-4  # a pixel stops before the Gaussian that would lower it below this
+    # a pixel stops before the Gaussian that would lower it below this
+    transmittance_min: float = 1e-4
 
 
 CONSTANTS = RasterConstants()
 
 
 def slope_limits(camera: Camera) -> tuple[float, float, float, float]:
-    """The limits in the Jacobian of a projection (`RasterConstants.fov_margin`): x/z least, most; y/z least, most."""
+    """The limits in the Jacobian of a projection (`RasterConstants.fov_margin`): x/z least, most;
+    y/z least, most."""
     margin_x = CONSTANTS.fov_margin * camera.width / (2 * camera.fx)
     margin_y = CONSTANTS.fov_margin * camera.height / (2 * camera.fy)
     return (
@@ -94,19 +99,24 @@ class CameraNumbers(NamedTuple):
 class Footprint:
     """Facts of the pixels of one view that each Gaussian is blended into.
 
-    These are the pixels where its alpha is not skipped and that have not stopped before it. All fields are [N] and have
-    no gradient. For a Gaussian without such pixels, all but ``depths`` are 0.
+    These are the pixels where its alpha is not skipped and that have not stopped before it. All
+    fields are [N] and have no gradient. For a Gaussian without such pixels, all but ``depths`` are
+    0.
     """
 
     pixels: Tensor  # int32, number of pixels
     depths: Tensor  # view z of the mean, world units
     values: Tensor  # sum over the pixels of the given values; 0 if none were given
-    distances: Tensor  # px, sum over the pixels of the distance from the projected mean to the pixel's centre
+    # px, sum over the pixels of the distance from the projected mean to the pixel's centre
+    distances: Tensor
 
 
 def view_depths(gaussians: Gaussians, camera: Camera) -> Tensor:
     """View z of each mean, [N] world units."""
-    return gaussians.means.detach() @ gaussians.means.new_tensor(camera.rotation[2]) + camera.translation[2]
+    return (
+        gaussians.means.detach() @ gaussians.means.new_tensor(camera.rotation[2])
+        + camera.translation[2]
+    )
 
 
 @dataclass
@@ -115,16 +125,21 @@ class RenderOutput:
 
     - ``image`` is [H, W, 3], not clamped above; ``alpha`` is [H, W].
     - ``radii`` is [N] int32 in px, 0 for culled Gaussians.
-    - ``screen_points`` is [N, 2], a leaf of zeros. After ``backward``, its ``.grad`` is the gradient of the loss by the
-      projected means in NDC units, as in 3DGS (pixel gradient times W/2, H/2).
-    - ``screen_gradient_abs`` is [N, 2], or None if not requested. ``backward`` fills it with the same gradient, but
-      with the absolute value taken at each pixel before the sum (AbsGS, arXiv 2404.10484).
-    - ``footprint()`` computes the `Footprint` of this view, also after ``backward``; ``footprint(values)`` sums
-      ``values`` [H, W] over its pixels, too. None if the rasterizer has no footprints.
-    - ``splitting_probe`` is [N, 3, 3], a leaf of zeros, or None if not requested. After ``backward``, its ``.grad`` is
-      the splitting matrix of each Gaussian in this view, per world unit squared (SteepGS, arXiv 2505.05587): the sum
-      over pixels of (d loss / d s) times the second derivative of s by the mean. s is the opacity times the density at
-      the pixel, before the clamp to ``alpha_max``. Here the projection is linearised and the 2D covariance is constant.
+    - ``screen_points`` is [N, 2], a leaf of zeros. After ``backward``, its ``.grad`` is the
+      gradient of the loss by the projected means in NDC units, as in 3DGS (pixel gradient times
+      W/2, H/2).
+    - ``screen_gradient_abs`` is [N, 2], or None if not requested. ``backward`` fills it with the
+      same gradient, but with the absolute value taken at each pixel before the sum (AbsGS, arXiv
+      2404.10484).
+    - ``footprint()`` computes the `Footprint` of this view, also after ``backward``;
+      ``footprint(values)`` sums ``values`` [H, W] over its pixels, too. None if the rasterizer has
+      no footprints.
+    - ``splitting_probe`` is [N, 3, 3], a leaf of zeros, or None if not requested. After
+      ``backward``, its ``.grad`` is the splitting matrix of each Gaussian in this view, per world
+      unit squared (SteepGS, arXiv 2505.05587): the sum over pixels of (d loss / d s) times the
+      second derivative of s by the mean. s is the opacity times the density at the pixel, before
+      the clamp to ``alpha_max``. Here the projection is linearised and the 2D covariance is
+      constant.
     """
 
     image: Tensor
@@ -143,15 +158,18 @@ class RenderOutput:
     def require_footprint(self, values: Tensor | None = None) -> Footprint:
         """Return ``footprint(values)``. Raises RuntimeError if the rasterizer has no footprints."""
         if self.footprint is None:
-            raise RuntimeError("this densifier needs RenderOutput.footprint, which the rasterizer does not give")
+            raise RuntimeError(
+                "this densifier needs RenderOutput.footprint, which the rasterizer does not give"
+            )
         return self.footprint(values)
 
     def require_splitting_matrix(self) -> Tensor:
-        """Return the splitting matrices [N, 3, 3] of this view. Raises RuntimeError if they were not requested, and
-        before ``backward``."""
+        """Return the splitting matrices [N, 3, 3] of this view. Raises RuntimeError if they were
+        not requested, and before ``backward``."""
         if self.splitting_probe is None or self.splitting_probe.grad is None:
             raise RuntimeError(
-                "this densifier needs splitting matrices: render with splitting_matrix=True, then backward"
+                "this densifier needs splitting matrices: render with splitting_matrix=True, then "
+                "backward"
             )
         return self.splitting_probe.grad
 
@@ -159,9 +177,9 @@ class RenderOutput:
 class Rasterizer(Protocol):
     """The contract of rasterizers; ``tests/raster/test_contract.py`` tests all executors.
 
-    Two outputs are optional. A class that gives ``RenderOutput.footprint`` has the class attribute ``has_footprint =
-    True``. A class that gives splitting matrices has ``has_splitting_matrix = True``, and its ``render`` has a further
-    argument ``splitting_matrix: bool = False``.
+    Two outputs are optional. A class that gives ``RenderOutput.footprint`` has the class attribute
+    ``has_footprint = True``. A class that gives splitting matrices has ``has_splitting_matrix =
+    True``, and its ``render`` has a further argument ``splitting_matrix: bool = False``.
 
     Examples:
         The reference without colours. `departures` lists where it differs from the contract.
@@ -171,8 +189,8 @@ class Rasterizer(Protocol):
         >>> class Grey:
         ...     name = "grey"
         ...
-        ...     def render(self, gaussians, camera, sh_degree, background, absolute_gradient=False):
-        ...         output = ReferenceRasterizer().render(gaussians, camera, sh_degree, background, absolute_gradient)
+        ...     def render(self, gaussians, camera, *options, **more):
+        ...         output = ReferenceRasterizer().render(gaussians, camera, *options, **more)
         ...         output.image = output.image.mean(-1, keepdim=True).expand(-1, -1, 3)
         ...         return output
 
@@ -185,11 +203,17 @@ class Rasterizer(Protocol):
     name: str
 
     def render(
-        self, gaussians: Gaussians, camera: Camera, sh_degree: int, background: Tensor, absolute_gradient: bool = False
+        self,
+        gaussians: Gaussians,
+        camera: Camera,
+        sh_degree: int,
+        background: Tensor,
+        absolute_gradient: bool = False,
     ) -> RenderOutput:
-        """Render ``gaussians`` from ``camera`` with harmonics up to ``sh_degree`` (0 to 3) over ``background`` [3].
+        """Render ``gaussians`` from ``camera`` with harmonics up to ``sh_degree`` (0 to 3) over
+        ``background`` [3].
 
-        Differentiable in the six tensors of ``gaussians`` and in ``screen_points``. Pixels are sampled at their
-        centres, which are integers: a point projects to ``fx x/z + cx - 0.5``.
+        Differentiable in the six tensors of ``gaussians`` and in ``screen_points``. Pixels are
+        sampled at their centres, which are integers: a point projects to ``fx x/z + cx - 0.5``.
         """
         ...

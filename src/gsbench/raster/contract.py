@@ -1,4 +1,5 @@
-"""A test of the contract of ``raster.base``: it compares a rasterizer with the float64 reference on seeded scenes.
+"""A test of the contract of ``raster.base``: it compares a rasterizer with the float64 reference on
+seeded scenes.
 
 gsbench tests its own executors with the same scenes. To test yours:
 
@@ -23,14 +24,17 @@ from gsbench.scene.types import Camera
 VALUE_TOLERANCE = 1e-4  # of image and alpha
 RADIUS_TOLERANCE = 0.5  # px: radii are whole
 GRADIENT_TOLERANCE = 1e-3  # of the largest entry of each gradient
-FOOTPRINT_TOLERANCE = 1e-3  # of each sum: rounding may skip a pixel whose alpha is nearly 1/255, or not
+# of each sum: rounding may skip a pixel whose alpha is nearly 1/255, or not
+FOOTPRINT_TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True)
 class Case:
-    """A seeded scene with its camera. ``principal`` is the offset of the principal point from the image centre, px.
+    """A seeded scene with its camera. ``principal`` is the offset of the principal point from the
+    image centre, px.
 
-    ``spread`` scales the distances of the Gaussians from the axis through their middle, which is ``depth`` away.
+    ``spread`` scales the distances of the Gaussians from the axis through their middle, which is
+    ``depth`` away.
     """
 
     width: int
@@ -49,7 +53,8 @@ class Case:
     def camera(self) -> Camera:
         angle = 0.2
         rotation = np.array(
-            [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]], dtype=np.float64
+            [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]],
+            dtype=np.float64,
         )
         return Camera(
             self.width,
@@ -63,7 +68,8 @@ class Case:
         )
 
     def gaussians(self) -> Gaussians:
-        """float64 values that are exact in float32; some Gaussians are behind the camera or outside the image."""
+        """float64 values that are exact in float32; some Gaussians are behind the camera or outside
+        the image."""
         generator = torch.Generator().manual_seed(self.width * 1000 + self.count)
 
         def normal(*shape: int) -> Tensor:
@@ -89,7 +95,8 @@ CASES = (
     Case(64, 48, 150, sh_degree=2, log_scale=-3.0),
     Case(50, 37, 120, sh_degree=1, log_scale=-1.0),
     Case(81, 50, 150, sh_degree=0, log_scale=-2.5, principal=(-20.0, 11.0)),
-    Case(40, 40, 300, sh_degree=3, log_scale=-1.5, logit=3.0),  # opaque: pixels stop early, alphas are clamped
+    # opaque: pixels stop early, alphas are clamped
+    Case(40, 40, 300, sh_degree=3, log_scale=-1.5, logit=3.0),
     Case(7, 5, 20, sh_degree=3),  # smaller than a tile
 )
 
@@ -97,19 +104,31 @@ CASES = (
 def render_with_gradients(
     rasterizer: Rasterizer, case: Case, dtype: torch.dtype, device: str = "cpu"
 ) -> tuple[RenderOutput, dict[str, Tensor]]:
-    """Render ``case``; also return gradients, as float64 on the CPU, of a fixed random weighting of image and alpha.
+    """Render ``case``; also return gradients, as float64 on the CPU, of a fixed random weighting of
+    image and alpha.
 
     Includes the splitting matrices if the rasterizer offers them.
     """
     gaussians = case.gaussians().map(lambda tensor: tensor.to(device, dtype).requires_grad_())
     background = torch.tensor([0.2, 0.5, 0.9], dtype=dtype, device=device)
-    extra = {"splitting_matrix": True} if offers(rasterizer.name, "has_splitting_matrix", rasterizer) else {}
-    output = rasterizer.render(gaussians, case.camera(), case.sh_degree, background, absolute_gradient=True, **extra)
+    extra = (
+        {"splitting_matrix": True}
+        if offers(rasterizer.name, "has_splitting_matrix", rasterizer)
+        else {}
+    )
+    output = rasterizer.render(
+        gaussians, case.camera(), case.sh_degree, background, absolute_gradient=True, **extra
+    )
     generator = torch.Generator().manual_seed(7)
-    weights = torch.randn(case.height, case.width, 4, generator=generator, dtype=torch.float64).to(device, dtype)
+    weights = torch.randn(case.height, case.width, 4, generator=generator, dtype=torch.float64).to(
+        device, dtype
+    )
     ((output.image * weights[..., :3]).sum() + (output.alpha * weights[..., 3]).sum()).backward()
     gradients = {name: tensor.grad for name, tensor in gaussians.tensors().items()}
-    gradients |= {"screen_points": output.screen_points.grad, "screen_gradient_abs": output.screen_gradient_abs}
+    gradients |= {
+        "screen_points": output.screen_points.grad,
+        "screen_gradient_abs": output.screen_gradient_abs,
+    }
     if extra:
         gradients["splitting_probe"] = output.require_splitting_matrix()
     return output, {
@@ -119,7 +138,8 @@ def render_with_gradients(
 
 
 class Error(NamedTuple):
-    """The largest error of a quantity in a case, what the contract allows, and the place of the error in words."""
+    """The largest error of a quantity in a case, what the contract allows, and the place of the
+    error in words."""
 
     case: str
     quantity: str
@@ -135,26 +155,35 @@ class Error(NamedTuple):
     def __str__(self) -> str:
         if math.isinf(self.off):
             return f"{self.case}: {self.quantity} {self.place}"
-        return f"{self.case}: {self.quantity} is off by up to {self.off:.2e}{self.unit} at {self.place}"
+        return (
+            f"{self.case}: {self.quantity} is off by up to {self.off:.2e}{self.unit} at "
+            f"{self.place}"
+        )
 
 
-def departures(rasterizer: Rasterizer, device: str = "cpu", cases: tuple[Case, ...] = CASES) -> list[str]:
-    """List where ``rasterizer``, in float32 on ``device``, departs from the contract, one line each; [] if nowhere.
+def departures(
+    rasterizer: Rasterizer, device: str = "cpu", cases: tuple[Case, ...] = CASES
+) -> list[str]:
+    """List where ``rasterizer``, in float32 on ``device``, departs from the contract, one line
+    each; [] if nowhere.
 
-    For all ``cases``, it compares image, alpha, radii, all gradients and, if offered, footprint and splitting matrices
-    with the reference. It also tests a scene without Gaussians. Takes seconds.
+    For all ``cases``, it compares image, alpha, radii, all gradients and, if offered, footprint and
+    splitting matrices with the reference. It also tests a scene without Gaussians. Takes seconds.
     """
     lines = []
     for case in cases:
         try:
-            lines += [str(error) for error in measure(rasterizer, case, device) if error.is_departure]
+            lines += [
+                str(error) for error in measure(rasterizer, case, device) if error.is_departure
+            ]
         except (RuntimeError, ValueError, TypeError, NotImplementedError) as error:
             lines.append(f"{case}: {type(error).__name__}: {error}")
     return lines + _without_gaussians(rasterizer, device)
 
 
 def measure(rasterizer: Rasterizer, case: Case, device: str) -> list[Error]:
-    """The largest error of each quantity of ``rasterizer``, in float32 on ``device``, against the float64 reference.
+    """The largest error of each quantity of ``rasterizer``, in float32 on ``device``, against the
+    float64 reference.
 
     A shape or dtype that is not the contract's is an infinite error.
     """
@@ -162,11 +191,15 @@ def measure(rasterizer: Rasterizer, case: Case, device: str) -> list[Error]:
     output, gradients = render_with_gradients(rasterizer, case, torch.float32, device)
     errors = []
 
-    def compare(quantity: str, value: Tensor, reference: Tensor, limit: float, relative: bool, place: Place) -> None:
+    def compare(
+        quantity: str, value: Tensor, reference: Tensor, limit: float, relative: bool, place: Place
+    ) -> None:
         value, reference = value.detach().cpu().double(), reference.detach().double()
         if value.shape != reference.shape:
             shapes = (
-                f"has shape {tuple(value.shape)}, expected {tuple(reference.shape)}" if value.dim() else "is missing"
+                f"has shape {tuple(value.shape)}, expected {tuple(reference.shape)}"
+                if value.dim()
+                else "is missing"
             )
             errors.append(Error(str(case), quantity, math.inf, limit, shapes))
             return
@@ -180,12 +213,32 @@ def measure(rasterizer: Rasterizer, case: Case, device: str) -> list[Error]:
     def pixel(index: int) -> str:
         return f"pixel ({index % case.width}, {index // case.width})"
 
-    compare("image", output.image, expected.image, VALUE_TOLERANCE, False, lambda index: pixel(index // 3))
+    compare(
+        "image",
+        output.image,
+        expected.image,
+        VALUE_TOLERANCE,
+        False,
+        lambda index: pixel(index // 3),
+    )
     compare("alpha", output.alpha, expected.alpha, VALUE_TOLERANCE, False, pixel)
-    compare("radius", output.radii, expected.radii, RADIUS_TOLERANCE, False, lambda index: f"Gaussian {index}")
+    compare(
+        "radius",
+        output.radii,
+        expected.radii,
+        RADIUS_TOLERANCE,
+        False,
+        lambda index: f"Gaussian {index}",
+    )
     if output.radii.dtype != torch.int32:
         errors.append(
-            Error(str(case), "radius", math.inf, RADIUS_TOLERANCE, f"is {output.radii.dtype}, expected torch.int32")
+            Error(
+                str(case),
+                "radius",
+                math.inf,
+                RADIUS_TOLERANCE,
+                f"is {output.radii.dtype}, expected torch.int32",
+            )
         )
     for name, reference in references.items():
         if name == "splitting_probe" and name not in gradients:
@@ -195,13 +248,24 @@ def measure(rasterizer: Rasterizer, case: Case, device: str) -> list[Error]:
         size = reference.numel() // max(1, case.count) or 1  # numbers for each Gaussian
         quantity = "splitting matrix" if name == "splitting_probe" else f"gradient of {name}"
         compare(
-            quantity, gradients[name], reference, GRADIENT_TOLERANCE, True,
+            quantity,
+            gradients[name],
+            reference,
+            GRADIENT_TOLERANCE,
+            True,
             lambda index, size=size: f"Gaussian {index // size}",  # type: ignore[misc]
-        )  # fmt: skip
+        )
     if output.footprint is not None:
         for name, off in footprint_errors(output, expected).items():
             errors.append(
-                Error(str(case), f"footprint ({name})", off, FOOTPRINT_TOLERANCE, "all pixels", " of the sum")
+                Error(
+                    str(case),
+                    f"footprint ({name})",
+                    off,
+                    FOOTPRINT_TOLERANCE,
+                    "all pixels",
+                    " of the sum",
+                )
             )
     return errors
 
@@ -210,9 +274,12 @@ Place = Callable[[int], str]  # words for the place of a tensor's flat index
 
 
 def footprint_errors(output: RenderOutput, expected: RenderOutput) -> dict[str, float]:
-    """The error of each field of ``output``'s footprint against ``expected``, relative to the field's sum."""
+    """The error of each field of ``output``'s footprint against ``expected``, relative to the
+    field's sum."""
     height, width = expected.alpha.shape
-    values = torch.rand(height, width, generator=torch.Generator().manual_seed(8), dtype=torch.float64)
+    values = torch.rand(
+        height, width, generator=torch.Generator().manual_seed(8), dtype=torch.float64
+    )
     assert output.footprint is not None
     assert expected.footprint is not None
     footprint, reference = output.footprint(values.to(output.alpha)), expected.footprint(values)
@@ -225,13 +292,18 @@ def footprint_errors(output: RenderOutput, expected: RenderOutput) -> dict[str, 
 
 def _without_gaussians(rasterizer: Rasterizer, device: str) -> list[str]:
     case = CASES[0]
-    empty = case.gaussians().map(lambda tensor: tensor[:0].to(device, torch.float32).requires_grad_())
+    empty = case.gaussians().map(
+        lambda tensor: tensor[:0].to(device, torch.float32).requires_grad_()
+    )
     background = torch.tensor([0.1, 0.2, 0.3], device=device)
     try:
         output = rasterizer.render(empty, case.camera(), case.sh_degree, background)
         output.image.sum().backward()
     except (RuntimeError, ValueError, TypeError, IndexError, ZeroDivisionError) as error:
         return [f"without Gaussians: {type(error).__name__}: {error}"]
-    if not torch.equal(output.image, background.expand(case.height, case.width, 3)) or output.alpha.abs().max() > 0:
+    if (
+        not torch.equal(output.image, background.expand(case.height, case.width, 3))
+        or output.alpha.abs().max() > 0
+    ):
         return ["without Gaussians: the image is not the background"]
     return []

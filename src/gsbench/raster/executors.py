@@ -48,11 +48,17 @@ class Executor:
         return not self.devices or device_type in self.devices
 
     def obstacle(self, device_type: str) -> str | None:
-        """The reason why it cannot run here on a device of this type, and the remedy; None if it can run."""
+        """The reason why it cannot run here on a device of this type, and the remedy; None if it
+        can run."""
         if not self.runs_on(device_type):
             needed = " or ".join(self.devices)
-            alternatives = ", ".join(other.name for other in EXECUTORS if other.runs_on(device_type))
-            return f"runs on device={needed}, not on {device_type}; choose from {alternatives}, or set device={needed}"
+            alternatives = ", ".join(
+                other.name for other in EXECUTORS if other.runs_on(device_type)
+            )
+            return (
+                f"runs on device={needed}, not on {device_type}; choose from {alternatives}, "
+                f"or set device={needed}"
+            )
         return None if self.is_installed else f"needs {self.package}: {self.install}"
 
 
@@ -61,21 +67,25 @@ EXECUTORS = (  # ``auto`` takes the first that is made for the type of device an
         "reference",
         "gsbench.raster.reference.ReferenceRasterizer",
         devices=(),
-        text="plain torch, float32 or float64: the definition; all others are tested against it; slow",
+        text="plain torch, float32 or float64: the definition; all others are tested against it; "
+        "slow",
         same_bits=False,  # torch's sums on a GPU use atomics
     ),
     Executor(
         "cpu",
         "gsbench.raster.cpu.CpuRasterizer",
         devices=("cpu",),
-        text="compiled by numba at first use; the same bits on every run and for any number of threads",
+        text="compiled by numba at first use; the same bits on every run and for any number of "
+        "threads",
         takes_threads=True,
     ),
     Executor(
         "triton",
         "gsbench.raster.triton.executor.TritonRasterizer",
-        devices=("cuda", "cpu") if os.environ.get("TRITON_INTERPRET") == "1" else ("cuda",),  # tests
-        text="Triton kernels, compiled at first use by what torch brings along; the same bits on every run",
+        # tests
+        devices=("cuda", "cpu") if os.environ.get("TRITON_INTERPRET") == "1" else ("cuda",),
+        text="Triton kernels, compiled at first use by what torch brings along; the same bits on "
+        "every run",
         package="triton",
         install="pip install triton, in the version that your torch asks for",
     ),
@@ -83,7 +93,8 @@ EXECUTORS = (  # ``auto`` takes the first that is made for the type of device an
         "gsplat",
         "gsbench.raster.gsplat.GsplatRasterizer",
         devices=("cuda",),
-        text="gsplat's CUDA kernels, to measure against; compiled with a CUDA toolkit (nvcc) at first use",
+        text="gsplat's CUDA kernels, to measure against; compiled with a CUDA toolkit (nvcc) at "
+        "first use",
         package="gsplat",
         install=install_command("gsplat"),
         has_footprint=False,
@@ -100,19 +111,23 @@ def names() -> tuple[str, ...]:
 
 
 def find_executor(name: str) -> Executor:
-    """Return the executor called ``name``. Raises InputError, which lists the names, if there is none."""
+    """Return the executor called ``name``. Raises InputError, which lists the names, if there is
+    none."""
     for executor in EXECUTORS:
         if executor.name == name:
             return executor
     raise InputError(
-        f"raster={name} is not known; choose {', '.join(names())}, or set raster._target_ to a class of your own"
+        f"raster={name} is not known; choose {', '.join(names())}, or set raster._target_ to a "
+        "class of your own"
     )
 
 
 def offers(name: str, fact: str, own: object = None) -> bool:
-    """Return whether the rasterizer called ``name`` offers an optional output; ``fact`` is such as ``has_footprint``.
+    """Return whether the rasterizer called ``name`` offers an optional output; ``fact`` is such as
+    ``has_footprint``.
 
-    If ``name`` is not an executor of gsbench, the attribute ``fact`` of the rasterizer ``own`` decides.
+    If ``name`` is not an executor of gsbench, the attribute ``fact`` of the rasterizer ``own``
+    decides.
     """
     offered = {executor.name: bool(getattr(executor, fact)) for executor in EXECUTORS}
     return offered.get(name, bool(getattr(own, fact, False)))
@@ -121,7 +136,8 @@ def offers(name: str, fact: str, own: object = None) -> bool:
 def resolve(name: str, device_type: str) -> Executor:
     """Return the executor that ``name``, perhaps ``auto``, selects on a device of this type.
 
-    Raises InputError if it cannot run there. ``auto`` logs a warning if only the slow reference can run.
+    Raises InputError if it cannot run there. ``auto`` logs a warning if only the slow reference can
+    run.
     """
     if name == AUTO:
         first, *_ = automatic(device_type)
@@ -133,42 +149,57 @@ def resolve(name: str, device_type: str) -> Executor:
 
 
 def automatic(device_type: str) -> list[Executor]:
-    """The executors that ``auto`` takes on a device of this type, the best first; the last is the reference.
+    """The executors that ``auto`` takes on a device of this type, the best first; the last is the
+    reference.
 
     Logs a warning if only the slow reference can run.
     """
     candidates = [executor for executor in EXECUTORS if device_type in executor.devices]
     usable = [executor for executor in candidates if executor.obstacle(device_type) is None]
     if not usable:
-        hints = "; ".join(f"{executor.name} needs {executor.package}: {executor.install}" for executor in candidates)
-        log.warning("raster=auto: the slow reference rasterizer runs%s", f" ({hints})" if hints else "")
+        hints = "; ".join(
+            f"{executor.name} needs {executor.package}: {executor.install}"
+            for executor in candidates
+        )
+        log.warning(
+            "raster=auto: the slow reference rasterizer runs%s", f" ({hints})" if hints else ""
+        )
     return [*usable, find_executor("reference")]
 
 
 def missing_tools() -> list[str]:
-    """List what Triton lacks to compile the C code that launches its kernels: a C compiler, Python's headers.
+    """List what Triton lacks to compile the C code that launches its kernels: a C compiler,
+    Python's headers.
 
     Each line names the package to install.
     """
     missing = []
     compiler = os.environ.get("CC")
-    path = shutil.which(compiler.split()[0]) if compiler else shutil.which("gcc") or shutil.which("clang")
+    path = (
+        shutil.which(compiler.split()[0])
+        if compiler
+        else shutil.which("gcc") or shutil.which("clang")
+    )
     if path is None:
         named = f" (CC is {compiler}, which is not there)" if compiler else ""
         missing.append(f"a C compiler{named}: install the package gcc")
     scheme = sysconfig.get_default_scheme()
-    if scheme == "posix_local":  # Debian's scheme for packages; its headers are still in the usual place
+    # Debian's scheme for packages; its headers are still in the usual place
+    if scheme == "posix_local":
         scheme = "posix_prefix"
     header = Path(sysconfig.get_paths(scheme=scheme)["include"]) / "Python.h"
     if not header.exists():
         version = f"{sys.version_info.major}.{sys.version_info.minor}"
-        missing.append(f"{header}: install the package python{version}-dev (python{version}-devel on Fedora)")
+        missing.append(
+            f"{header}: install the package python{version}-dev (python{version}-devel on Fedora)"
+        )
     return missing
 
 
 @cache
 def load_driver() -> None:
-    """Make Triton load its launcher for the GPU, which may compile it. Raises InputError that names what is missing."""
+    """Make Triton load its launcher for the GPU, which may compile it. Raises InputError that names
+    what is missing."""
     try:
         from triton import knobs
         from triton.runtime import driver
@@ -178,7 +209,9 @@ def load_driver() -> None:
         driver.active.get_current_target()
     except (RuntimeError, OSError, AssertionError, ImportError) as error:
         missing = missing_tools()
-        reason = "Triton needs " + " and ".join(missing) if missing else f"Triton cannot start: {error}"
+        reason = (
+            "Triton needs " + " and ".join(missing) if missing else f"Triton cannot start: {error}"
+        )
         raise InputError(reason) from error
 
 
@@ -191,4 +224,7 @@ class RasterConfig:
         check_settings(self, "raster")
         if self._target_ is None and self.name not in names():
             choices = ", ".join(names())
-            raise InputError(f"raster must be one of {choices}, got {self.name!r}{did_you_mean(self.name, names())}")
+            raise InputError(
+                f"raster must be one of {choices}, got "
+                f"{self.name!r}{did_you_mean(self.name, names())}"
+            )

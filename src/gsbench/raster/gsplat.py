@@ -1,16 +1,20 @@
-"""gsplat's CUDA kernels (Ye et al., arXiv 2409.06765) under the contract of ``raster.base``, for comparison.
+"""gsplat's CUDA kernels (Ye et al., arXiv 2409.06765) under the contract of ``raster.base``, for
+comparison.
 
-This module calls gsplat's functions one by one, so that the conventions of 3DGS hold, which gsplat's ``rasterization``
-does not follow: the near plane is 0.2, and a Gaussian reaches the tiles of a square of 3 sigma along its larger axis at
-any opacity. It works with gsplat 1.5.3 and with 1.6, whose harmonics take other arguments. Some differences are inside
-gsplat's kernels and remain:
+This module calls gsplat's functions one by one, so that the conventions of 3DGS hold, which
+gsplat's ``rasterization`` does not follow: the near plane is 0.2, and a Gaussian reaches the tiles
+of a square of 3 sigma along its larger axis at any opacity. It works with gsplat 1.5.3 and with
+1.6, whose harmonics take other arguments. Some differences are inside gsplat's kernels and remain:
 
-- ``image`` and ``alpha``: gsplat 1.5 clamps alpha to 0.999 (1.6 to 0.99, as the contract), and the clamp blocks the
-  gradient. A tile at the edge of the square is included if any part of it is reached, not only if its first pixel is.
-- ``radii`` and ``visible``: a Gaussian is culled by a box of 3.33 sigma along each image axis, not by the square. If
-  the square reaches the image but the box does not, the radius is 0; such a Gaussian would contribute less than 1/255
-  everywhere. Densifiers that count the iterations in which a Gaussian was visible count fewer.
-- All gradients, also that of ``screen_points``: sums use atomics, so two runs differ in the last bits.
+- ``image`` and ``alpha``: gsplat 1.5 clamps alpha to 0.999 (1.6 to 0.99, as the contract), and the
+  clamp blocks the gradient. A tile at the edge of the square is included if any part of it is
+  reached, not only if its first pixel is.
+- ``radii`` and ``visible``: a Gaussian is culled by a box of 3.33 sigma along each image axis, not
+  by the square. If the square reaches the image but the box does not, the radius is 0; such a
+  Gaussian would contribute less than 1/255 everywhere. Densifiers that count the iterations in
+  which a Gaussian was visible count fewer.
+- All gradients, also that of ``screen_points``: sums use atomics, so two runs differ in the last
+  bits.
 """
 
 from __future__ import annotations
@@ -40,7 +44,8 @@ COEFFICIENTS = {0: 1, 1: 4, 2: 9, 3: 16}  # number of harmonics up to each degre
 
 
 class GsplatRasterizer:
-    """Renders with gsplat on a CUDA device, float32. ``library`` is the module ``gsplat`` or one with its functions."""
+    """Renders with gsplat on a CUDA device, float32. ``library`` is the module ``gsplat`` or one
+    with its functions."""
 
     name = "gsplat"
 
@@ -49,20 +54,29 @@ class GsplatRasterizer:
             try:
                 library = importlib.import_module("gsplat")
             except ImportError as error:
-                raise InputError(f"raster=gsplat needs gsplat: {find_executor('gsplat').install}") from error
+                raise InputError(
+                    f"raster=gsplat needs gsplat: {find_executor('gsplat').install}"
+                ) from error
         self.library = library
         # gsplat 1.5 takes directions, 1.6 means and poses.
         self._takes_directions = "dirs" in inspect.signature(library.spherical_harmonics).parameters
         self._cameras: WeakKeyDictionary[Camera, _DeviceCamera] = WeakKeyDictionary()
 
     def render(
-        self, gaussians: Gaussians, camera: Camera, sh_degree: int, background: Tensor, absolute_gradient: bool = False
+        self,
+        gaussians: Gaussians,
+        camera: Camera,
+        sh_degree: int,
+        background: Tensor,
+        absolute_gradient: bool = False,
     ) -> RenderOutput:
-        """See `gsbench.raster.base.Rasterizer`. Raises ValueError that names a parameter that cannot be used."""
+        """See `gsbench.raster.base.Rasterizer`. Raises ValueError that names a parameter that
+        cannot be used."""
         check_settings(gaussians, camera, sh_degree, background)
         points = torch.zeros_like(gaussians.means[:, :2], requires_grad=True)
         absolute = torch.zeros_like(points) if absolute_gradient else None
-        if len(gaussians) == 0:  # gsplat's projection divides by the number of Gaussians, on the host
+        # gsplat's projection divides by the number of Gaussians, on the host
+        if len(gaussians) == 0:
             return _empty(camera, background, points, absolute)
         bad = Readback(bad_values(gaussians, background))
         width, height, tile = camera.width, camera.height, CONSTANTS.tile
@@ -83,7 +97,9 @@ class GsplatRasterizer:
         square = _square_radii(conics.detach(), seen)  # [1, N] int32
         tiles_x, tiles_y = -(-width // tile), -(-height // tile)
         axis_radii = square.unsqueeze(-1).expand(-1, -1, 2).contiguous()
-        _, pairs, members = self.library.isect_tiles(means, axis_radii, depths, tile, tiles_x, tiles_y)
+        _, pairs, members = self.library.isect_tiles(
+            means, axis_radii, depths, tile, tiles_x, tiles_y
+        )
         if bad.values():  # no wait: gsplat has just waited for the number of pairs
             raise_for_values(gaussians, background)
         offsets = self.library.isect_offset_encode(pairs, 1, tiles_x, tiles_y)
@@ -119,7 +135,9 @@ class GsplatRasterizer:
             cached = self._cameras[camera] = _DeviceCamera.of(camera, like)
         return cached
 
-    def _colors(self, gaussians: Gaussians, camera: _DeviceCamera, sh_degree: int, seen: Tensor) -> Tensor:
+    def _colors(
+        self, gaussians: Gaussians, camera: _DeviceCamera, sh_degree: int, seen: Tensor
+    ) -> Tensor:
         used = gaussians.sh_rest[:, : COEFFICIENTS[sh_degree] - 1]
         coefficients = torch.cat([gaussians.sh_dc.unsqueeze(1), used], dim=1)  # [N, K, 3]
         harmonics = self.library.spherical_harmonics
@@ -144,16 +162,22 @@ class _DeviceCamera:
         view = np.eye(4)
         view[:3, :3], view[:3, 3] = camera.rotation, camera.translation
         intrinsics = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
-        numbers = (view[None], intrinsics[None], camera.center, np.array([camera.width / 2, camera.height / 2]))
+        numbers = (
+            view[None],
+            intrinsics[None],
+            camera.center,
+            np.array([camera.width / 2, camera.height / 2]),
+        )
         return cls(*map(like.new_tensor, numbers))
 
 
 class _Composite(torch.autograd.Function):
-    """gsplat's compositing on leaves of its own graph, so that ``backward`` here sees the gradient of the means.
+    """gsplat's compositing on leaves of its own graph, so that ``backward`` here sees the gradient
+    of the means.
 
-    gsplat stores the absolute gradient as an attribute of the means that it was given. A hook on these means that reads
-    the attribute would be a reference cycle through C++, which the garbage collector cannot free: the memory of every
-    step would leak. This function avoids the cycle.
+    gsplat stores the absolute gradient as an attribute of the means that it was given. A hook on
+    these means that reads the attribute would be a reference cycle through C++, which the garbage
+    collector cannot free: the memory of every step would leak. This function avoids the cycle.
     """
 
     @staticmethod
@@ -170,9 +194,12 @@ class _Composite(torch.autograd.Function):
         screen_points: Tensor,
     ) -> tuple[Tensor, Tensor]:
         needed = ctx.needs_input_grad
-        requires = (needed[3] or needed[8], *needed[4:7])  # the screen points need the gradient of the means
+        # the screen points need the gradient of the means
+        requires = (needed[3] or needed[8], *needed[4:7])
         leaves = (tensor.detach() for tensor in (means, conics, colors, opacities))
-        ctx.leaves = [leaf.requires_grad_(flag) for leaf, flag in zip(leaves, requires, strict=True)]
+        ctx.leaves = [
+            leaf.requires_grad_(flag) for leaf, flag in zip(leaves, requires, strict=True)
+        ]
         with torch.enable_grad():
             ctx.outputs = rasterize(*ctx.leaves)  # [1, H, W, 3], [1, H, W, 1]
         ctx.half_size, ctx.absolute = half_size, absolute
@@ -191,30 +218,44 @@ class _Composite(torch.autograd.Function):
         g_screen = None if g_means is None else g_means[0] * ctx.half_size
         if ctx.absolute is not None and g_means is not None:
             ctx.absolute.add_(ctx.leaves[0].absgrad[0] * ctx.half_size)
-        g_background = (g_image * (1 - alpha.detach()[0])).sum((0, 1)) if ctx.needs_input_grad[7] else None
+        g_background = (
+            (g_image * (1 - alpha.detach()[0])).sum((0, 1)) if ctx.needs_input_grad[7] else None
+        )
         return None, None, None, *gradients, g_background, g_screen
 
 
-def _empty(camera: Camera, background: Tensor, points: Tensor, absolute: Tensor | None) -> RenderOutput:
+def _empty(
+    camera: Camera, background: Tensor, points: Tensor, absolute: Tensor | None
+) -> RenderOutput:
     """Return the background, connected with the graph so that ``backward`` works."""
     zero = 0 * points.sum()
     image = background.expand(camera.height, camera.width, 3) + zero
     alpha = torch.zeros_like(image[..., 0]) + zero
-    return RenderOutput(image, alpha, torch.zeros_like(points[:, 0], dtype=torch.int32), points, absolute)
+    return RenderOutput(
+        image, alpha, torch.zeros_like(points[:, 0], dtype=torch.int32), points, absolute
+    )
 
 
 def _square_radii(conics: Tensor, seen: Tensor) -> Tensor:
-    """ceil(3 sqrt(lambda_max)) px, for covariances with the inverses ``conics`` [1, N, 3]; 0 if not ``seen``."""
-    a, b, c = conics.double().unbind(-1)  # the inverse of the covariance: yy, -xy, xx over its determinant
+    """ceil(3 sqrt(lambda_max)) px, for covariances with the inverses ``conics`` [1, N, 3]; 0 if not
+    ``seen``."""
+    # the inverse of the covariance: yy, -xy, xx over its determinant
+    a, b, c = conics.double().unbind(-1)
     determinant = 1 / (a * c - b * b)
     half_trace = 0.5 * (a + c) * determinant
     root = (half_trace * half_trace - determinant).clamp_min(CONSTANTS.eigenvalue_floor).sqrt()
-    radii = (CONSTANTS.sigma_extent * (half_trace + root).sqrt()).ceil().nan_to_num(0, 0, 0).clamp(0, MAX_RADIUS)
+    radii = (
+        (CONSTANTS.sigma_extent * (half_trace + root).sqrt())
+        .ceil()
+        .nan_to_num(0, 0, 0)
+        .clamp(0, MAX_RADIUS)
+    )
     return torch.where(seen, radii, 0.0).to(torch.int32)
 
 
 def _reaches_image(means: Tensor, radii: Tensor, width: int, height: int) -> Tensor:
-    """Mask [N]: whether the square around the mean touches the image; px, with the first pixel centre at 0.5."""
+    """Mask [N]: whether the square around the mean touches the image; px, with the first pixel
+    centre at 0.5."""
     x, y = means.unbind(-1)
     inside = (x + radii > 0) & (x - radii < width) & (y + radii > 0) & (y - radii < height)
     return inside & (radii > 0)

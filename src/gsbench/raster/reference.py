@@ -1,7 +1,9 @@
-"""The readable definition of the rasterizer in torch, tile by tile, for any device, float32 or float64.
+"""The readable definition of the rasterizer in torch, tile by tile, for any device, float32 or
+float64.
 
-Tests compare the faster executors with this one in float64. The formulas are those of EWA splatting (Zwicker et al.
-2001) as in 3DGS (Kerbl et al. 2023); the constants are in ``raster.base.RasterConstants``.
+Tests compare the faster executors with this one in float64. The formulas are those of EWA splatting
+(Zwicker et al. 2001) as in 3DGS (Kerbl et al. 2023); the constants are in
+``raster.base.RasterConstants``.
 """
 
 from collections.abc import Iterator
@@ -46,7 +48,8 @@ class ReferenceRasterizer:
         splitting_matrix: bool = False,
     ) -> RenderOutput:
         check_inputs(gaussians, camera, sh_degree, background)
-        half_size = gaussians.means.new_tensor([camera.width / 2, camera.height / 2])  # NDC to pixels
+        # NDC to pixels
+        half_size = gaussians.means.new_tensor([camera.width / 2, camera.height / 2])
         screen_points = torch.zeros_like(gaussians.means[:, :2], requires_grad=True)  # [N, 2] NDC
         gradient_abs = torch.zeros_like(screen_points) if absolute_gradient else None
 
@@ -60,20 +63,27 @@ class ReferenceRasterizer:
         probe, image_probe = None, None
         if splitting_matrix:
             probe = gaussians.means.new_zeros(len(gaussians), 3, 3, requires_grad=True)
-            jacobians = mean_jacobians(gaussians.means.detach()[projected.index], camera)  # [M, 2, 3]
+            jacobians = mean_jacobians(
+                gaussians.means.detach()[projected.index], camera
+            )  # [M, 2, 3]
             image_probe = jacobians @ probe[projected.index] @ jacobians.mT  # [M, 2, 2] all zero
         rgb = self._colors(gaussians, projected.index, camera, sh_degree)  # [M, 3]
         opacities = gaussians.opacities[projected.index]  # [M]
 
-        # Adding zero connects the image with the graph even if no tile is reached, so that ``backward`` always works.
+        # Adding zero connects the image with the graph even if no tile is reached, so that
+        # ``backward`` always works.
         image = background.expand(camera.height, camera.width, 3) + 0 * screen_points.sum()
         alpha = torch.zeros(camera.height, camera.width, dtype=image.dtype, device=image.device)
-        for members, (x0, y0, x1, y1) in members_of_tiles(projected.depths, tile_min, tile_max, camera):
+        for members, (x0, y0, x1, y1) in members_of_tiles(
+            projected.depths, tile_min, tile_max, camera
+        ):
             pixels = pixel_centres(x0, y0, x1, y1, image)
             # One mean per pixel, so that the hook sees the gradient of each pixel before the sum.
             pixel_means = means[members].expand(len(pixels), -1, -1)  # [P, K, 2]
             if gradient_abs is not None and pixel_means.requires_grad:
-                pixel_means.register_hook(_absolute_sum_into(gradient_abs, projected.index[members], half_size))
+                pixel_means.register_hook(
+                    _absolute_sum_into(gradient_abs, projected.index[members], half_size)
+                )
             # Recomputed in the backward pass: memory for intermediate results is that of one tile.
             tile_image, tile_alpha = checkpoint(
                 composite,
@@ -93,31 +103,44 @@ class ReferenceRasterizer:
         return RenderOutput(image, alpha, radii, screen_points, gradient_abs, footprint, probe)
 
     @torch.no_grad()
-    def _footprint(self, gaussians: Gaussians, camera: Camera, values: Tensor | None = None) -> Footprint:
+    def _footprint(
+        self, gaussians: Gaussians, camera: Camera, values: Tensor | None = None
+    ) -> Footprint:
         covered = torch.zeros(len(gaussians), dtype=torch.int32, device=gaussians.means.device)
-        sums, distances = torch.zeros(2, len(gaussians), dtype=gaussians.means.dtype, device=gaussians.means.device)
+        sums, distances = torch.zeros(
+            2, len(gaussians), dtype=gaussians.means.dtype, device=gaussians.means.device
+        )
         projected = project(gaussians, camera)
         tile_min, tile_max = tile_rectangles(projected, camera, CONSTANTS.tile)
-        for members, (x0, y0, x1, y1) in members_of_tiles(projected.depths, tile_min, tile_max, camera):
+        for members, (x0, y0, x1, y1) in members_of_tiles(
+            projected.depths, tile_min, tile_max, camera
+        ):
             pixels, index = pixel_centres(x0, y0, x1, y1, sums), projected.index[members]
             means = projected.means[members].expand(len(pixels), -1, -1)  # [P, K, 2]
             conics, opacities = projected.conics[members], gaussians.opacities[index]
             blended = blending_weights(pixels, means, conics, opacities) > 0  # [P, K]
             covered.index_add_(0, index, blended.sum(0, dtype=torch.int32))
-            distances.index_add_(0, index, ((means - pixels.unsqueeze(1)).norm(dim=-1) * blended).sum(0))
+            distances.index_add_(
+                0, index, ((means - pixels.unsqueeze(1)).norm(dim=-1) * blended).sum(0)
+            )
             if values is not None:
-                sums.index_add_(0, index, (values[y0:y1, x0:x1].reshape(-1, 1).to(sums) * blended).sum(0))
+                sums.index_add_(
+                    0, index, (values[y0:y1, x0:x1].reshape(-1, 1).to(sums) * blended).sum(0)
+                )
         return Footprint(covered, view_depths(gaussians, camera), sums, distances)
 
     @staticmethod
     def _colors(gaussians: Gaussians, index: Tensor, camera: Camera, sh_degree: int) -> Tensor:
         center = gaussians.means.new_tensor(camera.center)
-        directions = torch.nn.functional.normalize(gaussians.means[index] - center, dim=-1)  # [M, 3]
+        directions = torch.nn.functional.normalize(
+            gaussians.means[index] - center, dim=-1
+        )  # [M, 3]
         return colors(gaussians.sh_dc[index], gaussians.sh_rest[index], directions, sh_degree)
 
 
 def pixel_centres(x0: int, y0: int, x1: int, y1: int, like: Tensor) -> Tensor:
-    """The pixel centres of a rectangle, row by row, [P, 2] (x, y), with the dtype and on the device of ``like``."""
+    """The pixel centres of a rectangle, row by row, [P, 2] (x, y), with the dtype and on the device
+    of ``like``."""
     return torch.cartesian_prod(
         torch.arange(y0, y1, dtype=like.dtype, device=like.device),
         torch.arange(x0, x1, dtype=like.dtype, device=like.device),
@@ -125,10 +148,11 @@ def pixel_centres(x0: int, y0: int, x1: int, y1: int, like: Tensor) -> Tensor:
 
 
 def project(gaussians: Gaussians, camera: Camera) -> Projection:
-    """Project the Gaussians to the image plane; leave out those behind ``near`` or with an unusable covariance.
+    """Project the Gaussians to the image plane; leave out those behind ``near`` or with an unusable
+    covariance.
 
-    A first pass without a graph selects the usable ones, so that an overflow in another Gaussian cannot reach their
-    gradients.
+    A first pass without a graph selects the usable ones, so that an overflow in another Gaussian
+    cannot reach their gradients.
     """
     with torch.no_grad():
         depths = view_depths(gaussians, camera)  # [N]
@@ -138,15 +162,20 @@ def project(gaussians: Gaussians, camera: Camera) -> Projection:
         half_trace = 0.5 * (xx + yy)
         root = (half_trace * half_trace - determinant).clamp_min(CONSTANTS.eigenvalue_floor).sqrt()
         radii = (CONSTANTS.sigma_extent * (half_trace + root).sqrt()).ceil()
-        usable = (determinant > 0) & determinant.isfinite() & radii.isfinite() & means.isfinite().all(-1)
+        usable = (
+            (determinant > 0) & determinant.isfinite() & radii.isfinite() & means.isfinite().all(-1)
+        )
         index, radii = index[usable], radii[usable].clamp_max(MAX_RADIUS)
     means, (xx, xy, yy), z = _to_image(gaussians.select(index), camera)
     conics = torch.stack([yy, -xy, xx], -1) / (xx * yy - xy * xy).unsqueeze(-1)  # [M, 3]
     return Projection(index, means, conics, z.detach(), radii)
 
 
-def _to_image(gaussians: Gaussians, camera: Camera) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor], Tensor]:
-    """Means [M, 2] px; entries xx, xy, yy of the blurred 2D covariances, each [M], px^2; view depths [M]."""
+def _to_image(
+    gaussians: Gaussians, camera: Camera
+) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor], Tensor]:
+    """Means [M, 2] px; entries xx, xy, yy of the blurred 2D covariances, each [M], px^2; view
+    depths [M]."""
     rotation = gaussians.means.new_tensor(camera.rotation)  # [3, 3]
     translation = gaussians.means.new_tensor(camera.translation)  # [3]
     x, y, z = (gaussians.means @ rotation.T + translation).unbind(-1)  # each [M]
@@ -163,38 +192,57 @@ def _to_image(gaussians: Gaussians, camera: Camera) -> tuple[Tensor, tuple[Tenso
     axes = gaussians.rotations * gaussians.scales.unsqueeze(-2)  # [M, 3, 3] columns: scaled axes
     image_axes = jacobian @ rotation @ axes  # [M, 2, 3]
     covariance = image_axes @ image_axes.mT  # [M, 2, 2]
-    means = torch.stack([camera.fx * x / z + camera.cx - 0.5, camera.fy * y / z + camera.cy - 0.5], -1)
-    blurred = (covariance[:, 0, 0] + CONSTANTS.blur, covariance[:, 0, 1], covariance[:, 1, 1] + CONSTANTS.blur)
+    means = torch.stack(
+        [camera.fx * x / z + camera.cx - 0.5, camera.fy * y / z + camera.cy - 0.5], -1
+    )
+    blurred = (
+        covariance[:, 0, 0] + CONSTANTS.blur,
+        covariance[:, 0, 1],
+        covariance[:, 1, 1] + CONSTANTS.blur,
+    )
     return means, blurred, z
 
 
 def mean_jacobians(means: Tensor, camera: Camera) -> Tensor:
-    """The Jacobians [M, 2, 3] of the projected means, px, by ``means`` [M, 3], without the limits on the slopes."""
+    """The Jacobians [M, 2, 3] of the projected means, px, by ``means`` [M, 3], without the limits
+    on the slopes."""
     rotation = means.new_tensor(camera.rotation)  # [3, 3]
-    x, y, z = (means @ rotation.T + means.new_tensor(camera.translation)).unsqueeze(-1).unbind(1)  # each [M, 1]
+    # each [M, 1]
+    x, y, z = (means @ rotation.T + means.new_tensor(camera.translation)).unsqueeze(-1).unbind(1)
     row_x = camera.fx / z * (rotation[0] - x / z * rotation[2])  # [M, 3]
     row_y = camera.fy / z * (rotation[1] - y / z * rotation[2])
     return torch.stack([row_x, row_y], 1)
 
 
 def tile_rectangles(projected: Projection, camera: Camera, tile: int) -> tuple[Tensor, Tensor]:
-    """The tiles that each Gaussian's square of side 2 radius touches: first and past-the-last, int64 [M, 2] (x, y)."""
+    """The tiles that each Gaussian's square of side 2 radius touches: first and past-the-last,
+    int64 [M, 2] (x, y)."""
     means, radii = projected.means.detach(), projected.radii.unsqueeze(-1)
-    grid = torch.tensor([-(-camera.width // tile), -(-camera.height // tile)], device=means.device)  # [2]
-    limit = torch.tensor(2.0**30, dtype=means.dtype, device=means.device)  # so that the conversion to int64 is defined
+    grid = torch.tensor(
+        [-(-camera.width // tile), -(-camera.height // tile)], device=means.device
+    )  # [2]
+    # so that the conversion to int64 is defined
+    limit = torch.tensor(2.0**30, dtype=means.dtype, device=means.device)
     first = ((means - radii) / tile).clamp(-limit, limit).floor().long()
     past = ((means + radii + tile - 1) / tile).clamp(-limit, limit).floor().long()
     zero = torch.zeros_like(grid)
-    return torch.maximum(torch.minimum(first, grid), zero), torch.maximum(torch.minimum(past, grid), zero)
+    return torch.maximum(torch.minimum(first, grid), zero), torch.maximum(
+        torch.minimum(past, grid), zero
+    )
 
 
-def bin_gaussians(depths: Tensor, tile_min: Tensor, tile_max: Tensor, tiles_x: int) -> list[tuple[int, Tensor]]:
-    """List all tiles with Gaussians: the row-major number, and the Gaussians [K], front to back (ties by index)."""
+def bin_gaussians(
+    depths: Tensor, tile_min: Tensor, tile_max: Tensor, tiles_x: int
+) -> list[tuple[int, Tensor]]:
+    """List all tiles with Gaussians: the row-major number, and the Gaussians [K], front to back
+    (ties by index)."""
     order = torch.sort(depths, stable=True).indices  # [M]
     low, size = tile_min[order], (tile_max - tile_min)[order].clamp_min(0)  # [M, 2]
     counts = size.prod(-1)  # [M]
     owner = torch.repeat_interleave(counts)  # [pairs] indices into ``order``
-    within = torch.arange(len(owner), device=owner.device) - (counts.cumsum(0) - counts)[owner]  # [pairs]
+    within = (
+        torch.arange(len(owner), device=owner.device) - (counts.cumsum(0) - counts)[owner]
+    )  # [pairs]
     column, row = within % size[owner, 0], within // size[owner, 0]
     tiles = (low[owner, 1] + row) * tiles_x + low[owner, 0] + column  # [pairs]
     by_tile = torch.sort(tiles, stable=True)
@@ -206,7 +254,8 @@ def bin_gaussians(depths: Tensor, tile_min: Tensor, tile_max: Tensor, tiles_x: i
 def members_of_tiles(
     depths: Tensor, tile_min: Tensor, tile_max: Tensor, camera: Camera
 ) -> Iterator[tuple[Tensor, tuple[int, int, int, int]]]:
-    """Yield, for each tile with Gaussians, those [K], front to back, and its pixels: first x, y; past-the-last x, y."""
+    """Yield, for each tile with Gaussians, those [K], front to back, and its pixels: first x, y;
+    past-the-last x, y."""
     tile, tiles_x = CONSTANTS.tile, -(-camera.width // CONSTANTS.tile)
     for number, members in bin_gaussians(depths, tile_min, tile_max, tiles_x):
         x, y = number % tiles_x * tile, number // tiles_x * tile
@@ -224,9 +273,9 @@ def composite(
 ) -> tuple[Tensor, Tensor]:
     """Blend K Gaussians, front to back, at P pixels.
 
-    ``pixels`` [P, 2], ``means`` [P, K, 2], ``conics`` [K, 3], ``opacities`` [K], ``rgb`` [K, 3]. Returns colours [P, 3]
-    and opacities [P]. A pixel stops before the Gaussian that would lower its transmittance below
-    ``transmittance_min``. ``image_probe`` as in ``blending_weights``.
+    ``pixels`` [P, 2], ``means`` [P, K, 2], ``conics`` [K, 3], ``opacities`` [K], ``rgb`` [K, 3].
+    Returns colours [P, 3] and opacities [P]. A pixel stops before the Gaussian that would lower its
+    transmittance below ``transmittance_min``. ``image_probe`` as in ``blending_weights``.
     """
     weight = blending_weights(pixels, means, conics, opacities, image_probe)  # [P, K]
     opacity = weight.sum(1)  # [P]
@@ -234,12 +283,18 @@ def composite(
 
 
 def blending_weights(
-    pixels: Tensor, means: Tensor, conics: Tensor, opacities: Tensor, image_probe: Tensor | None = None
+    pixels: Tensor,
+    means: Tensor,
+    conics: Tensor,
+    opacities: Tensor,
+    image_probe: Tensor | None = None,
 ) -> Tensor:
-    """Alpha times transmittance, [P, K], for the arguments of ``composite``; 0 where a Gaussian is not blended.
+    """Alpha times transmittance, [P, K], for the arguments of ``composite``; 0 where a Gaussian is
+    not blended.
 
-    ``image_probe`` [K, 2, 2] is zero. Its gradient is the sum over pixels of (d loss / d s) times the second derivative
-    of s by the projected mean, where s is the opacity times the density at the pixel.
+    ``image_probe`` [K, 2, 2] is zero. Its gradient is the sum over pixels of (d loss / d s) times
+    the second derivative of s by the projected mean, where s is the opacity times the density at
+    the pixel.
     """
     dx, dy = (means - pixels.unsqueeze(1)).unbind(-1)  # [P, K]
     power = -0.5 * (conics[:, 0] * dx * dx + conics[:, 2] * dy * dy) - conics[:, 1] * dx * dy
@@ -250,7 +305,8 @@ def blending_weights(
         slope = (inverse @ offset.unsqueeze(-1)).squeeze(-1)  # [P, K, 2]
         second = slope.unsqueeze(-1) * slope.unsqueeze(-2) - inverse  # [P, K, 2, 2]
         raw = raw + raw.detach() * (second * image_probe).sum((-2, -1))
-    saturated = raw + (raw.clamp_max(CONSTANTS.alpha_max) - raw).detach()  # the gradient passes the clamp, as in 3DGS
+    # the gradient passes the clamp, as in 3DGS
+    saturated = raw + (raw.clamp_max(CONSTANTS.alpha_max) - raw).detach()
     alpha = torch.where((power <= 0) & (raw >= CONSTANTS.alpha_min), saturated, 0.0)
     after = torch.cumprod(1 - alpha, dim=1)  # [P, K] transmittance behind each Gaussian
     before = torch.cat([torch.ones_like(after[:, :1]), after[:, :-1]], dim=1)

@@ -1,4 +1,5 @@
-"""Code that executors share: checks of inputs, asynchronous reads from a device, and autograd for compiled stages."""
+"""Code that executors share: checks of inputs, asynchronous reads from a device, and autograd for
+compiled stages."""
 
 from abc import ABC, abstractmethod
 from functools import partial
@@ -14,16 +15,19 @@ from gsbench.scene.types import Camera
 
 MAX_SIDE = 16384  # px; a larger image is most likely a mistake in the settings
 MIN_QUATERNION_NORM = 1e-12  # below, torch's ``normalize`` no longer gives a unit quaternion
-FOCAL_RANGE = (1e-3, 1e6)  # focal length over image side: fields of view between 0.2 arc seconds and 179.8 degrees
-MAX_PRINCIPAL_OFFSET = 100.0  # image sides; the largest distance of the principal point from the image corner
+# focal length over image side: fields of view between 0.2 arc seconds and 179.8 degrees
+FOCAL_RANGE = (1e-3, 1e6)
+# image sides; the largest distance of the principal point from the image corner
+MAX_PRINCIPAL_OFFSET = 100.0
 
 
 def check_inputs(gaussians: Gaussians, camera: Camera, sh_degree: int, background: Tensor) -> None:
-    """Raise ValueError, which names the parameter, for anything that ``Rasterizer.render`` cannot use.
+    """Raise ValueError, which names the parameter, for anything that ``Rasterizer.render`` cannot
+    use.
 
-    Reads every value of ``gaussians`` and waits for a device once. To avoid that, executors call ``check_settings``
-    first. If their kernels then find a bad value, or ``bad_values``, read later, is True, they call
-    ``raise_for_values``.
+    Reads every value of ``gaussians`` and waits for a device once. To avoid that, executors call
+    ``check_settings`` first. If their kernels then find a bad value, or ``bad_values``, read later,
+    is True, they call ``raise_for_values``.
     """
     check_settings(gaussians, camera, sh_degree, background)
     if bad_values(gaussians, background):
@@ -42,7 +46,9 @@ def bad_values(gaussians: Gaussians, background: Tensor) -> Tensor:
     return bad
 
 
-def check_settings(gaussians: Gaussians, camera: Camera, sh_degree: int, background: Tensor) -> None:
+def check_settings(
+    gaussians: Gaussians, camera: Camera, sh_degree: int, background: Tensor
+) -> None:
     """The checks of ``check_inputs`` that do not wait for a device."""
     if not 0 <= sh_degree <= MAX_SH_DEGREE:
         raise ValueError(f"sh_degree: must be 0 to {MAX_SH_DEGREE}, got {sh_degree}")
@@ -51,7 +57,9 @@ def check_settings(gaussians: Gaussians, camera: Camera, sh_degree: int, backgro
         raise ValueError(f"gaussians: dtype must be float32 or float64, got {dtype}")
     for name, tensor in [*gaussians.tensors().items(), ("background", background)]:
         if tensor.dtype != dtype or tensor.device != device:
-            raise ValueError(f"{name}: is {tensor.dtype} on {tensor.device}, but means is {dtype} on {device}")
+            raise ValueError(
+                f"{name}: is {tensor.dtype} on {tensor.device}, but means is {dtype} on {device}"
+            )
     if tuple(background.shape) != (3,):
         raise ValueError(f"background: must be three numbers, got shape {tuple(background.shape)}")
     if device.type == "cpu":
@@ -66,11 +74,17 @@ def _check_camera(camera: Camera) -> None:
     ):
         axis = "x" if side == "width" else "y"
         if size > MAX_SIDE:
-            raise ValueError(f"camera: {side} is {size} px, more than {MAX_SIDE}; resize the images")
+            raise ValueError(
+                f"camera: {side} is {size} px, more than {MAX_SIDE}; resize the images"
+            )
         if not FOCAL_RANGE[0] * size <= focal <= FOCAL_RANGE[1] * size:
-            raise ValueError(f"camera: f{axis} is {focal} px, which is degenerate for a {side} of {size} px")
+            raise ValueError(
+                f"camera: f{axis} is {focal} px, which is degenerate for a {side} of {size} px"
+            )
         if abs(principal) > MAX_PRINCIPAL_OFFSET * size:
-            raise ValueError(f"camera: c{axis} is {principal} px, which is degenerate for a {side} of {size} px")
+            raise ValueError(
+                f"camera: c{axis} is {principal} px, which is degenerate for a {side} of {size} px"
+            )
 
 
 def _check_background(background: Tensor) -> None:
@@ -79,7 +93,8 @@ def _check_background(background: Tensor) -> None:
 
 
 def raise_for_values(gaussians: Gaussians, background: Tensor | None = None) -> None:
-    """Raise ValueError for the first parameter with a non-finite value, or for a quaternion of length zero."""
+    """Raise ValueError for the first parameter with a non-finite value, or for a quaternion of
+    length zero."""
     if background is not None:
         _check_background(background)
     for name, tensor in gaussians.tensors().items():
@@ -88,19 +103,25 @@ def raise_for_values(gaussians: Gaussians, background: Tensor | None = None) -> 
             finite = finite.all(-1)  # finally [N]
         if not finite.all():
             index = int((~finite).nonzero()[0])
-            raise ValueError(f"{name}: not finite at Gaussian {index} ({int((~finite).sum())} in all)")
+            raise ValueError(
+                f"{name}: not finite at Gaussian {index} ({int((~finite).sum())} in all)"
+            )
     short = gaussians.quaternions.detach().norm(dim=-1) < MIN_QUATERNION_NORM  # [N]
     if short.any():
         index = int(short.nonzero()[0])
-        raise ValueError(f"quaternions: no length, so no rotation, at Gaussian {index} ({int(short.sum())} in all)")
+        raise ValueError(
+            f"quaternions: no length, so no rotation, at Gaussian {index} ({int(short.sum())} in "
+            "all)"
+        )
 
 
 class Readback:
     """An asynchronous copy of a small tensor to the host.
 
-    On a CUDA device, the copy is queued in the stream and the host continues. ``values`` waits for the copy, which
-    takes no time if the device has finished it, for example an iteration later. On other devices the copy is immediate.
-    The class variable ``waits`` counts how often any ``values`` had to wait.
+    On a CUDA device, the copy is queued in the stream and the host continues. ``values`` waits for
+    the copy, which takes no time if the device has finished it, for example an iteration later. On
+    other devices the copy is immediate. The class variable ``waits`` counts how often any
+    ``values`` had to wait.
     """
 
     waits: ClassVar[int] = 0
@@ -139,7 +160,8 @@ class Lifetime:
 
 
 class RenderRequest(NamedTuple):
-    """The inputs of one render besides the Gaussians. The backward pass fills ``absolute`` [N, 2]."""
+    """The inputs of one render besides the Gaussians. The backward pass fills ``absolute`` [N,
+    2]."""
 
     camera: Camera
     degree: int
@@ -149,7 +171,8 @@ class RenderRequest(NamedTuple):
 
 
 class Gradients(NamedTuple):
-    """Gradients by the six tensors and ``screen_points``, and the splitting matrices, if requested."""
+    """Gradients by the six tensors and ``screen_points``, and the splitting matrices, if
+    requested."""
 
     tensors: list[Tensor]
     screen: Tensor  # [N, 2]
@@ -157,10 +180,11 @@ class Gradients(NamedTuple):
 
 
 class StagedRasterizer(ABC, Generic[FrameT]):
-    """A rasterizer with separate stages: its forward pass leaves a frame for the backward pass and the footprint.
+    """A rasterizer with separate stages: its forward pass leaves a frame for the backward pass and
+    the footprint.
 
-    This class implements ``render`` of the contract and the connection with autograd. A subclass implements the
-    stages, whose tensors are contiguous.
+    This class implements ``render`` of the contract and the connection with autograd. A subclass
+    implements the stages, whose tensors are contiguous.
     """
 
     name: str
@@ -170,8 +194,11 @@ class StagedRasterizer(ABC, Generic[FrameT]):
         """Raise ValueError if the stages cannot use tensors of this dtype or device."""
 
     @abstractmethod
-    def forward(self, gaussians: Gaussians, request: RenderRequest) -> tuple[Tensor, Tensor, Tensor, FrameT]:
-        """Return image [H, W, 3], alpha [H, W], radii [N] and the frame, with memory for ``request.lifetime``."""
+    def forward(
+        self, gaussians: Gaussians, request: RenderRequest
+    ) -> tuple[Tensor, Tensor, Tensor, FrameT]:
+        """Return image [H, W, 3], alpha [H, W], radii [N] and the frame, with memory for
+        ``request.lifetime``."""
 
     @abstractmethod
     def backward(
@@ -187,7 +214,11 @@ class StagedRasterizer(ABC, Generic[FrameT]):
 
     @abstractmethod
     def footprint(
-        self, frame: FrameT, gaussians: Gaussians, request: RenderRequest, values: Tensor | None = None
+        self,
+        frame: FrameT,
+        gaussians: Gaussians,
+        request: RenderRequest,
+        values: Tensor | None = None,
     ) -> Footprint:
         """See ``raster.base.RenderOutput``."""
 
@@ -200,21 +231,31 @@ class StagedRasterizer(ABC, Generic[FrameT]):
         absolute_gradient: bool = False,
         splitting_matrix: bool = False,
     ) -> RenderOutput:
-        """See `gsbench.raster.base.Rasterizer`. Raises ValueError that names a parameter that cannot be used."""
+        """See `gsbench.raster.base.Rasterizer`. Raises ValueError that names a parameter that
+        cannot be used."""
         check_settings(gaussians, camera, sh_degree, background)
         self.check(gaussians)
         screen_points = torch.zeros_like(gaussians.means[:, :2], requires_grad=True)
         absolute = torch.zeros_like(screen_points) if absolute_gradient else None
-        probe = screen_points.new_zeros(len(gaussians), 3, 3, requires_grad=True) if splitting_matrix else None
-        request = RenderRequest(camera, sh_degree, background.detach().contiguous(), absolute, Lifetime())
+        probe = (
+            screen_points.new_zeros(len(gaussians), 3, 3, requires_grad=True)
+            if splitting_matrix
+            else None
+        )
+        request = RenderRequest(
+            camera, sh_degree, background.detach().contiguous(), absolute, Lifetime()
+        )
         tensors = gaussians.tensors().values()
-        image, alpha, radii, frame = _Render.apply(self, request, background, screen_points, probe, *tensors)
+        image, alpha, radii, frame = _Render.apply(
+            self, request, background, screen_points, probe, *tensors
+        )
         footprint = partial(self.footprint, frame, gaussians.detach(), request)
         return RenderOutput(image, alpha, radii, screen_points, absolute, footprint, probe)
 
 
 class _Render(torch.autograd.Function):
-    """The node of a render in autograd's graph. It keeps no reference to itself, so it is freed with the graph."""
+    """The node of a render in autograd's graph. It keeps no reference to itself, so it is freed
+    with the graph."""
 
     @staticmethod
     def forward(
@@ -236,7 +277,9 @@ class _Render(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, g_image: Tensor | None, g_alpha: Tensor | None, *_: None) -> tuple[Tensor | None, ...]:
+    def backward(
+        ctx: Any, g_image: Tensor | None, g_alpha: Tensor | None, *_: None
+    ) -> tuple[Tensor | None, ...]:
         alpha, *tensors = ctx.saved_tensors
         request: RenderRequest = ctx.request
         if g_image is None:
@@ -244,6 +287,8 @@ class _Render(torch.autograd.Function):
         g_image = g_image.contiguous()
         g_alpha = None if g_alpha is None else g_alpha.contiguous()
         _, _, _, _, wants_splitting, *_ = ctx.needs_input_grad
-        gradients = ctx.rasterizer.backward(ctx.frame, Gaussians(*tensors), request, g_image, g_alpha, wants_splitting)
+        gradients = ctx.rasterizer.backward(
+            ctx.frame, Gaussians(*tensors), request, g_image, g_alpha, wants_splitting
+        )
         g_background = None if alpha is None else (g_image * (1 - alpha).unsqueeze(-1)).sum((0, 1))
         return None, None, g_background, gradients.screen, gradients.splitting, *gradients.tensors

@@ -1,8 +1,10 @@
-"""The work of ``gsbench evaluate``: measuring renders of any program, and importing them into an experiment.
+"""The work of ``gsbench evaluate``: measuring renders of any program, and importing them into an
+experiment.
 
-Renders are compared with the photographs of a trial, of a scene as a trial would see it, or of a folder. An imported
-trial has only metrics and pictures: no model, no times, and an unknown number of iterations. Tables show unknown values
-as missing, and say which arms were evaluated from renders.
+Renders are compared with the photographs of a trial, of a scene as a trial would see it, or of a
+folder. An imported trial has only metrics and pictures: no model, no times, and an unknown number
+of iterations. Tables show unknown values as missing, and say which arms were evaluated from
+renders.
 """
 
 import argparse
@@ -34,7 +36,17 @@ from gsbench.pipeline.trial import TrialSteps, versions
 from gsbench.renders.predictions import opened_renders
 from gsbench.runs import keys
 from gsbench.runs.keys import EVALUATE, ROOMS, sha256_of, states_of
-from gsbench.runs.layout import CONFIG, GROUND_TRUTH, IN_RUNS, MASKS, PER_VIEW, RENDERS, RESULTS, SEED, STORE
+from gsbench.runs.layout import (
+    CONFIG,
+    GROUND_TRUTH,
+    IN_RUNS,
+    MASKS,
+    PER_VIEW,
+    RENDERS,
+    RESULTS,
+    SEED,
+    STORE,
+)
 from gsbench.runs.store import Store
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import FROM_RENDERS, RENDERS_ALONE, Code, TrialRecord
@@ -47,7 +59,8 @@ from gsbench.system.resources import available_threads
 from gsbench.view.trials import find_trial
 from gsbench.words import counted, did_you_mean, some_of
 
-KEPT_GROUPS = ("scene", "eval", "tracking", "launch")  # groups of the configuration that apply to renders too
+# groups of the configuration that apply to renders too
+KEPT_GROUPS = ("scene", "eval", "tracking", "launch")
 CAMERAS_ONLY = ("init=random", "init.count=100")  # the fastest initialiser; its points are not used
 
 
@@ -55,9 +68,10 @@ CAMERAS_ONLY = ("init=random", "init.count=100")  # the fastest initialiser; its
 class ReferenceImages:
     """Photographs by the names of their views, in the order of an evaluation.
 
-    ``what`` describes them in messages. ``data`` is the fingerprint of their capture, and ``resolution`` (width,
-    height) its size in px. ``config`` is the configuration of a trial that is tested on them. ``scene`` is None for a
-    plain folder of pictures, ``init`` is None if they come from no trial.
+    ``what`` describes them in messages. ``data`` is the fingerprint of their capture, and
+    ``resolution`` (width, height) its size in px. ``config`` is the configuration of a trial that
+    is tested on them. ``scene`` is None for a plain folder of pictures, ``init`` is None if they
+    come from no trial.
     """
 
     photographs: Mapping[str, Path]
@@ -67,12 +81,14 @@ class ReferenceImages:
     config: Mapping[str, Any]
     scene: str | None = None
     init: str | None = None
-    masks: Mapping[str, Path] = field(default_factory=dict)  # mask files of the views that ignore some pixels
+    # mask files of the views that ignore some pixels
+    masks: Mapping[str, Path] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class Destination:
-    """The trial that renders become: experiment, scene, arm (initialiser and densifier) and seed."""
+    """The trial that renders become: experiment, scene, arm (initialiser and densifier) and
+    seed."""
 
     experiment: str
     scene: str
@@ -87,14 +103,21 @@ def measure_renders(options: argparse.Namespace, runs: Path) -> None:
         _measure(options, renders, photographs, runs)
 
 
-def _measure(options: argparse.Namespace, renders: Path, photographs: Path | None, runs: Path) -> None:
-    """Measure the pictures in the folder ``renders``; ``photographs`` is used if the command names none."""
+def _measure(
+    options: argparse.Namespace, renders: Path, photographs: Path | None, runs: Path
+) -> None:
+    """Measure the pictures in the folder ``renders``; ``photographs`` is used if the command names
+    none."""
     if options.truth is not None:
         truth = _reference_images(options, runs)
     elif photographs is not None:
-        truth = replace(_folder(photographs, options.settings), what=f"the photographs in {options.renders}")
+        truth = replace(
+            _folder(photographs, options.settings), what=f"the photographs in {options.renders}"
+        )
     else:
-        raise InputError("--truth PLACE is needed: only predictions of nerfbaselines bring their photographs")
+        raise InputError(
+            "--truth PLACE is needed: only predictions of nerfbaselines bring their photographs"
+        )
     destination = None
     if options.place is not None:
         destination = find_destination(options.place, options.scene, options.seed, truth, runs)
@@ -124,8 +147,11 @@ def _measure(options: argparse.Namespace, renders: Path, photographs: Path | Non
 
 
 def _reference_images(options: argparse.Namespace, runs: Path) -> ReferenceImages:
-    """The photographs; those of a scene come from the trials of the experiment in ``--as``, if it has any."""
-    overrides = [word for word in options.settings if not word.startswith(("eval", f"{PERMISSIONS}="))]
+    """The photographs; those of a scene come from the trials of the experiment in ``--as``, if it
+    has any."""
+    overrides = [
+        word for word in options.settings if not word.startswith(("eval", f"{PERMISSIONS}="))
+    ]
     experiment = runs / (options.place or "").partition(":")[0]
     if not overrides and options.place and not Path(options.truth).is_dir() and experiment.is_dir():
         trials = [trial for trial in read_experiment(experiment).trials if not trial.from_renders]
@@ -133,17 +159,23 @@ def _reference_images(options: argparse.Namespace, runs: Path) -> ReferenceImage
             return reference_images_of(same_scene)
     truth = find_reference_images(options.truth, options.settings, runs)
     if truth.init is not None and overrides:
-        raise InputError(f"{overrides[0]}: the settings of {truth.what} are as they are; only eval.… can be set here")
+        raise InputError(
+            f"{overrides[0]}: the settings of {truth.what} are as they are; only eval.… can be "
+            "set here"
+        )
     return truth
 
 
 def _evaluator(truth: ReferenceImages, protocol: str | None, settings: Sequence[str]) -> Evaluator:
-    """The evaluator with the settings of the photographs' trial or scene, unless the command gives others."""
+    """The evaluator with the settings of the photographs' trial or scene, unless the command gives
+    others."""
     allowed = typed_permissions([word for word in settings if word.startswith(f"{PERMISSIONS}=")])
     allow_modules(allowed)
     config: Mapping[str, Any] = truth.config
     if any(word.startswith("eval") for word in settings):
-        config = compose_one([word for word in settings if word.startswith(("eval", f"{PERMISSIONS}="))]).values
+        config = compose_one(
+            [word for word in settings if word.startswith(("eval", f"{PERMISSIONS}="))]
+        ).values
     chosen = dict(config["eval"]) | ({} if protocol is None else {"protocol": protocol})
     own = build_metrics(chosen, list(allowed))
     return make_evaluator(EvalConfig(**chosen), select_device(config.get("device", "auto")), own)
@@ -167,7 +199,9 @@ def _lines(
         lines.append(f"left out, without a photograph: {some_of(matching.left_out)}")
     lines.append("  ".join([" " * width, *names.values()]))
     for view, row in [*per_view.items(), ("mean", metrics)]:
-        cells = [f"{row[key]:.{facts[key].decimals + 1}f}".rjust(len(names[key])) for key in metrics]
+        cells = [
+            f"{row[key]:.{facts[key].decimals + 1}f}".rjust(len(names[key])) for key in metrics
+        ]
         lines.append("  ".join([view.ljust(width), *cells]))
     lines += [f"{key}: n/a, {evaluator.unavailable[key]}" for key in sorted(evaluator.awaited)]
     if folder is not None:
@@ -176,7 +210,10 @@ def _lines(
 
 
 def _as_dict(
-    evaluator: Evaluator, matching: Matching, per_view: Mapping[str, Mapping[str, float]], folder: Path | None
+    evaluator: Evaluator,
+    matching: Matching,
+    per_view: Mapping[str, Mapping[str, float]],
+    folder: Path | None,
 ) -> dict[str, Any]:
     return {
         "protocol": evaluator.protocol.id,
@@ -191,9 +228,11 @@ def _as_dict(
 
 
 def find_reference_images(place: str, settings: Sequence[str], runs: Path) -> ReferenceImages:
-    """The photographs of ``place``: a folder, a trial (folder or EXPERIMENT:SCENE:DENSIFY), or the name of a scene.
+    """The photographs of ``place``: a folder, a trial (folder or EXPERIMENT:SCENE:DENSIFY), or the
+    name of a scene.
 
-    ``settings`` are overrides of the configuration. Raises `InputError` if ``place`` is none of these.
+    ``settings`` are overrides of the configuration. Raises `InputError` if ``place`` is none of
+    these.
     """
     folder = Path(place).expanduser()
     if folder.is_dir():
@@ -213,7 +252,8 @@ def find_reference_images(place: str, settings: Sequence[str], runs: Path) -> Re
 
 
 def reference_images_of(trial: TrialResult) -> ReferenceImages:
-    """The reference images of a finished trial, with the names and in the order of its own evaluation."""
+    """The reference images of a finished trial, with the names and in the order of its own
+    evaluation."""
     photographs = {view: trial.path / GROUND_TRUTH / png_name(view) for view in read_views(trial)}
     if trial.record.resolution is None or "data" not in trial.record.hashes:
         raise InputError(f"{trial.label} does not say what it was tested on: run this trial again")
@@ -233,10 +273,14 @@ def reference_images_of(trial: TrialResult) -> ReferenceImages:
 def _scene(name: str, settings: Sequence[str]) -> ReferenceImages:
     """The test views of a scene as a trial with these settings sees them: undistorted, at its size.
 
-    If the scene comes with cameras, the fastest initialiser is used, unless the settings choose one.
+    If the scene comes with cameras, the fastest initialiser is used, unless the settings choose
+    one.
     """
     config = compose_one([f"scene={name}", *settings]).values
-    if not any(word.startswith("init=") for word in settings) and config["scene"]["kind"] != "photos":
+    if (
+        not any(word.startswith("init=") for word in settings)
+        and config["scene"]["kind"] != "photos"
+    ):
         config = compose_one([f"scene={name}", *CAMERAS_ONLY, *settings]).values
     store = Store(Path(config["runs"]).expanduser().resolve() / STORE)
     trial = TrialSteps(Parts(config), store)
@@ -250,7 +294,9 @@ def _scene(name: str, settings: Sequence[str]) -> ReferenceImages:
     sizes = [(view.camera.width, view.camera.height) for view in [*scene.train, *scene.test]]
     masks = _masks(folder / MASKS, photographs)
     what = f"the test views of {name}"
-    return ReferenceImages(photographs, what, trial.capture.fingerprint, max(sizes), config, name, masks=masks)
+    return ReferenceImages(
+        photographs, what, trial.capture.fingerprint, max(sizes), config, name, masks=masks
+    )
 
 
 def _masks(folder: Path, views: Iterable[str]) -> dict[str, Path]:
@@ -266,34 +312,45 @@ def _folder(folder: Path, settings: Sequence[str]) -> ReferenceImages:
     photographs = {name: folder / name for name in names}
     resolution = max(image_size(path) for path in photographs.values())
     config = compose_one(list(settings)).values
-    return ReferenceImages(photographs, f"the pictures in {folder}", fingerprint(folder, names), resolution, config)
+    return ReferenceImages(
+        photographs, f"the pictures in {folder}", fingerprint(folder, names), resolution, config
+    )
 
 
-def find_destination(word: str, scene: str | None, seed: int, truth: ReferenceImages, runs: Path) -> Destination:
+def find_destination(
+    word: str, scene: str | None, seed: int, truth: ReferenceImages, runs: Path
+) -> Destination:
     """The destination that ``EXPERIMENT:ARM`` names; ARM is a name, or INIT-NAME.
 
-    If ARM names no initialiser, it is taken from the experiment's trials of the scene, else from the trial of
-    ``truth``. Raises `InputError` if several are possible.
+    If ARM names no initialiser, it is taken from the experiment's trials of the scene, else from
+    the trial of ``truth``. Raises `InputError` if several are possible.
     """
     experiment, _, arm = word.partition(":")
     scene_name = scene or truth.scene
     if not is_folder_name(experiment) or not is_folder_name(arm):
         raise InputError(f"--as {word} is not EXPERIMENT:ARM, such as table1:sfm-mine")
     if experiment.casefold() in IN_RUNS:
-        raise InputError(f"--as {word}: {experiment} is gsbench's own folder of {runs}: name an experiment")
+        raise InputError(
+            f"--as {word}: {experiment} is gsbench's own folder of {runs}: name an experiment"
+        )
     if seed < 0:
         raise InputError(f"--seed {seed}: must be 0 or more")
     if scene is not None and not is_folder_name(scene):
         raise InputError(f"--scene {scene}: must be a plain folder name")
     if scene is not None and truth.scene not in (None, scene):
-        raise InputError(f"--scene {scene}: the photographs are {truth.what}, of the scene {truth.scene}: leave it out")
+        raise InputError(
+            f"--scene {scene}: the photographs are {truth.what}, of the scene {truth.scene}: "
+            "leave it out"
+        )
     if scene_name is None:
         raise InputError("--as: a folder of photographs has no scene's name: give it with --scene")
     init, dash, name = arm.partition("-")
     if not dash:
         init, name = truth.init or "", arm
         trials = _trials(runs / experiment, scene_name)
-        inits = sorted({trial.init for trial in trials if not trial.from_renders}) or sorted({t.init for t in trials})
+        inits = sorted({trial.init for trial in trials if not trial.from_renders}) or sorted(
+            {t.init for t in trials}
+        )
         if len(inits) > 1:
             raise InputError(
                 f"{experiment} has {', '.join(inits)} on {scene_name}: say which, as in "
@@ -304,14 +361,17 @@ def find_destination(word: str, scene: str | None, seed: int, truth: ReferenceIm
 
 
 def check_destination(destination: Destination, truth: ReferenceImages, runs: Path) -> None:
-    """Raise `InputError` if the experiment's trials of the scene were tested on other photographs."""
+    """Raise `InputError` if the experiment's trials of the scene were tested on other
+    photographs."""
     for trial in _trials(runs / destination.experiment, destination.scene):
         conditions = trial.conditions
         size = "x".join(map(str, truth.resolution))
         if conditions["data"] != truth.data or conditions["resolution"] != size:
             raise InputError(
-                f"{destination.experiment} tests {destination.scene} on other photographs (such as {trial.label}, "
-                f"{conditions['resolution']} px) than {truth.what} ({size} px), so nothing could be compared: give "
+                f"{destination.experiment} tests {destination.scene} on other photographs (such "
+                f"as {trial.label}, "
+                f"{conditions['resolution']} px) than {truth.what} ({size} px), so nothing could "
+                "be compared: give "
                 f"--truth {destination.experiment}:{destination.scene}:{trial.init}-{trial.densify}"
             )
 
@@ -327,15 +387,24 @@ def import_trial(
 ) -> Path:
     """Write the trial's folder and return it. The same renders always go to the same folder.
 
-    ``source`` says where the renders came from. Raises `InputError` if the destination already holds other renders.
+    ``source`` says where the renders came from. Raises `InputError` if the destination already
+    holds other renders.
     """
     renders = {pair.view: file_sha256(pair.picture) for pair in pairs}
-    identity = sha256_of({"renders": renders, "data": truth.data, "protocol": evaluator.protocol.id})
-    arm = runs / destination.experiment / destination.scene / f"{destination.init}-{destination.densify}"
+    identity = sha256_of(
+        {"renders": renders, "data": truth.data, "protocol": evaluator.protocol.id}
+    )
+    arm = (
+        runs
+        / destination.experiment
+        / destination.scene
+        / f"{destination.init}-{destination.densify}"
+    )
     folder = arm / f"{identity[:8]}{SEED}{destination.seed}"
     if taken := [other for other in arm.glob(f"*{SEED}{destination.seed}") if other != folder]:
         raise InputError(
-            f"seed {destination.seed} of {destination.init}-{destination.densify} on {destination.scene} is taken "
+            f"seed {destination.seed} of {destination.init}-{destination.densify} on "
+            f"{destination.scene} is taken "
             f"({taken[0]}): give another --seed, or remove that folder"
         )
     for name, files in (
@@ -351,7 +420,9 @@ def import_trial(
     config = _config(destination, truth, runs)
     write_text(folder / CONFIG, yaml.safe_dump(config, sort_keys=False))
     write_per_view(folder / PER_VIEW, per_view)
-    TrialFolder(folder).write_finished(config, _results(destination, truth, identity, per_view, evaluator, source))
+    TrialFolder(folder).write_finished(
+        config, _results(destination, truth, identity, per_view, evaluator, source)
+    )
     return folder
 
 
@@ -394,12 +465,28 @@ def _results(
 
 def _config(destination: Destination, truth: ReferenceImages, runs: Path) -> dict[str, Any]:
     groups = {group: truth.config[group] for group in KEPT_GROUPS}
-    own = truth.config["init"] if truth.config["init"]["name"] == destination.init else {"name": destination.init}
-    names: dict[str, Any] = {"name": destination.experiment, "seed": destination.seed, "runs": str(runs)}
+    own = (
+        truth.config["init"]
+        if truth.config["init"]["name"] == destination.init
+        else {"name": destination.init}
+    )
+    names: dict[str, Any] = {
+        "name": destination.experiment,
+        "seed": destination.seed,
+        "runs": str(runs),
+    }
     groups["scene"] = dict(groups["scene"]) | {"name": destination.scene}
-    return names | groups | {"init": own, "densify": {"name": destination.densify, "evaluated_from": FROM_RENDERS}}
+    return (
+        names
+        | groups
+        | {"init": own, "densify": {"name": destination.densify, "evaluated_from": FROM_RENDERS}}
+    )
 
 
 def _trials(home: Path, scene: str) -> list[TrialResult]:
     """The experiment's trials of a scene; none if the experiment does not exist yet."""
-    return [trial for trial in read_experiment(home).trials if trial.scene == scene] if home.is_dir() else []
+    return (
+        [trial for trial in read_experiment(home).trials if trial.scene == scene]
+        if home.is_dir()
+        else []
+    )

@@ -1,7 +1,9 @@
-"""Predictions of nerfbaselines: a folder, a .tar.gz, or the zip of a published result, with its names.
+"""Predictions of nerfbaselines: a folder, a .tar.gz, or the zip of a published result, with its
+names.
 
-``color/`` has the renders and ``gt-color/`` the photographs, each as ``<name of the photograph>.png``, beside
-``info.json`` (`save_predictions` of nerfbaselines 1.2). A published zip has them in ``predictions/``.
+``color/`` has the renders and ``gt-color/`` the photographs, each as ``<name of the
+photograph>.png``, beside ``info.json`` (`save_predictions` of nerfbaselines 1.2). A published zip
+has them in ``predictions/``.
 """
 
 import tarfile
@@ -24,12 +26,15 @@ CHUNK = 1 << 20
 
 @contextmanager
 def opened_renders(place: Path) -> Iterator[tuple[Path, Path | None]]:
-    """The folder of renders at ``place``, and that of photographs if nerfbaselines wrote them; an archive is unpacked.
+    """The folder of renders at ``place``, and that of photographs if nerfbaselines wrote them; an
+    archive is unpacked.
 
     Raises InputError if ``place`` is neither a folder nor such an archive.
     """
     if place.is_dir():
-        home = next((one for one in (place, place / "predictions") if (one / PHOTOGRAPHS).is_dir()), None)
+        home = next(
+            (one for one in (place, place / "predictions") if (one / PHOTOGRAPHS).is_dir()), None
+        )
         yield (place, None) if home is None else (home / RENDERED, home / PHOTOGRAPHS)
         return
     if not place.exists():
@@ -38,22 +43,38 @@ def opened_renders(place: Path) -> Iterator[tuple[Path, Path | None]]:
     with tempfile.TemporaryDirectory(prefix="gsbench-") as scratch:
         try:
             _unpack(place, Path(scratch))
-        except (tarfile.TarError, zipfile.BadZipFile, EOFError, OSError, ValueError, RuntimeError) as error:
-            raise InputError(f"{place} cannot be unpacked ({error}): give a folder, a .zip or a .tar.gz") from None
+        except (
+            tarfile.TarError,
+            zipfile.BadZipFile,
+            EOFError,
+            OSError,
+            ValueError,
+            RuntimeError,
+        ) as error:
+            raise InputError(
+                f"{place} cannot be unpacked ({error}): give a folder, a .zip or a .tar.gz"
+            ) from None
         yield Path(scratch) / RENDERED, Path(scratch) / PHOTOGRAPHS
 
 
 def _unpack(archive: Path, scratch: Path) -> None:
-    """Write the renders and photographs of an archive below ``scratch``; no other member is read."""
+    """Write the renders and photographs of an archive below ``scratch``; no other member is
+    read."""
     if zipfile.is_zipfile(archive):
         with zipfile.ZipFile(archive) as packed:
-            sizes = {member.filename: member.file_size for member in packed.infolist() if not member.is_dir()}
+            sizes = {
+                member.filename: member.file_size
+                for member in packed.infolist()
+                if not member.is_dir()
+            }
             for name, target in _wanted(archive, sizes).items():
                 with packed.open(name) as source:
                     _write(source, scratch / target, sizes[name])
     else:
         with tarfile.open(archive) as packed_tar:
-            members = {member.name.removeprefix("./"): member for member in packed_tar if member.isfile()}
+            members = {
+                member.name.removeprefix("./"): member for member in packed_tar if member.isfile()
+            }
             sizes = {name: member.size for name, member in members.items()}
             for name, target in _wanted(archive, sizes).items():
                 content = packed_tar.extractfile(members[name])
@@ -63,11 +84,14 @@ def _unpack(archive: Path, scratch: Path) -> None:
 
 
 def _wanted(archive: Path, sizes: dict[str, int]) -> dict[str, str]:
-    """The names of the members that are renders or photographs, with the places to write them to."""
+    """The names of the members that are renders or photographs, with the places to write them
+    to."""
     home = _home(archive, list(sizes))
     wanted = {}
     for name in sizes:
-        inside = PurePosixPath(name.removeprefix(home)) if name.startswith(home) else PurePosixPath()
+        inside = (
+            PurePosixPath(name.removeprefix(home)) if name.startswith(home) else PurePosixPath()
+        )
         if inside.parts[:1] in ((RENDERED,), (PHOTOGRAPHS,)) and inside.suffix == ".png":
             if ".." in inside.parts or "\\" in name:
                 raise InputError(f"{archive}: {name!r} leads out of the archive")
@@ -80,11 +104,13 @@ def _wanted(archive: Path, sizes: dict[str, int]) -> dict[str, str]:
 
 
 def _home(archive: Path, names: Sequence[str]) -> str:
-    """The folder in the archive that has renders and photographs, with a slash at its end; "" for the archive."""
+    """The folder in the archive that has renders and photographs, with a slash at its end; "" for
+    the archive."""
     both = sorted(_parents(names, RENDERED) & _parents(names, PHOTOGRAPHS))
     if len(both) != 1:
         raise InputError(
-            f"{archive} must have one folder with {RENDERED}/ and {PHOTOGRAPHS}/, as nerfbaselines writes it, and has "
+            f"{archive} must have one folder with {RENDERED}/ and {PHOTOGRAPHS}/, as "
+            "nerfbaselines writes it, and has "
             f"{len(both) or 'none'}"
         )
     return both[0]
@@ -97,7 +123,8 @@ def _parents(names: Sequence[str], folder: str) -> set[str]:
 
 
 def _write(source: IO[bytes], target: Path, size: int) -> None:
-    """Copy exactly ``size`` bytes; raises ValueError for a member that has more or fewer than the archive says."""
+    """Copy exactly ``size`` bytes; raises ValueError for a member that has more or fewer than the
+    archive says."""
     target.parent.mkdir(parents=True, exist_ok=True)
     written = 0
     with target.open("wb") as file:

@@ -1,4 +1,5 @@
-"""The experiments in a runs folder, the search that tunes an arm (``tuning.json``), and declared questions."""
+"""The experiments in a runs folder, the search that tunes an arm (``tuning.json``), and declared
+questions."""
 
 import calendar
 import json
@@ -26,14 +27,19 @@ def list_experiments(runs_dir: Path) -> list[str]:
     """The names of the experiments in a runs folder, sorted."""
     if not runs_dir.is_dir():
         return []
-    return sorted(Path(folder).name for folder in folders_in(runs_dir) if Path(folder).name not in IN_RUNS)
+    return sorted(
+        Path(folder).name for folder in folders_in(runs_dir) if Path(folder).name not in IN_RUNS
+    )
 
 
 def experiment_home(runs_dir: Path, name: str) -> Path:
-    """The folder of the experiment ``name``; for an unknown name raises InputError that lists the experiments."""
+    """The folder of the experiment ``name``; for an unknown name raises InputError that lists the
+    experiments."""
     names = list_experiments(runs_dir)
     if name not in names:
-        raise InputError(f"no experiment {name!r} in {runs_dir}; there: {', '.join(names) or 'none yet'}")
+        raise InputError(
+            f"no experiment {name!r} in {runs_dir}; there: {', '.join(names) or 'none yet'}"
+        )
     return runs_dir / name
 
 
@@ -44,7 +50,8 @@ def make_home(home: Path) -> None:
 
 
 def trial_folders(home: Path) -> Iterator[str]:
-    """The paths of all folders three levels below ``home`` (scene, arm, trial), in no particular order."""
+    """The paths of all folders three levels below ``home`` (scene, arm, trial), in no particular
+    order."""
     for scene in folders_in(home):
         for arm in folders_in(scene):
             yield from folders_in(arm)
@@ -69,7 +76,8 @@ def folders_in(folder: str | Path) -> list[str]:
 
 @dataclass(frozen=True, kw_only=True)
 class SearchPoint(Record):
-    """A point of a search; ``value`` is the mean of the metric over its trials, None if one of them has no value."""
+    """A point of a search; ``value`` is the mean of the metric over its trials, None if one of them
+    has no value."""
 
     settings: dict[str, Whole | Number]
     value: Number | None
@@ -77,10 +85,11 @@ class SearchPoint(Record):
 
 @dataclass(frozen=True, kw_only=True)
 class TuningRecord(Record):
-    """The search for the settings of ``arm`` (INIT-DENSIFY), which the experiment ``sweep`` then trains.
+    """The search for the settings of ``arm`` (INIT-DENSIFY), which the experiment ``sweep`` then
+    trains.
 
-    ``ranges`` are the searched ranges as given, those in ``log`` on a logarithmic scale. ``wanted`` is the number of
-    points, each judged by trials of ``seeds`` on validation views of ``scenes``.
+    ``ranges`` are the searched ranges as given, those in ``log`` on a logarithmic scale. ``wanted``
+    is the number of points, each judged by trials of ``seeds`` on validation views of ``scenes``.
     """
 
     sweep: Text
@@ -108,32 +117,37 @@ class TuningRecord(Record):
         return max(done, key=lambda point: self.direction * (point.value or 0.0), default=None)
 
 
-# ---- the questions that were declared for an experiment before its trials ran: ``<runs>/<experiment>/declared.jsonl``
+# ---- questions declared before the trials ran: ``<runs>/<experiment>/declared.jsonl``
 #
-# Every line is a `Declaration`. A command writes it before its trials run, for ``eval.primary``, a file of claims or
-# ``launch.stop_when_decided``. A trial's ``results.json`` repeats the metric that was declared when it ran.
-# `gsbench.analysis.judgement` answers the questions.
+# Every line is a `Declaration`. A command writes it before its trials run, for ``eval.primary``, a
+# file of claims or ``launch.stop_when_decided``. A trial's ``results.json`` repeats the metric that
+# was declared when it ran. `gsbench.analysis.judgement` answers the questions.
 
 INTERPOLATION, EXTRAPOLATION = "interpolation", "extrapolation"
-QUESTIONS = {"every_nth": INTERPOLATION, "sector": EXTRAPOLATION}  # the question of each split (scene.split)
+# the question of each split (scene.split)
+QUESTIONS = {"every_nth": INTERPOLATION, "sector": EXTRAPOLATION}
 AT = "@"  # psnr@extrapolation
 STAMP = "%Y-%m-%dT%H:%M:%SZ"  # UTC, as in the manifests of the store
 ERROR_RATE = 0.05
 
 TrialKey = Annotated[str, Field(pattern=r"^[^/]*/[^/]*/[^/]*$")]
-Planned = Mapping[str, tuple[int, ...]]  # seeds by scene, arm and hash of the configuration (`trial_key`)
+# seeds by scene, arm and hash of the configuration (`trial_key`)
+Planned = Mapping[str, tuple[int, ...]]
 
 
 def trial_key(scene: str, arm: str, config_hash: str) -> str:
-    """The key that trials of an experiment share if they differ only in the seed: ``garden/sfm-adc/3fa9c1d2``."""
+    """The key that trials of an experiment share if they differ only in the seed:
+    ``garden/sfm-adc/3fa9c1d2``."""
     return f"{scene}/{arm}/{config_hash}"
 
 
 @dataclass(frozen=True, order=True)
 class Arm:
-    """An arm of a comparison: an initialiser, a densifier, and the swept settings that distinguish it.
+    """An arm of a comparison: an initialiser, a densifier, and the swept settings that distinguish
+    it.
 
-    ``variant`` holds (setting, value as text) pairs. The arms of a file of claims have its names and no ``init``.
+    ``variant`` holds (setting, value as text) pairs. The arms of a file of claims have its names
+    and no ``init``.
     """
 
     __pydantic_config__ = STRICT
@@ -144,23 +158,27 @@ class Arm:
 
     def __str__(self) -> str:
         name = f"{self.init}-{self.densify}" if self.init else self.densify
-        return " ".join([name, *(f"{key.rpartition('.')[2]}={value}" for key, value in self.variant)])
+        return " ".join(
+            [name, *(f"{key.rpartition('.')[2]}={value}" for key, value in self.variant)]
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
 class Question(Record):
-    """A question: does ``arm`` differ from ``baseline`` in ``metric`` in the direction ``sign``, by at least ``least``?
+    """A question: does ``arm`` differ from ``baseline`` in ``metric`` in the direction ``sign``, by
+    at least ``least``?
 
     - ``sign``: of the claimed difference, arm minus baseline; 0 if no difference is claimed.
-    - ``least``: the smallest difference that matters, in the metric's unit or (``relative``) as a fraction of the
-      baseline's value; None if it is not known.
-    - ``scenes``: for each scene, the keys (`trial_key`) of baseline's and arm's trials; if empty, the trials are those
-      of the two arms on all scenes.
+    - ``least``: the smallest difference that matters, in the metric's unit or (``relative``) as a
+      fraction of the baseline's value; None if it is not known.
+    - ``scenes``: for each scene, the keys (`trial_key`) of baseline's and arm's trials; if empty,
+      the trials are those of the two arms on all scenes.
     - ``seeds``: in the order of adding them; if empty, all seeds that both arms have.
-    - ``baseline`` and ``arm`` are None in a question about all compared arms, in the metric's own direction.
+    - ``baseline`` and ``arm`` are None in a question about all compared arms, in the metric's own
+      direction.
     - ``about``: "interpolation" or "extrapolation", "" for both.
-    - ``versions``: the arms are versions of one trainer, so their code may differ, and the baseline's trials may be
-      older than the question.
+    - ``versions``: the arms are versions of one trainer, so their code may differ, and the
+      baseline's trials may be older than the question.
     """
 
     metric: str
@@ -184,12 +202,13 @@ class Question(Record):
 
 @dataclass(frozen=True, kw_only=True)
 class Declaration(Record):
-    """Questions that were declared at ``time`` (UTC). ``error_rate`` is the chance that any answer is false.
+    """Questions that were declared at ``time`` (UTC). ``error_rate`` is the chance that any answer
+    is false.
 
-    ``looks`` are the rising numbers of seeds at which a question may be decided; without looks, all seeds are judged
-    at once. ``trials`` are the planned trials if the questions name none; None if they are not recorded. ``missing``
-    says by question what could not be tested, and why. ``votes`` is the number of people's votes at which the questions
-    of the round ``vote_round`` are judged.
+    ``looks`` are the rising numbers of seeds at which a question may be decided; without looks, all
+    seeds are judged at once. ``trials`` are the planned trials if the questions name none; None if
+    they are not recorded. ``missing`` says by question what could not be tested, and why. ``votes``
+    is the number of people's votes at which the questions of the round ``vote_round`` are judged.
     """
 
     time: str
@@ -217,7 +236,8 @@ class Declaration(Record):
 
     @property
     def kind(self) -> Literal["sweep", "claims", "votes"]:
-        """The subject: a sweep's metric, people's votes, or claims (of a file or a gate): their questions are named."""
+        """The subject: a sweep's metric, people's votes, or claims (of a file or a gate): their
+        questions are named."""
         if self.vote_round:
             return "votes"
         return "claims" if any(question.name for question in self.questions) else "sweep"
@@ -230,7 +250,8 @@ class Declaration(Record):
 
     @property
     def names_trials(self) -> bool:
-        """Return whether the planned trials are recorded. They are not in the part that a trial repeats."""
+        """Return whether the planned trials are recorded. They are not in the part that a trial
+        repeats."""
         return self.trials is not None or any(question.scenes for question in self.questions)
 
     @property
@@ -243,7 +264,8 @@ class Declaration(Record):
 
     @property
     def hash(self) -> str:
-        """sha256 of everything that affects the answers: different hashes are different declarations."""
+        """sha256 of everything that affects the answers: different hashes are different
+        declarations."""
         return sha256_of(replace(self, time="1970-01-01T00:00:00Z", missing={}).to_json())
 
     def summary(self) -> Declared:
@@ -280,16 +302,21 @@ def read_declarations(folder: Path, repeated: Iterable[Declared | None] = ()) ->
 
     ``repeated`` are the declarations in its trials' results. They are added if the file lacks them.
     """
-    declarations: list[Declaration] = [one for one in read_rows(folder / DECLARED, Declaration) if one.questions]
+    declarations: list[Declaration] = [
+        one for one in read_rows(folder / DECLARED, Declaration) if one.questions
+    ]
     in_file = {(one.primary, one.time) for one in declarations}
-    for metric, when in dict.fromkeys((one.metric, one.time) for one in repeated if one is not None):
+    for metric, when in dict.fromkeys(
+        (one.metric, one.time) for one in repeated if one is not None
+    ):
         if (metric, when) not in in_file and unix_time(when) is not None:
             declarations.append(Declaration(time=when, questions=(open_question(metric),)))
     return sorted(declarations, key=lambda declaration: declaration.moment)
 
 
 def latest_declaration(declarations: Sequence[Declaration]) -> Declaration:
-    """The latest of ``declarations`` (in the order of time), with the time since which it has been in force."""
+    """The latest of ``declarations`` (in the order of time), with the time since which it has been
+    in force."""
     first = len(declarations) - 1
     while first > 0 and declarations[first - 1].hash == declarations[-1].hash:
         first -= 1
@@ -298,7 +325,9 @@ def latest_declaration(declarations: Sequence[Declaration]) -> Declaration:
 
 def merge_planned(one: Planned, other: Planned) -> Planned:
     """The trials of both plans."""
-    return {key: tuple(sorted({*one.get(key, ()), *other.get(key, ())})) for key in {**one, **other}}
+    return {
+        key: tuple(sorted({*one.get(key, ()), *other.get(key, ())})) for key in {**one, **other}
+    }
 
 
 def record_text(declarations: Iterable[Declaration]) -> str:

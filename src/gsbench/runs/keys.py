@@ -1,11 +1,13 @@
-"""Hashes of what determines a result: of a configuration, of each step of a trial (its key), and of the code.
+"""Hashes of what determines a result: of a configuration, of each step of a trial (its key), and of
+the code.
 
 A step is a stage with its inputs. Its key is known before it runs. Loads neither Hydra nor torch.
 
-gsbench's own code is identified by *rooms* (parts of the package). If a room is as released (``released.json``), the
-versions of gsbench's stages, which are bumped by hand, stand for it. In a checkout that differs, the key of a stage
-also contains the digests of the differing rooms that it uses. A user's modules are hashed whole: those of configured
-classes and those in ``allow_targets``, since no others can be imported.
+gsbench's own code is identified by *rooms* (parts of the package). If a room is as released
+(``released.json``), the versions of gsbench's stages, which are bumped by hand, stand for it. In a
+checkout that differs, the key of a stage also contains the digests of the differing rooms that it
+uses. A user's modules are hashed whole: those of configured classes and those in ``allow_targets``,
+since no others can be imported.
 """
 
 import ast
@@ -27,7 +29,8 @@ from gsbench.settings import option_fields
 
 TARGET = "_target_"  # the key of a class's import path
 OWN = "gsbench."  # prefix of the import paths of gsbench's own classes
-# Options that cannot change a result. This holds for gsbench's own classes; a user's class may use the names otherwise.
+# Options that cannot change a result. This holds for gsbench's own classes; a user's class may use
+# the names otherwise.
 WITHOUT_EFFECT = ("threads", "weights", "download", "time_limit_minutes")
 # Settings that only declare how results are read or what an ablation may turn off.
 DECLARED = {"eval": ("primary", "controls"), "densify": ("switches",)}
@@ -48,7 +51,9 @@ def determining_settings(values: Mapping[str, Any]) -> dict[str, Any]:
     kept = {key: value for key, value in values.items() if key not in NOT_HASHED}
     for key, group in kept.items():
         if isinstance(group, dict):
-            without_effect = WITHOUT_EFFECT if str(group.get("_target_") or OWN).startswith(OWN) else ()
+            without_effect = (
+                WITHOUT_EFFECT if str(group.get("_target_") or OWN).startswith(OWN) else ()
+            )
             dropped = (*without_effect, *DECLARED.get(key, ()))
             kept[key] = {name: value for name, value in group.items() if name not in dropped}
     return kept
@@ -56,11 +61,14 @@ def determining_settings(values: Mapping[str, Any]) -> dict[str, Any]:
 
 def sha256_of(values: Any) -> str:
     """sha256 of canonical JSON: sorted keys, no spaces, floats by repr."""
-    return hashlib.sha256(json.dumps(values, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+    return hashlib.sha256(
+        json.dumps(values, sort_keys=True, separators=(",", ":")).encode()
+    ).hexdigest()
 
 
 def flatten(mapping: Mapping[str, Any], keep_empty: bool = False) -> dict[str, Any]:
-    """Nested mappings as one mapping with dotted keys; empty inner mappings are dropped unless ``keep_empty``.
+    """Nested mappings as one mapping with dotted keys; empty inner mappings are dropped unless
+    ``keep_empty``.
 
     Examples:
         >>> flatten({"a": {"b": 1, "c": {}}, "d": [2]})
@@ -80,10 +88,12 @@ def flatten(mapping: Mapping[str, Any], keep_empty: bool = False) -> dict[str, A
 
 @dataclass(frozen=True)
 class Stage:
-    """A stage of the pipeline, such as training. Bump ``version`` by hand when its code computes something else.
+    """A stage of the pipeline, such as training. Bump ``version`` by hand when its code computes
+    something else.
 
-    ``resumable`` stages continue from the files of a killed build; the others start in an empty folder. Files that
-    match ``scratch`` are needed only by the build, and removed when the result is complete.
+    ``resumable`` stages continue from the files of a killed build; the others start in an empty
+    folder. Files that match ``scratch`` are needed only by the build, and removed when the result
+    is complete.
     """
 
     name: str
@@ -92,16 +102,18 @@ class Stage:
     scratch: tuple[str, ...] = ()
 
     def key(self, inputs: dict[str, Any]) -> str:
-        """sha256 of the stage's name, its version and all of its inputs, which include upstream keys."""
+        """sha256 of the stage's name, its version and all of its inputs, which include upstream
+        keys."""
         return sha256_of({"stage": self.name, "version": self.version, "inputs": inputs})
 
 
 @dataclass(frozen=True)
 class Step:
-    """One step of a trial: ``build(folder)`` computes its result, which ``inputs`` (with upstream keys) determine.
+    """One step of a trial: ``build(folder)`` computes its result, which ``inputs`` (with upstream
+    keys) determine.
 
-    ``code`` has the states of the rooms that it uses (`ROOMS`). ``check`` is called after building; it
-    raises if other code than that in ``inputs`` may have built the result.
+    ``code`` has the states of the rooms that it uses (`ROOMS`). ``check`` is called after building;
+    it raises if other code than that in ``inputs`` may have built the result.
     """
 
     stage: Stage
@@ -131,17 +143,19 @@ STAGES = (CAPTURE, INIT, TRAIN, GROUND_TRUTH, EVALUATE)
 
 @dataclass(frozen=True)
 class UserCode:
-    """The user's code in a trial: the digests of its modules, and the classes that the configuration names.
+    """The user's code in a trial: the digests of its modules, and the classes that the
+    configuration names.
 
-    ``targets`` maps a place of the configuration (``densify``, ``eval.extra.sharp``) to a class's import path,
-    gsbench's own classes included.
+    ``targets`` maps a place of the configuration (``densify``, ``eval.extra.sharp``) to a class's
+    import path, gsbench's own classes included.
     """
 
     modules: Mapping[str, str] = field(default_factory=dict)
     targets: Mapping[str, str] = field(default_factory=dict)
 
     def is_behind(self, component: Any, place: str) -> bool:
-        """Return whether the component's class is named by, or defined in, a module that is not gsbench's."""
+        """Return whether the component's class is named by, or defined in, a module that is not
+        gsbench's."""
         defined_in = f"{type(component).__module__}."
         return not (self.targets.get(place, OWN).startswith(OWN) and defined_in.startswith(OWN))
 
@@ -149,11 +163,14 @@ class UserCode:
 NO_USER_CODE = UserCode()
 
 
-def options_of(group: str, component: Any, user: UserCode = NO_USER_CODE, place: str | None = None) -> dict[str, Any]:
+def options_of(
+    group: str, component: Any, user: UserCode = NO_USER_CODE, place: str | None = None
+) -> dict[str, Any]:
     """The class and options of a component of ``group``, as they enter a stage's key.
 
-    For gsbench's own classes, options that cannot change a result are left out. For a user's class, the digests of the
-    user's modules are added. ``place`` is where the configuration names the class, if that is not the group.
+    For gsbench's own classes, options that cannot change a result are left out. For a user's class,
+    the digests of the user's modules are added. ``place`` is where the configuration names the
+    class, if that is not the group.
     """
     cls, is_users = type(component), user.is_behind(component, place or group)
     values: dict[str, Any] = {"class": f"{cls.__module__}.{cls.__qualname__}"}
@@ -161,15 +178,24 @@ def options_of(group: str, component: Any, user: UserCode = NO_USER_CODE, place:
         values["source"] = dict(user.modules)
     if is_dataclass(component):
         left_out = () if is_users else WITHOUT_EFFECT
-        options = {one.name: getattr(component, one.name) for one in option_fields(cls) if one.name not in left_out}
+        options = {
+            one.name: getattr(component, one.name)
+            for one in option_fields(cls)
+            if one.name not in left_out
+        }
         values |= json.loads(json.dumps(options, default=str))
     return values
 
 
 def rasterizer_inputs(rasterizer: Any, user: UserCode = NO_USER_CODE) -> str | dict[str, Any]:
-    """The rasterizer as it enters a stage's key: by name if gsbench's own, else by class, code and options."""
+    """The rasterizer as it enters a stage's key: by name if gsbench's own, else by class, code and
+    options."""
     name: str = rasterizer.name
-    return {"name": name} | options_of("raster", rasterizer, user) if user.is_behind(rasterizer, "raster") else name
+    return (
+        {"name": name} | options_of("raster", rasterizer, user)
+        if user.is_behind(rasterizer, "raster")
+        else name
+    )
 
 
 def step_of(
@@ -179,7 +205,8 @@ def step_of(
     user: UserCode = NO_USER_CODE,
     in_processes: bool = False,
 ) -> Step:
-    """A step. Its inputs get the states of those parts of gsbench's source behind it that differ from the release.
+    """A step. Its inputs get the states of those parts of gsbench's source behind it that differ
+    from the release.
 
     ``in_processes`` says that the build starts processes, which import the code anew.
     """
@@ -188,18 +215,25 @@ def step_of(
 
     def check() -> None:
         changed = [f"gsbench's {room}" for room in changed_since_asked(rooms)]
-        changed += [f"the code of {name}" for name in user.modules if has_changed_since_import(name)]
+        changed += [
+            f"the code of {name}" for name in user.modules if has_changed_since_import(name)
+        ]
         if changed:
             raise InputError(
-                f"{', '.join(changed)} changed while {stage.name} ran, so it may have used the old and the new "
+                f"{', '.join(changed)} changed while {stage.name} ran, so it may have used the "
+                "old and the new "
                 "code: start again"
             )
 
     if edited_rooms := edited(states):
         inputs = inputs | {"code": edited_rooms}
-    # This process keeps running the code that it imported. Processes that a build starts import the files as they are
-    # then, so only for these an edit during the build matters.
-    return Step(stage, inputs, build, states, check) if in_processes else Step(stage, inputs, build, states)
+    # This process keeps running the code that it imported. Processes that a build starts import the
+    # files as they are then, so only for these an edit during the build matters.
+    return (
+        Step(stage, inputs, build, states, check)
+        if in_processes
+        else Step(stage, inputs, build, states)
+    )
 
 
 # ---- gsbench's own code
@@ -210,14 +244,22 @@ RELEASED = "released.json"  # in the package: the digests of all rooms at the re
 AS_RELEASED = "released"  # the state of a room that equals the release
 DIGEST_CHARACTERS = 16
 
-# The rooms of each stage: folders and files of gsbench that determine its numbers. Code that only reports, shows,
-# launches or reads is no room. Nor is code that makes objects from settings: keys contain the settings themselves.
-# An edit of one densifier changes the room of all densifiers; in return, the table is simple enough to check.
+# The rooms of each stage: folders and files of gsbench that determine its numbers. Code that only
+# reports, shows, launches or reads is no room. Nor is code that makes objects from settings: keys
+# contain the settings themselves. An edit of one densifier changes the room of all densifiers; in
+# return, the table is simple enough to check.
 MODEL = ("scene", "gaussians", "densify", "raster", "train", "events.py", "normalization.py")
 LOSS = ("eval/ssim.py", "eval/images.py", "eval/pictures.py")
 ROOMS = {
     "scene": ("scene", "init", "normalization.py", "pipeline/steps/scene.py"),
-    "init": ("scene", "init", "gaussians", "normalization.py", "weights.py", "pipeline/steps/scene.py"),
+    "init": (
+        "scene",
+        "init",
+        "gaussians",
+        "normalization.py",
+        "weights.py",
+        "pipeline/steps/scene.py",
+    ),
     "train": (*MODEL, *LOSS, "external", "pipeline/steps/train.py"),
     "ground_truth": ("scene", "normalization.py", "pipeline/steps/scene.py"),
     "evaluate": (*MODEL, "eval", "weights.py", "pipeline/steps"),
@@ -247,14 +289,16 @@ def changed_since_asked(rooms: Iterable[str]) -> list[str]:
 
 @cache
 def _first_contents(room: str) -> dict[str, bytes]:
-    """The files of a room when this process first asked for them: later edits do not change what it runs."""
+    """The files of a room when this process first asked for them: later edits do not change what it
+    runs."""
     return _contents(room)
 
 
 @cache
 def _state(room: str) -> str:
     released, contents = _released().get(room) or {}, _first_contents(room)
-    if released.get("bytes") == _digest(contents):  # the usual case of an installed gsbench, without parsing
+    # the usual case of an installed gsbench, without parsing
+    if released.get("bytes") == _digest(contents):
         return AS_RELEASED
     digest = _digest({name: syntax_of(content) for name, content in contents.items()})
     return AS_RELEASED if digest == released.get("syntax") else digest
@@ -264,11 +308,16 @@ def _contents(room: str) -> dict[str, bytes]:
     """The content of a room's files by their paths below the package."""
     path = PACKAGE / room
     files = [path] if path.suffix else sorted(path.rglob("*.py"))
-    return {file.relative_to(PACKAGE).as_posix(): file.read_bytes() for file in files if file.is_file()}
+    return {
+        file.relative_to(PACKAGE).as_posix(): file.read_bytes() for file in files if file.is_file()
+    }
 
 
 def _digest(contents: Mapping[str, bytes]) -> str:
-    parts = "".join(f"{hashlib.sha256(content).hexdigest()}  {name}\n" for name, content in sorted(contents.items()))
+    parts = "".join(
+        f"{hashlib.sha256(content).hexdigest()}  {name}\n"
+        for name, content in sorted(contents.items())
+    )
     return hashlib.sha256(parts.encode()).hexdigest()[:DIGEST_CHARACTERS]
 
 
@@ -282,7 +331,8 @@ def _released() -> dict[str, dict[str, str]]:
 
 
 def syntax_of(source: bytes) -> bytes:
-    """The syntax tree of a Python file without docstrings, as text; the source itself if it cannot be parsed."""
+    """The syntax tree of a Python file without docstrings, as text; the source itself if it cannot
+    be parsed."""
     try:
         tree = ast.parse(source)
     except (SyntaxError, ValueError, RecursionError):
@@ -296,7 +346,8 @@ def syntax_of(source: bytes) -> bytes:
 
 
 def room_digests(room: str) -> dict[str, str]:
-    """The digests of a room's files, and of their syntax, as `RELEASED` records them for each room."""
+    """The digests of a room's files, and of their syntax, as `RELEASED` records them for each
+    room."""
     contents = _contents(room)
     syntax = {name: syntax_of(content) for name, content in contents.items()}
     return {"bytes": _digest(contents), "syntax": _digest(syntax)}
@@ -304,32 +355,41 @@ def room_digests(room: str) -> dict[str, str]:
 
 # ---- the user's code
 
-INSTALLED = frozenset({"site-packages", "dist-packages"})  # the version stands for a package in these folders
+# the version stands for a package in these folders
+INSTALLED = frozenset({"site-packages", "dist-packages"})
 CODE_SUFFIXES = frozenset({".py", ".so", ".pyd", ".c", ".cpp", ".cu", ".h", ".cuh"})
 
-_digests_at_import: dict[str, tuple[ModuleSpec, str | None]] = {}  # a module's digest when it was first asked for
+# a module's digest when it was first asked for
+_digests_at_import: dict[str, tuple[ModuleSpec, str | None]] = {}
 
 
 def user_modules(values: Mapping[str, Any]) -> dict[str, str]:
-    """``{module: sha256}`` of the user's code behind a configuration; {} if all of its classes are gsbench's.
+    """``{module: sha256}`` of the user's code behind a configuration; {} if all of its classes are
+    gsbench's.
 
-    These are the modules of its classes, and the modules in ``allow_targets``, which the classes may import. An
-    installed module is included only if a class comes from it.
+    These are the modules of its classes, and the modules in ``allow_targets``, which the classes
+    may import. An installed module is included only if a class comes from it.
     """
     of_classes = {name.split(".")[0] for _, name in targets_in(values) if not name.startswith(OWN)}
     if not of_classes:
         return {}
     helpers = {name.split(".")[0] for name in values.get("allow_targets") or ()} - of_classes
-    helpers = {name for name in helpers if (spec := _find_spec(name)) is not None and not _is_installed(spec)}
+    helpers = {
+        name
+        for name in helpers
+        if (spec := _find_spec(name)) is not None and not _is_installed(spec)
+    }
     digests = {name: module_digest(name) for name in sorted(of_classes | helpers)}
     return {name: digest for name, digest in digests.items() if digest is not None}
 
 
 def module_digest(name: str, folder: str | None = None) -> str | None:
-    """The sha256 of a top-level module: of its file, or of all code in its package. None if it is not found.
+    """The sha256 of a top-level module: of its file, or of all code in its package. None if it is
+    not found.
 
-    A module that this process has imported keeps its digest: that is the code that runs. With ``folder``, the module is
-    found as by a program that is started there, without regard to what this process has imported.
+    A module that this process has imported keeps its digest: that is the code that runs. With
+    ``folder``, the module is found as by a program that is started there, without regard to what
+    this process has imported.
     """
     loaded = sys.modules.get(name) if folder is None else None
     spec = _find_spec(name, folder) if loaded is None else loaded.__spec__
@@ -344,26 +404,41 @@ def module_digest(name: str, folder: str | None = None) -> str | None:
 
 
 def has_changed_since_import(name: str) -> bool:
-    """Return whether a module's files differ from the code that this process has imported and runs."""
+    """Return whether a module's files differ from the code that this process has imported and
+    runs."""
     loaded = sys.modules.get(name)
     spec = None if loaded is None else loaded.__spec__
     return spec is not None and module_digest(name) != _digest_on_disk(spec)
 
 
 def unnamed_modules(before: Collection[str], named: Collection[str]) -> list[str]:
-    """The user's modules that were imported since ``before`` but are not ``named``: their edits change no key."""
-    tops = {name.split(".")[0] for name in sys.modules.keys() - set(before)} - {*named, PACKAGE.name}
+    """The user's modules that were imported since ``before`` but are not ``named``: their edits
+    change no key."""
+    tops = {name.split(".")[0] for name in sys.modules.keys() - set(before)} - {
+        *named,
+        PACKAGE.name,
+    }
     specs = {top: getattr(sys.modules.get(top), "__spec__", None) for top in tops}
-    return sorted(top for top, spec in specs.items() if spec is not None and not _is_installed(spec))
+    return sorted(
+        top for top, spec in specs.items() if spec is not None and not _is_installed(spec)
+    )
 
 
 def targets_in(values: Any, place: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
-    """Yield every ``_target_`` at any depth, lists included, as (keys that lead to its mapping, the target)."""
-    return ((inner, value) for inner, key, value in entries_of(values, place) if key == TARGET and value is not None)
+    """Yield every ``_target_`` at any depth, lists included, as (keys that lead to its mapping, the
+    target)."""
+    return (
+        (inner, value)
+        for inner, key, value in entries_of(values, place)
+        if key == TARGET and value is not None
+    )
 
 
-def entries_of(values: Any, place: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], str, Any]]:
-    """Yield every entry at any depth, lists included, as (keys that lead there, its key, its value)."""
+def entries_of(
+    values: Any, place: tuple[str, ...] = ()
+) -> Iterator[tuple[tuple[str, ...], str, Any]]:
+    """Yield every entry at any depth, lists included, as (keys that lead there, its key, its
+    value)."""
     if isinstance(values, Mapping | list | tuple):
         for key, value in values.items() if isinstance(values, Mapping) else enumerate(values):
             yield place, str(key), value
@@ -382,11 +457,16 @@ def _find_spec(name: str, folder: str | None = None) -> ModuleSpec | None:
 
 
 def _digest_on_disk(spec: ModuleSpec) -> str | None:
-    """The sha256 of a module's code: of its content if it is one file, else of the list of its files' hashes."""
+    """The sha256 of a module's code: of its content if it is one file, else of the list of its
+    files' hashes."""
     folders = [Path(place) for place in spec.submodule_search_locations or ()]
     if not folders:
         file = Path(spec.origin or "")
-        return hashlib.sha256(file.read_bytes()).hexdigest() if spec.has_location and file.is_file() else None
+        return (
+            hashlib.sha256(file.read_bytes()).hexdigest()
+            if spec.has_location and file.is_file()
+            else None
+        )
     parts = [
         f"{hashlib.sha256(file.read_bytes()).hexdigest()}  {file.relative_to(folder).as_posix()}\n"
         for folder in folders
@@ -397,10 +477,13 @@ def _digest_on_disk(spec: ModuleSpec) -> str | None:
 
 
 def _is_installed(spec: ModuleSpec) -> bool:
-    """Return whether a module is Python's own or of an installed package: their versions stand for them."""
+    """Return whether a module is Python's own or of an installed package: their versions stand for
+    them."""
     paths = [spec.origin] if spec.has_location else list(spec.submodule_search_locations or [])
     library = [sysconfig.get_path(key) for key in ("stdlib", "platstdlib")]
     return all(
-        path is None or INSTALLED & set(Path(path).parts) or any(Path(path).is_relative_to(one) for one in library)
+        path is None
+        or INSTALLED & set(Path(path).parts)
+        or any(Path(path).is_relative_to(one) for one in library)
         for path in paths
     )

@@ -37,7 +37,8 @@ SUBMITTED = ".submitted.json"  # the trial's Slurm job
 BUILDING = "building.json"  # the present stage of an unfinished trial, and its folder
 INIT_REPORT = "init_report.json"
 PER_VIEW = "per_view.csv"
-FROM_PIXELS = "from_pixels.json"  # measures of pictures, in a trial from an archive without pictures
+# measures of pictures, in a trial from an archive without pictures
+FROM_PIXELS = "from_pixels.json"
 CURVES = "metrics.jsonl"  # of the training
 EVENTS = "events.jsonl"  # counts of every refinement by cause
 HISTOGRAMS = "volume_histograms.jsonl"

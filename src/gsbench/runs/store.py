@@ -1,8 +1,8 @@
 """A store of stage results by the key of their inputs, so that nothing is computed twice.
 
-``<root>/<stage>/<key>/`` is a finished result; its ``manifest.json`` is written last. ``.<key>.partial/`` is the folder
-in which it is built, and which a killed build leaves. While one process holds ``.<key>.lock`` (an empty file that is
-never removed) and builds, others wait.
+``<root>/<stage>/<key>/`` is a finished result; its ``manifest.json`` is written last.
+``.<key>.partial/`` is the folder in which it is built, and which a killed build leaves. While one
+process holds ``.<key>.lock`` (an empty file that is never removed) and builds, others wait.
 """
 
 import logging
@@ -66,7 +66,8 @@ class Manifest(Record):
 
 @dataclass(frozen=True)
 class StoredResult:
-    """A finished result in the store; ``cached`` if it was not built now, ``seconds`` is the time of building it."""
+    """A finished result in the store; ``cached`` if it was not built now, ``seconds`` is the time
+    of building it."""
 
     path: Path
     key: str
@@ -75,11 +76,15 @@ class StoredResult:
 
 
 class Store:
-    """The store below ``root``; ``on_build`` is called with each stage that is built, and its partial folder."""
+    """The store below ``root``; ``on_build`` is called with each stage that is built, and its
+    partial folder."""
 
-    def __init__(self, root: Path, on_build: Callable[[Stage, Path], None] = lambda stage, folder: None) -> None:
+    def __init__(
+        self, root: Path, on_build: Callable[[Stage, Path], None] = lambda stage, folder: None
+    ) -> None:
         self.root, self.on_build = root, on_build
-        self._verified: set[Path] = set()  # results whose checksums this process has compared or computed
+        # results whose checksums this process has compared or computed
+        self._verified: set[Path] = set()
 
     def folder(self, stage: Stage, key: str) -> Path:
         """The folder of the finished result of ``stage`` under ``key``."""
@@ -103,18 +108,20 @@ class Store:
     def get(self, step: Step) -> StoredResult:
         """The result of ``step``; it is built unless it exists, and published by an atomic rename.
 
-        A damaged result is built again, with a warning. Raises DiskFullError, or InputError if the store is read-only.
+        A damaged result is built again, with a warning. Raises DiskFullError, or InputError if the
+        store is read-only.
         """
         final = self.path(step)
-        # An existing result may become the input of further steps, so its checksums are compared once in each process:
-        # a flipped bit changes neither size nor time of change.
+        # An existing result may become the input of further steps, so its checksums are compared
+        # once in each process: a flipped bit changes neither size nor time of change.
         with suppress(ValueError):
             return self._read_verified(final)
         with storage_errors(self.root.parent):
             require_no_links(self.root.parent, self.partial(step.stage, step.key))
             final.parent.mkdir(parents=True, exist_ok=True)
             with hold(final.parent / f".{step.key}.lock", f"{step.stage.name} {step.key[:8]}"):
-                if os.path.lexists(final):  # another process may have built it while this one waited
+                # another process may have built it while this one waited
+                if os.path.lexists(final):
                     try:
                         return self._read_verified(final)
                     except ValueError as error:
@@ -130,13 +137,17 @@ class Store:
     def _read(self, path: Path, thorough: bool = False) -> StoredResult:
         if path.is_symlink():
             raise ValueError("it is a link")
-        return StoredResult(path, path.name, read_manifest(path, thorough=thorough).seconds, cached=True)
+        return StoredResult(
+            path, path.name, read_manifest(path, thorough=thorough).seconds, cached=True
+        )
 
     def _build(self, step: Step) -> StoredResult:
-        """Build or finish the partial folder, and publish it. The caller holds the lock of the step's key."""
+        """Build or finish the partial folder, and publish it. The caller holds the lock of the
+        step's key."""
         final, partial, stage = self.path(step), self.partial(step.stage, step.key), step.stage
         seconds = None
-        with suppress(ValueError):  # else the build was killed between writing the manifest and publishing
+        # else the build was killed between writing the manifest and publishing
+        with suppress(ValueError):
             seconds = read_manifest(partial, step.key).seconds
         if seconds is None:
             if partial.exists() and not stage.resumable:
@@ -160,7 +171,8 @@ class Store:
         return StoredResult(final, step.key, seconds, cached=False)
 
     def sweep(self, stages: Iterable[Stage]) -> None:
-        """Remove the remains of killed processes that no build would continue. Locked folders are left alone."""
+        """Remove the remains of killed processes that no build would continue. Locked folders are
+        left alone."""
         for stage in stages:
             for partial in (self.root / stage.name).glob(".*.partial"):
                 key = partial.name[1 : -len(".partial")]
@@ -170,21 +182,27 @@ class Store:
                         _remove(partial)
             for removed in (self.root / stage.name).glob(".*.removed"):
                 shutil.rmtree(removed, ignore_errors=True)
-        for work in (self.root / VIEWS).glob(".*"):  # photographs are prepared in such folders, which have no lock
+        # photographs are prepared in such folders, which have no lock
+        for work in (self.root / VIEWS).glob(".*"):
             with suppress(OSError):
                 if work.is_dir() and time.time() - work.stat().st_mtime > LEFTOVER_AGE:
                     shutil.rmtree(work, ignore_errors=True)
 
 
 def write_manifest(folder: Path, step: Step, seconds: float) -> None:
-    """Write the manifest of ``folder`` with a checksum of every file, after all files are safely on the disk."""
+    """Write the manifest of ``folder`` with a checksum of every file, after all files are safely on
+    the disk."""
     scratch = {path for pattern in step.stage.scratch for path in folder.rglob(pattern)}
     outputs = {}
     for path in sorted(folder.rglob("*")):
         if path.is_file() and path not in scratch:
             sync_to_disk(path)
             state = path.stat()
-            recorded = {"size": state.st_size, "mtime_ns": state.st_mtime_ns, "sha256": file_sha256(path)}
+            recorded = {
+                "size": state.st_size,
+                "mtime_ns": state.st_mtime_ns,
+                "sha256": file_sha256(path),
+            }
             outputs[path.relative_to(folder).as_posix()] = recorded
     manifest = {
         "stage": step.stage.name,
@@ -202,8 +220,8 @@ def write_manifest(folder: Path, step: Step, seconds: float) -> None:
 def read_manifest(folder: Path, key: str | None = None, thorough: bool = False) -> Manifest:
     """Read and check the manifest in ``folder``; ``key`` defaults to the folder's name.
 
-    A file with the recorded size and time of change counts as sound, unless ``thorough``; other files are compared by
-    checksum. Raises ValueError that names what is damaged.
+    A file with the recorded size and time of change counts as sound, unless ``thorough``; other
+    files are compared by checksum. Raises ValueError that names what is damaged.
     """
     try:
         manifest = read_typed(folder / MANIFEST, Manifest)
@@ -234,7 +252,8 @@ def _is_sound(folder: Path, name: str, recorded: Output, thorough: bool) -> bool
 
 
 def _remove(folder: Path) -> None:
-    """Remove a folder. It is renamed first, so that a kill in between leaves nothing that looks like a result."""
+    """Remove a folder. It is renamed first, so that a kill in between leaves nothing that looks
+    like a result."""
     removed = folder.with_name(f".{folder.name.lstrip('.')}.removed")
     shutil.rmtree(removed, ignore_errors=True)
     os.replace(folder, removed)

@@ -1,6 +1,7 @@
 """A trial's folder: its path, its state, reading and writing its files, and what it was made of.
 
-Nothing here follows a link (`gsbench.files.open_plain`): the runs folder may come from a stranger. Loads no torch.
+Nothing here follows a link (`gsbench.files.open_plain`): the runs folder may come from a stranger.
+Loads no torch.
 """
 
 from __future__ import annotations
@@ -55,7 +56,8 @@ TAIL_BYTES = 4096  # of a growing log, enough for its last rows
 
 
 class TrialFolder:
-    """The folder ``<runs>/<experiment>/<scene>/<init>-<densify>/<hash8>-seed<k>`` of a trial, and its files.
+    """The folder ``<runs>/<experiment>/<scene>/<init>-<densify>/<hash8>-seed<k>`` of a trial, and
+    its files.
 
     Examples:
         >>> TrialFolder(Path("runs/table1/garden/sfm-adc/3fa9c1d2-seed0")).label
@@ -64,7 +66,8 @@ class TrialFolder:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._digests: Mapping[str, str] | None = None  # sha256 of files by name, from the results that were read last
+        # sha256 of files by name, from the results that were read last
+        self._digests: Mapping[str, str] | None = None
 
     @classmethod
     def of(cls, values: Mapping[str, Any]) -> TrialFolder:
@@ -86,7 +89,8 @@ class TrialFolder:
 
     @property
     def key(self) -> str:
-        """The folder within its experiment, without the seed (`gsbench.runs.experiments.trial_key`)."""
+        """The folder within its experiment, without the seed
+        (`gsbench.runs.experiments.trial_key`)."""
         return self.path.relative_to(self.home).as_posix().rpartition(layout.SEED)[0]
 
     @property
@@ -101,7 +105,8 @@ class TrialFolder:
         return f"{self.path.parent.parent.name}/{self.path.parent.name} seed {seed} ({hash8})"
 
     def require_no_links(self) -> None:
-        """Raise InputError if the folder, a folder above it, or anything in it is a link, a pipe or a device."""
+        """Raise InputError if the folder, a folder above it, or anything in it is a link, a pipe or
+        a device."""
         require_no_links(self.runs, self.path, below=True)
 
     # ---- state
@@ -123,7 +128,9 @@ class TrialFolder:
 
     def failure(self) -> Failure:
         """The reason why the trial failed."""
-        return read_if_sound(self.path / layout.FAILED, Failure) or Failure(message=f"{layout.FAILED} cannot be read")
+        return read_if_sound(self.path / layout.FAILED, Failure) or Failure(
+            message=f"{layout.FAILED} cannot be read"
+        )
 
     def has_failed(self) -> bool:
         """Return whether the trial's last run failed."""
@@ -134,10 +141,15 @@ class TrialFolder:
         return read_if_sound(self.path / layout.BUILDING, Building) or Building()
 
     def stage_and_step(self) -> tuple[str, int]:
-        """The present stage of the unfinished trial ("" if none has begun), and the last logged iteration."""
+        """The present stage of the unfinished trial ("" if none has begun), and the last logged
+        iteration."""
         building = self.building()
         try:
-            tail = read_tail(Path(building.folder, layout.CURVES), TAIL_BYTES) if building.folder else b""
+            tail = (
+                read_tail(Path(building.folder, layout.CURVES), TAIL_BYTES)
+                if building.folder
+                else b""
+            )
         except (FileNotFoundError, DamagedError):
             tail = b""
         steps = re.findall(rb'"step": (\d{1,18})', tail)
@@ -146,22 +158,25 @@ class TrialFolder:
     # ---- configuration
 
     def configuration(self) -> dict[str, Any]:
-        """The configuration in ``config.yaml``, without its permissions; raises InputError if it cannot be used."""
+        """The configuration in ``config.yaml``, without its permissions; raises InputError if it
+        cannot be used."""
         path = self.path / layout.CONFIG
         try:
             values = read_yaml(path)
         except FileNotFoundError:
             raise InputError(f"{path} is not there: give the command of the trial again") from None
         parse_typed(to_json(values), Configuration, path)
-        return values | {"allow_targets": []}  # only the user who gives a command may allow code to run
+        # only the user who gives a command may allow code to run
+        return values | {"allow_targets": []}
 
     # ---- results
 
     def record(self) -> TrialRecord:
         """The content of ``results.json``.
 
-        Raises FileNotFoundError if there is none, and DamagedError if it is damaged, unfinished, or was changed after
-        it was written. Results without ``made_of`` cannot be checked for changes, and are accepted.
+        Raises FileNotFoundError if there is none, and DamagedError if it is damaged, unfinished, or
+        was changed after it was written. Results without ``made_of`` cannot be checked for changes,
+        and are accepted.
         """
         path = self.path / layout.RESULTS
         content = read_bytes(path)
@@ -171,7 +186,9 @@ class TrialFolder:
             values = from_json(content)  # compared as values: white space does not matter
             del values[MADE_OF]
             if made_of.results != sha256_of(values):
-                reason = f"was changed after it was written: `gsbench retry {self.home.name}` repairs it"
+                reason = (
+                    f"was changed after it was written: `gsbench retry {self.home.name}` repairs it"
+                )
                 raise DamagedError(path, reason)
         self._digests = {} if made_of is None else made_of.digests
         return record
@@ -184,11 +201,13 @@ class TrialFolder:
             return None
 
     def made_of(self) -> MadeOf | None:
-        """The inputs of the results, not checked for changes; None if they are not recorded. Raises as `record`."""
+        """The inputs of the results, not checked for changes; None if they are not recorded. Raises
+        as `record`."""
         return read_typed(self.path / layout.RESULTS, ResultsFile).made_of
 
     def settings(self) -> dict[str, Any]:
-        """The settings in ``results.json``, else those in ``config.yaml``: YAML takes some twenty times longer to read.
+        """The settings in ``results.json``, else those in ``config.yaml``: YAML takes some twenty
+        times longer to read.
 
         Raises FileNotFoundError and DamagedError.
         """
@@ -208,13 +227,16 @@ class TrialFolder:
     ) -> bool:
         """Write ``results.json``, after which the trial is complete.
 
-        ``sources`` are the user's files, ``entries`` results of stages by name, ``published`` files in this folder.
-        Returns True if it already had equal results: then only ``made_of`` is renewed, and the file keeps its time.
+        ``sources`` are the user's files, ``entries`` results of stages by name, ``published`` files
+        in this folder. Returns True if it already had equal results: then only ``made_of`` is
+        renewed, and the file keeps its time.
         """
         path, content = self.path / layout.RESULTS, record.to_json()
         present = self.sound_record()
         before = path.stat() if present is not None and present.to_json() == content else None
-        files = sorted({*published, *(self.path / name for name in READ_LATER if (self.path / name).is_file())})
+        files = sorted(
+            {*published, *(self.path / name for name in READ_LATER if (self.path / name).is_file())}
+        )
         names = {file.relative_to(self.path).as_posix(): file for file in files}
         sources = sorted(sources)
         made_of = MadeOf(
@@ -224,7 +246,10 @@ class TrialFolder:
             pycolmap=version_of("pycolmap"),
             sources={str(source): source_stamp_of(source) for source in sources},
             # Adding or removing a file changes its folder's time.
-            folders={str(folder): _changed_at(folder) for folder in sorted({source.parent for source in sources})},
+            folders={
+                str(folder): _changed_at(folder)
+                for folder in sorted({source.parent for source in sources})
+            },
             entries={name: str(entry) for name, entry in (entries or {}).items()},
             published={name: stamp_of(file) for name, file in names.items()},
             digests={
@@ -235,20 +260,27 @@ class TrialFolder:
             settings=dict(values),
         )
         with atomic(path) as temporary:
-            temporary.write_text(json.dumps(content | {MADE_OF: made_of.to_json()}, indent=1, allow_nan=False) + "\n")
-            # Verdicts count results from before their declaration by this time, so equal results must not look newer.
+            temporary.write_text(
+                json.dumps(content | {MADE_OF: made_of.to_json()}, indent=1, allow_nan=False) + "\n"
+            )
+            # Verdicts count results from before their declaration by this time, so equal results
+            # must not look newer.
             if before is not None:
                 os.utime(temporary, ns=(before.st_atime_ns, before.st_mtime_ns))
         return before is not None
 
     def why_not_done(
-        self, values: dict[str, Any], unavailable_now: Callable[[dict[str, Any]], Collection[str]] | None = None
+        self,
+        values: dict[str, Any],
+        unavailable_now: Callable[[dict[str, Any]], Collection[str]] | None = None,
     ) -> str:
-        """The reason to run or check the trial with the resolved configuration ``values``; "" if it is done.
+        """The reason to run or check the trial with the resolved configuration ``values``; "" if it
+        is done.
 
-        It is done if none of its inputs has changed. If it lacks a metric whose weights or packages were missing, it is
-        done only if ``unavailable_now``, called with the ``eval`` settings, still contains that metric. Without
-        ``unavailable_now``, it is not known whether the metric can be computed, so the trial is to be checked.
+        It is done if none of its inputs has changed. If it lacks a metric whose weights or packages
+        were missing, it is done only if ``unavailable_now``, called with the ``eval`` settings,
+        still contains that metric. Without ``unavailable_now``, it is not known whether the metric
+        can be computed, so the trial is to be checked.
         """
         try:
             record, made_of = self.record(), self.made_of()
@@ -270,10 +302,11 @@ class TrialFolder:
     # ---- files beside the results
 
     def curves(self, name: str = layout.CURVES, kind: Any = Row) -> list[Any]:
-        """The rows of a file of JSON lines that a training wrote over its iterations; [] if there is no such file.
+        """The rows of a file of JSON lines that a training wrote over its iterations; [] if there
+        is no such file.
 
-        With a warning, a finished trial's file that was changed after it was written is left out, and so are all rows
-        from a damaged one on.
+        With a warning, a finished trial's file that was changed after it was written is left out,
+        and so are all rows from a damaged one on.
         """
         return read_rows(self.path / name, kind, lambda path: self._unchanged(path.name))
 
@@ -286,7 +319,11 @@ class TrialFolder:
         try:
             text = content.decode("utf-8")
             return {
-                row["view"]: {key: _number(value) for key, value in row.items() if key != "view" and value != ""}
+                row["view"]: {
+                    key: _number(value)
+                    for key, value in row.items()
+                    if key != "view" and value != ""
+                }
                 for row in csv.DictReader(io.StringIO(text, newline=""))
             }
         except (UnicodeDecodeError, KeyError, TypeError, ValueError, csv.Error) as error:
@@ -297,14 +334,17 @@ class TrialFolder:
         return sorted((self.path / kind).glob("*.png"))
 
     def _unchanged(self, name: str) -> bytes:
-        """The content of a file; raises as `read_bytes`, and DamagedError if it was changed after it was written."""
+        """The content of a file; raises as `read_bytes`, and DamagedError if it was changed after
+        it was written."""
         content = read_bytes(self.path / name)
         if self._digests is None:
             self.sound_record()
         recorded = (self._digests or {}).get(name)
         if recorded is not None and hashlib.sha256(content).hexdigest() != recorded:
             raise DamagedError(
-                self.path / name, "was changed after it was written: delete it, and `gsbench retry` repairs the trial"
+                self.path / name,
+                "was changed after it was written: delete it, and `gsbench retry` repairs the "
+                "trial",
             )
         return content
 
@@ -316,18 +356,24 @@ def _number(text: str) -> float:
     return value
 
 
-# ---- what a trial was made of: by this a repeated sweep recognises finished trials without reading photographs
+# ---- what a trial was made of: a repeated sweep recognises finished trials by it
 
 MADE_OF = "made_of"  # the key in results.json
-READ_LATER = (layout.PER_VIEW, layout.CURVES, layout.EVENTS, layout.HISTOGRAMS)  # files that tables and reports read
-# Files up to so many bytes are compared by content, since a flipped bit changes neither size nor time.
+# files that tables and reports read
+READ_LATER = (layout.PER_VIEW, layout.CURVES, layout.EVENTS, layout.HISTOGRAMS)
+# Files up to so many bytes are compared by content, since a flipped bit changes neither size nor
+# time.
 MAX_HASHED_BYTES = 1e6
 
-_digests: dict[Stamp, str] = {}  # sha256 of files that this process has read, by device, inode and stamp
+# sha256 of files that this process has read, by device, inode and stamp
+_digests: dict[Stamp, str] = {}
 
 
-def find_changes(folder: Path, values: dict[str, Any], record: TrialRecord, made_of: MadeOf) -> Iterator[str]:
-    """Reasons why the complete trial in ``folder`` is out of date; those that are found quickly come first.
+def find_changes(
+    folder: Path, values: dict[str, Any], record: TrialRecord, made_of: MadeOf
+) -> Iterator[str]:
+    """Reasons why the complete trial in ``folder`` is out of date; those that are found quickly
+    come first.
 
     Files are compared by size and time of change, small files of gsbench's also by content.
     """
@@ -368,8 +414,8 @@ def stamp_of(path: Path) -> Stamp:
 def source_stamp_of(path: Path) -> Stamp:
     """Size, mtime and ctime of a user's file; raises OSError.
 
-    A program may replace a file and restore its mtime, but not its ctime. The ctime of gsbench's own files is not used:
-    they are hard links, and each further link changes it.
+    A program may replace a file and restore its mtime, but not its ctime. The ctime of gsbench's
+    own files is not used: they are hard links, and each further link changes it.
     """
     state = os.stat(path)
     return state.st_size, state.st_mtime_ns, state.st_ctime_ns

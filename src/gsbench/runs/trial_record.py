@@ -1,5 +1,6 @@
-"""The types of a trial's files: ``results.json``, the records of stages in the store (``training.json``,
-``metrics.json``), and the JSON lines of a training. They are used for writing and for reading.
+"""The types of a trial's files: ``results.json``, the records of stages in the store
+(``training.json``, ``metrics.json``), and the JSON lines of a training. They are used for writing
+and for reading.
 """
 
 import logging
@@ -32,7 +33,8 @@ from gsbench.settings import FolderName
 
 log = logging.getLogger(__name__)
 
-# ``evaluated_from`` of trials that gsbench did not train: it rendered another program's model, or has only renders.
+# ``evaluated_from`` of trials that gsbench did not train: it rendered another program's model, or
+# has only renders.
 FROM_MODEL: Final = "model"
 FROM_RENDERS: Final = "renders"
 MADE_ELSEWHERE = "made by another program"  # start of the reason why such a trial lacks a quantity
@@ -45,7 +47,8 @@ Iteration = Annotated[str, Field(pattern=r"^\d{1,18}$")]  # as the key of an obj
 
 @dataclass(frozen=True, kw_only=True)
 class Budget(Record):
-    """Limits on the growth of a trial: a maximum of Gaussians, the rule that keeps it, and a time limit in s."""
+    """Limits on the growth of a trial: a maximum of Gaussians, the rule that keeps it, and a time
+    limit in s."""
 
     max_gaussians: Count | None = None
     cap: str | None = None
@@ -54,10 +57,11 @@ class Budget(Record):
 
 @dataclass(frozen=True, kw_only=True)
 class Code(Record):
-    """The versions of the code: sha256 of a user's modules (``sources``), versions of gsbench's stages.
+    """The versions of the code: sha256 of a user's modules (``sources``), versions of gsbench's
+    stages.
 
-    ``rooms`` has the states of the rooms that made the trial (`gsbench.runs.keys`). ``commit`` is that of the checkout
-    that trained; ``edited`` says whether files that git tracks had changed.
+    ``rooms`` has the states of the rooms that made the trial (`gsbench.runs.keys`). ``commit`` is
+    that of the checkout that trained; ``edited`` says whether files that git tracks had changed.
     """
 
     sources: dict[str, str] = field(default_factory=dict)
@@ -96,7 +100,8 @@ class Declared(Record):
 
 @dataclass(frozen=True, kw_only=True)
 class ExternalTrainer(Record):
-    """The program that trained in gsbench's place: its name, its version, what it prints on that, and the command."""
+    """The program that trained in gsbench's place: its name, its version, what it prints on that,
+    and the command."""
 
     program: str
     version: str
@@ -109,10 +114,13 @@ class InitialCloud(Record):
     """Facts of the initial points, measured before the first iteration (`gsbench.train.start`)."""
 
     seen: Amount  # the share of points that at least two training views have in view
-    color_agreement: Number | None  # with the photographs: 1 is equal, 0 is chance; None for points of one colour
+    # with the photographs: 1 is equal, 0 is chance; None for points of one colour
+    color_agreement: Number | None
     identical: Amount  # the share of points that share their place with another
-    far: Count  # points more than 10,000 times as far from the cameras' median place as cameras usually are
-    spread: Amount  # the median distance of points from their median place, over that of the training cameras
+    # points more than 10,000 times as far from the cameras' median place as cameras usually are
+    far: Count
+    # the median distance of points from their median place, over that of the training cameras
+    spread: Amount
     warnings: list[str]  # about points and training cameras, as logged
 
 
@@ -120,8 +128,9 @@ class InitialCloud(Record):
 class TwinViews(Record):
     """Photographs that the capture has twice.
 
-    ``left_out`` maps each photograph that was not used to the one that it copies. ``near`` maps a test view to the
-    training view that looks nearly the same, as the next shot of a burst does; it was used.
+    ``left_out`` maps each photograph that was not used to the one that it copies. ``near`` maps a
+    test view to the training view that looks nearly the same, as the next shot of a burst does; it
+    was used.
     """
 
     left_out: dict[str, str] = field(default_factory=dict)
@@ -132,7 +141,8 @@ class TwinViews(Record):
 class RasterProof(Record):
     """A comparison of a rasterizer with the float64 reference on a device (`gsbench.train.proof`).
 
-    ``errors`` has the largest error of each quantity. ``failures`` has a line for each that is too large.
+    ``errors`` has the largest error of each quantity. ``failures`` has a line for each that is too
+    large.
     """
 
     raster: Text
@@ -149,10 +159,12 @@ class RasterProof(Record):
 
 @dataclass(frozen=True, kw_only=True)
 class TrialRecord(Record):
-    """A finished trial. A value that cannot be known is None; the file leaves out None if that is the default.
+    """A finished trial. A value that cannot be known is None; the file leaves out None if that is
+    the default.
 
-    ``metrics`` are means over the test views. ``unavailable`` says why other metrics are missing; ``awaited`` names
-    those of them that need only weights or packages. ``seconds`` are by stage; ``resolution`` is (width, height) in px.
+    ``metrics`` are means over the test views. ``unavailable`` says why other metrics are missing;
+    ``awaited`` names those of them that need only weights or packages. ``seconds`` are by stage;
+    ``resolution`` is (width, height) in px.
     """
 
     status: Literal["complete"]
@@ -179,12 +191,15 @@ class TrialRecord(Record):
     awaited: list[str] = field(default_factory=list)
     metric_facts: dict[str, MetricRecord] = field(default_factory=dict)
     metrics_at: dict[Iteration, Earlier] = field(default_factory=dict)
-    one_color_psnr: Number | None = None  # dB: what a picture of the training views' mean colour would reach
-    causes: dict[str, Count] = field(default_factory=dict)  # Gaussians at the end, by the cause of their creation
+    # dB: what a picture of the training views' mean colour would reach
+    one_color_psnr: Number | None = None
+    # Gaussians at the end, by the cause of their creation
+    causes: dict[str, Count] = field(default_factory=dict)
     scene_extent: Amount | None = None  # units of the given coordinates
     initial_cloud: InitialCloud | None = None
     twins: TwinViews | None = None  # None: not looked for
-    normalization: Normalization | None = None  # from the given coordinates to those of the training; None: the same
+    # from the given coordinates to those of the training; None: the same
+    normalization: Normalization | None = None
     budget: Budget | None = None
     train_views: Count | None = None
     test_views: Count | None = None
@@ -197,20 +212,26 @@ class TrialRecord(Record):
     code: Code = field(default_factory=Code)
     machine: dict[str, str] | None = None
     raster_proof: RasterProof | None = None  # of the executor, on a GPU
-    raster_passed_over: list[str] = field(default_factory=list)  # executors that raster=auto did not take, and why
+    # executors that raster=auto did not take, and why
+    raster_passed_over: list[str] = field(default_factory=list)
 
     @property
     def remark(self) -> str:
-        """A line for the state of a finished trial: why its results may surprise; "" if they do not."""
+        """A line for the state of a finished trial: why its results may surprise; "" if they do
+        not."""
         return "; ".join(filter(None, [self.learnt_nothing, *self.raster_passed_over]))
 
     @property
     def learnt_nothing(self) -> str:
-        """A line that the renders are not better than one colour; "" if they are, or if that is not known."""
+        """A line that the renders are not better than one colour; "" if they are, or if that is not
+        known."""
         psnr, one_color = self.metrics.get("psnr"), self.one_color_psnr
         if psnr is None or one_color is None or psnr > one_color:
             return ""
-        return f"not better than one colour: PSNR {psnr:.2f} dB, the training views' mean colour has {one_color:.2f}"
+        return (
+            f"not better than one colour: PSNR {psnr:.2f} dB, the training views' mean colour "
+            f"has {one_color:.2f}"
+        )
 
     @property
     def to_training(self) -> Normalization:
@@ -229,20 +250,28 @@ class UnfinishedError(DamagedError):
 
 
 def record_from(content: bytes, path: Path) -> TrialRecord:
-    """Parse the ``content`` of the results file ``path``; raises DamagedError and UnfinishedError."""
+    """Parse the ``content`` of the results file ``path``; raises DamagedError and
+    UnfinishedError."""
     try:
         return adapter(TrialRecord).validate_json(content)
     except ValidationError as error:
-        status_fault = next((fault for fault in error.errors() if fault["loc"] == ("status",)), None)
+        status_fault = next(
+            (fault for fault in error.errors() if fault["loc"] == ("status",)), None
+        )
         if status_fault is not None:
-            status = "missing" if status_fault["type"] == "missing" else reprlib.repr(status_fault["input"])
+            status = (
+                "missing"
+                if status_fault["type"] == "missing"
+                else reprlib.repr(status_fault["input"])
+            )
             raise UnfinishedError(path, f"is unfinished, its status is {status}") from None
         raise DamagedError(path, describe_misfit(error)) from None
 
 
 @dataclass(frozen=True, kw_only=True)
 class Training(Record):
-    """The counts, time and memory of a training. ``trained_by`` and ``evaluated_from`` are set if a program trained."""
+    """The counts, time and memory of a training. ``trained_by`` and ``evaluated_from`` are set if a
+    program trained."""
 
     iterations: Count
     num_init_points: Count
@@ -252,7 +281,8 @@ class Training(Record):
     seconds: Amount
     peak_memory_mb: Amount | None
     machine: dict[str, str]
-    checkout: dict[str, Any] = field(default_factory=dict)  # gsbench's commit, and whether files were edited
+    # gsbench's commit, and whether files were edited
+    checkout: dict[str, Any] = field(default_factory=dict)
     initial_cloud: InitialCloud | None = None
     evaluated_from: Literal["model", "renders"] | None = None
     trained_by: ExternalTrainer | None = None
@@ -271,7 +301,8 @@ class Evaluation(Record):
 
 
 def split_text(config: Mapping[str, Any]) -> str:
-    """``every_nth``, ``sector 0 of 8`` or ``list``; with ``, matched`` or ``, validation`` if it is."""
+    """``every_nth``, ``sector 0 of 8`` or ``list``; with ``, matched`` or ``, validation`` if it
+    is."""
     text, sectors = str(config.get("scene.split")), config.get("scene.sectors")
     if text == "sector":
         text = f"sector {config.get('scene.sector')} of {sectors}"
@@ -306,7 +337,8 @@ class TrackingSettings(Record):
 
 @dataclass(frozen=True, kw_only=True)
 class Configuration(Record):
-    """The keys that every usable ``config.yaml`` of a trial has; `gsbench.config.schema` checks the others."""
+    """The keys that every usable ``config.yaml`` of a trial has; `gsbench.config.schema` checks the
+    others."""
 
     name: FolderName
     seed: Count
@@ -337,7 +369,8 @@ class Failure(Record):
 
 @dataclass(frozen=True, kw_only=True)
 class Building(Record):
-    """``building.json``: the present stage of an unfinished trial, and the folder in which it is built."""
+    """``building.json``: the present stage of an unfinished trial, and the folder in which it is
+    built."""
 
     stage: str = ""
     folder: str = ""
@@ -345,11 +378,13 @@ class Building(Record):
 
 @dataclass(frozen=True, kw_only=True)
 class MadeOf(Record):
-    """The configuration (``settings``) and its hash (``config``), versions, and files with their stamps.
+    """The configuration (``settings``) and its hash (``config``), versions, and files with their
+    stamps.
 
-    ``results`` is the hash of the rest of ``results.json``. ``sources`` are the user's files, ``folders`` their folders
-    with times of change. ``entries`` are the stages' results in the store. ``published`` are files in the trial's
-    folder; ``digests`` has the sha256 of those that tables and reports read, and of small ones.
+    ``results`` is the hash of the rest of ``results.json``. ``sources`` are the user's files,
+    ``folders`` their folders with times of change. ``entries`` are the stages' results in the
+    store. ``published`` are files in the trial's folder; ``digests`` has the sha256 of those that
+    tables and reports read, and of small ones.
     """
 
     results: str
@@ -389,7 +424,8 @@ def _with_step(row: dict[str, bool | int | float]) -> dict[str, bool | int | flo
 
 
 Value = bool | Whole | Number
-Row = Annotated[dict[str, Value], AfterValidator(_with_step)]  # a row of ``metrics.jsonl`` or ``events.jsonl``
+# a row of ``metrics.jsonl`` or ``events.jsonl``
+Row = Annotated[dict[str, Value], AfterValidator(_with_step)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -414,8 +450,8 @@ class Histogram(RowWithStep):
 def read_rows(path: Path, kind: Any = Row, read: Callable[[Path], bytes] = read_bytes) -> list[Any]:
     """The rows of a file, each of type ``kind``; [] if there is no such file.
 
-    ``read`` reads the content. With a warning, a file that cannot be read is left out, and so are all rows from a
-    damaged one on.
+    ``read`` reads the content. With a warning, a file that cannot be read is left out, and so are
+    all rows from a damaged one on.
     """
     try:
         content = read(path)
@@ -428,7 +464,8 @@ def read_rows(path: Path, kind: Any = Row, read: Callable[[Path], bytes] = read_
 
 
 def whole_lines(path: Path) -> list[tuple[str, int]]:
-    """The lines of a file such as ``metrics.jsonl`` up to the first damaged one, each with its iteration."""
+    """The lines of a file such as ``metrics.jsonl`` up to the first damaged one, each with its
+    iteration."""
     try:
         content = read_bytes(path)
     except FileNotFoundError:

@@ -46,8 +46,8 @@ class Showing(Record):
 class RoundKey(Record):
     """The key of a round, which stays in the runs folder until the votes are there.
 
-    ``arms`` begin with the baseline. ``people`` is the number of people at which the round is judged. A person with
-    more than ``traps_allowed`` wrong traps is left out.
+    ``arms`` begin with the baseline. ``people`` is the number of people at which the round is
+    judged. A person with more than ``traps_allowed`` wrong traps is left out.
     """
 
     salt: Text
@@ -58,14 +58,18 @@ class RoundKey(Record):
     showings: Annotated[tuple[Showing, ...], MinLen(1)]
 
     def commitment(self, showing: Showing) -> str:
-        """The salted hash of a showing's sides, which the page has: without the salt it tells nothing."""
+        """The salted hash of a showing's sides, which the page has: without the salt it tells
+        nothing."""
         sides = f"{showing.id} {showing.left} {showing.right}"
         return hmac.new(self.salt.encode(), sides.encode(), hashlib.sha256).hexdigest()
 
     @cached_property
     def round(self) -> str:
-        """The name of the round: a hash of all commitments, so a key that was changed later has another name."""
-        return hashlib.sha256("".join(map(self.commitment, self.showings)).encode()).hexdigest()[:12]
+        """The name of the round: a hash of all commitments, so a key that was changed later has
+        another name."""
+        return hashlib.sha256("".join(map(self.commitment, self.showings)).encode()).hexdigest()[
+            :12
+        ]
 
     @property
     def pairs(self) -> list[Showing]:
@@ -89,7 +93,8 @@ class Vote(Record):
 
 @dataclass(frozen=True, kw_only=True)
 class Ballot(Record):
-    """The file that a person saves at the end of a round; ``finished`` is the time of the last answer."""
+    """The file that a person saves at the end of a round; ``finished`` is the time of the last
+    answer."""
 
     round: RoundId
     person: PersonId
@@ -111,12 +116,17 @@ class Ballot(Record):
 
 
 def read_key(folder: Path) -> RoundKey:
-    """The key of the round in ``folder``; raises InputError if it is missing, damaged or was changed."""
+    """The key of the round in ``folder``; raises InputError if it is missing, damaged or was
+    changed."""
     if not (folder / VOTE_KEY).is_file():
-        raise InputError(f"this experiment has no round {folder.name}: `gsbench vote make` makes rounds")
+        raise InputError(
+            f"this experiment has no round {folder.name}: `gsbench vote make` makes rounds"
+        )
     key = read_typed(folder / VOTE_KEY, RoundKey)
     if key.round != folder.name:
-        raise InputError(f"{folder / VOTE_KEY} was changed after the page was made: nothing can be judged by it")
+        raise InputError(
+            f"{folder / VOTE_KEY} was changed after the page was made: nothing can be judged by it"
+        )
     return key
 
 
@@ -125,4 +135,7 @@ def check_ballot(ballot: Ballot, key: RoundKey, path: Path) -> None:
     showings = {one.id for one in key.showings}
     if ballot.answers.keys() != showings or len(ballot.votes) != len(showings):
         known = len(ballot.answers.keys() & showings)
-        raise InputError(f"{path} answers {known} of the {len(showings)} showings of its round: only whole files count")
+        raise InputError(
+            f"{path} answers {known} of the {len(showings)} showings of its round: only whole "
+            "files count"
+        )

@@ -1,4 +1,5 @@
-"""Reading COLMAP models safely, fitting them to the image files, converting their cameras, and writing models."""
+"""Reading COLMAP models safely, fitting them to the image files, converting their cameras, and
+writing models."""
 
 import codecs
 import tempfile
@@ -24,7 +25,8 @@ MIN_TRACK = 2  # images that must see a 3D point, as in COLMAP
 
 
 def read_model(folder: Path) -> pycolmap.Reconstruction:
-    """Read a COLMAP model, binary or text, of the current (rigs, frames) or the older three-file layout.
+    """Read a COLMAP model, binary or text, of the current (rigs, frames) or the older three-file
+    layout.
 
     Raises `InputError`, one line, if it is missing or damaged.
     """
@@ -37,7 +39,9 @@ def read_model(folder: Path) -> pycolmap.Reconstruction:
                 raise ValueError(f"image {image.name} has no finite pose")
     except (ValueError, IndexError, RuntimeError, TypeError, MemoryError) as error:
         reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
-        raise InputError(f"{folder}: the COLMAP model cannot be read ({reason}): export it again") from error
+        raise InputError(
+            f"{folder}: the COLMAP model cannot be read ({reason}): export it again"
+        ) from error
     return model
 
 
@@ -46,7 +50,8 @@ def _read(folder: Path) -> pycolmap.Reconstruction:
     files = model_files(folder)
     if files[0].suffix == ".bin":
         return pycolmap.Reconstruction(folder)
-    if any(file.read_bytes().startswith(codecs.BOM_UTF8) for file in files):  # pycolmap takes the mark for a record
+    # pycolmap takes the mark for a record
+    if any(file.read_bytes().startswith(codecs.BOM_UTF8) for file in files):
         with tempfile.TemporaryDirectory() as copy:
             for file in files:
                 (Path(copy) / file.name).write_bytes(without_byte_order_mark(file.read_bytes()))
@@ -59,7 +64,8 @@ def _read(folder: Path) -> pycolmap.Reconstruction:
 
 
 def _normalize_quaternions(model: pycolmap.Reconstruction) -> None:
-    """Give the quaternions of rigs and frames unit length. COLMAP normalises only those of images."""
+    """Give the quaternions of rigs and frames unit length. COLMAP normalises only those of
+    images."""
     for rig in model.rigs.values():
         for sensor, pose in rig.non_ref_sensors.items():
             if pose is not None and abs(pose.rotation.norm() - 1) > UNIT_TOLERANCE:
@@ -93,13 +99,20 @@ def normalize_capture(capture: Capture, folder: Path) -> Capture:
     normalize_model(model, normalization)
     folder.mkdir(parents=True, exist_ok=True)
     model.write_binary(folder)
-    return replace(capture, model=folder, normalization=normalization, advised_normalization=IDENTITY)
+    return replace(
+        capture, model=folder, normalization=normalization, advised_normalization=IDENTITY
+    )
 
 
-def normalize_model(model: pycolmap.Reconstruction, normalization: Normalization, undo: bool = False) -> None:
-    """Move ``model`` from the coordinates in which it was given to those of the training; ``undo`` moves it back."""
+def normalize_model(
+    model: pycolmap.Reconstruction, normalization: Normalization, undo: bool = False
+) -> None:
+    """Move ``model`` from the coordinates in which it was given to those of the training; ``undo``
+    moves it back."""
     to_training = pycolmap.Sim3d(
-        normalization.scale, pycolmap.Rotation3d(), -normalization.scale * np.array(normalization.center)
+        normalization.scale,
+        pycolmap.Rotation3d(),
+        -normalization.scale * np.array(normalization.center),
     )
     model.transform(to_training.inverse() if undo else to_training)
 
@@ -107,16 +120,20 @@ def normalize_model(model: pycolmap.Reconstruction, normalization: Normalization
 def read_reference(capture: Capture) -> pycolmap.Reconstruction:
     """The capture's reference model, fitted to its image files.
 
-    Only images in ``capture.image_names`` that have a pose remain, under those names. Cameras and 2D points are
-    rescaled to the sizes of the files, so a model of the full size serves ``images_4``. 3D points that fewer than two
-    of the images see are dropped, unless no point of the model has a track. The ids of cameras, images and points are
-    kept; if the files of one camera have different sizes, each further size gets a new camera.
+    Only images in ``capture.image_names`` that have a pose remain, under those names. Cameras and
+    2D points are rescaled to the sizes of the files, so a model of the full size serves
+    ``images_4``. 3D points that fewer than two of the images see are dropped, unless no point of
+    the model has a track. The ids of cameras, images and points are kept; if the files of one
+    camera have different sizes, each further size gets a new camera.
 
-    Raises `InputError` if there is no model, or if the aspect ratios of an image and its camera differ by more than
-    rounding.
+    Raises `InputError` if there is no model, or if the aspect ratios of an image and its camera
+    differ by more than rounding.
     """
     if capture.model is None:
-        raise InputError(f"scene {capture.name}: no COLMAP model came with these photos: use init=sfm init.poses=own")
+        raise InputError(
+            f"scene {capture.name}: no COLMAP model came with these photos: use init=sfm "
+            "init.poses=own"
+        )
     model = read_model(capture.model)
     names = match_names(registered_names(model), capture.image_names)
     fitted = pycolmap.Reconstruction()
@@ -135,11 +152,18 @@ def read_reference(capture: Capture) -> pycolmap.Reconstruction:
                 camera_ids[key], next_camera_id = next_camera_id, next_camera_id + 1
             else:
                 camera_ids[key] = image.camera_id
-            fitted.add_camera_with_trivial_rig(rescaled_camera(camera, *size, camera_id=camera_ids[key]))
+            fitted.add_camera_with_trivial_rig(
+                rescaled_camera(camera, *size, camera_id=camera_ids[key])
+            )
         scale = np.array(size) / (camera.width, camera.height)
-        points = np.array([point.xy for point in image.points2D], dtype=np.float64).reshape(-1, 2) * scale  # [K, 2]
+        points = (
+            np.array([point.xy for point in image.points2D], dtype=np.float64).reshape(-1, 2)
+            * scale
+        )  # [K, 2]
         fitted.add_image_with_trivial_frame(
-            pycolmap.Image(name=name, keypoints=points, camera_id=camera_ids[key], image_id=image_id),
+            pycolmap.Image(
+                name=name, keypoints=points, camera_id=camera_ids[key], image_id=image_id
+            ),
             image.cam_from_world(),
         )
         kept.add(image_id)
@@ -147,11 +171,14 @@ def read_reference(capture: Capture) -> pycolmap.Reconstruction:
     return fitted
 
 
-def rescaled_camera(camera: pycolmap.Camera, width: int, height: int, camera_id: int) -> pycolmap.Camera:
+def rescaled_camera(
+    camera: pycolmap.Camera, width: int, height: int, camera_id: int
+) -> pycolmap.Camera:
     """The same camera for the same image at another size in px.
 
-    SIMPLE_PINHOLE becomes PINHOLE, because rounded sides scale the focal length differently in x and y, and so does a
-    camera without distortion. Other models with one focal length scale it by the mean of both scales, as COLMAP does.
+    SIMPLE_PINHOLE becomes PINHOLE, because rounded sides scale the focal length differently in x
+    and y, and so does a camera without distortion. Other models with one focal length scale it by
+    the mean of both scales, as COLMAP does.
     """
     camera = without_distortion(camera)
     params = list(camera.params)
@@ -159,7 +186,9 @@ def rescaled_camera(camera: pycolmap.Camera, width: int, height: int, camera_id:
     if model == pycolmap.CameraModelId.SIMPLE_PINHOLE:
         model, params = pycolmap.CameraModelId.PINHOLE, [params[0], *params]
     # Copied because a Camera object taken from a Reconstruction is a view into it.
-    copy = pycolmap.Camera(camera_id=camera_id, model=model, width=camera.width, height=camera.height, params=params)
+    copy = pycolmap.Camera(
+        camera_id=camera_id, model=model, width=camera.width, height=camera.height, params=params
+    )
     copy.has_prior_focal_length = camera.has_prior_focal_length
     if (width, height) != (camera.width, camera.height):
         copy.rescale(width, height)
@@ -169,20 +198,26 @@ def rescaled_camera(camera: pycolmap.Camera, width: int, height: int, camera_id:
 def plain_camera(camera: pycolmap.Camera) -> CameraModel:
     """A COLMAP camera as plain values, as PINHOLE if it has no distortion."""
     camera = without_distortion(camera)
-    return CameraModel(camera.model_name, camera.width, camera.height, tuple(map(float, camera.params)))
+    return CameraModel(
+        camera.model_name, camera.width, camera.height, tuple(map(float, camera.params))
+    )
 
 
 def pinhole_camera(camera: pycolmap.Camera, cam_from_world: pycolmap.Rigid3d) -> Camera:
-    """Convert a COLMAP camera and pose to a `Camera`; raises `InputError` if the camera is distorted."""
+    """Convert a COLMAP camera and pose to a `Camera`; raises `InputError` if the camera is
+    distorted."""
     plain = plain_camera(camera)
     if plain.distorted:
-        raise InputError(f"a camera of the model {plain.name} is distorted: undistort the images first")
+        raise InputError(
+            f"a camera of the model {plain.name} is distorted: undistort the images first"
+        )
     rotation, translation = cam_from_world.rotation.matrix(), np.array(cam_from_world.translation)
     return replace(to_pinhole(plain), rotation=rotation, translation=translation)
 
 
 def reference_cameras(model: pycolmap.Reconstruction, names: Iterable[str]) -> list[Camera]:
-    """Cameras with the poses of the registered images ``names``; distortion and principal points are ignored.
+    """Cameras with the poses of the registered images ``names``; distortion and principal points
+    are ignored.
 
     They tell where cameras stand and look. They are not for rendering.
     """
@@ -192,7 +227,9 @@ def reference_cameras(model: pycolmap.Reconstruction, names: Iterable[str]) -> l
         camera, pose = model.cameras[image.camera_id], image.cam_from_world()
         size, focal = (camera.width, camera.height), camera.mean_focal_length()
         intrinsics = (focal, focal, camera.width / 2, camera.height / 2)
-        cameras.append(Camera(*size, *intrinsics, pose.rotation.matrix(), np.array(pose.translation)))
+        cameras.append(
+            Camera(*size, *intrinsics, pose.rotation.matrix(), np.array(pose.translation))
+        )
     return cameras
 
 
@@ -209,14 +246,17 @@ def write_model(
     text: bool = False,
     cloud: tuple[Array, NDArray[np.uint8]] | None = None,
 ) -> None:
-    """Write PINHOLE cameras with their poses as a COLMAP model; images with equal intrinsics share one camera.
+    """Write PINHOLE cameras with their poses as a COLMAP model; images with equal intrinsics share
+    one camera.
 
-    ``cloud``, positions [P, 3] and colours [P, 3], becomes the model's points, without tracks. By default the model
-    has no points.
+    ``cloud``, positions [P, 3] and colours [P, 3], becomes the model's points, without tracks. By
+    default the model has no points.
     """
     frames = {}
     for name, camera in cameras.items():
-        pinhole = CameraModel("PINHOLE", camera.width, camera.height, (camera.fx, camera.fy, camera.cx, camera.cy))
+        pinhole = CameraModel(
+            "PINHOLE", camera.width, camera.height, (camera.fx, camera.fy, camera.cx, camera.cy)
+        )
         frames[name] = pinhole, camera.rotation, camera.translation
     write_frames(folder, frames, text, cloud)
 
@@ -227,18 +267,23 @@ def write_frames(
     text: bool = False,
     cloud: tuple[Array, NDArray[np.uint8]] | None = None,
 ) -> None:
-    """Write cameras of any camera model with their world-to-camera rotations [3, 3] and translations [3].
+    """Write cameras of any camera model with their world-to-camera rotations [3, 3] and
+    translations [3].
 
     Images with equal intrinsics share one camera. ``cloud`` is as in `write_model`.
     """
     model = pycolmap.Reconstruction()
     ids: dict[CameraModel, int] = {}
-    for image_id, (name, (camera, rotation, translation)) in enumerate(sorted(frames.items()), start=1):
+    for image_id, (name, (camera, rotation, translation)) in enumerate(
+        sorted(frames.items()), start=1
+    ):
         if camera not in ids:
             ids[camera] = len(ids) + 1
             size = {"width": camera.width, "height": camera.height}
             model.add_camera_with_trivial_rig(
-                pycolmap.Camera(camera_id=ids[camera], model=camera.name, params=list(camera.params), **size)
+                pycolmap.Camera(
+                    camera_id=ids[camera], model=camera.name, params=list(camera.params), **size
+                )
             )
         image = pycolmap.Image(name=name, camera_id=ids[camera], image_id=image_id)
         pose = pycolmap.Rigid3d(np.column_stack([rotation, translation]))
@@ -249,14 +294,18 @@ def write_frames(
     (model.write_text if text else model.write_binary)(folder)
 
 
-def _copy_points(model: pycolmap.Reconstruction, target: pycolmap.Reconstruction, image_ids: set[int]) -> None:
+def _copy_points(
+    model: pycolmap.Reconstruction, target: pycolmap.Reconstruction, image_ids: set[int]
+) -> None:
     # A model without any track, such as one that `write_model` wrote, keeps all its points.
     observed = any(point.track.elements for point in model.points3D.values())
     for point_id, point in sorted(model.points3D.items()):
         elements = [element for element in point.track.elements if element.image_id in image_ids]
         if observed and len(elements) < MIN_TRACK:
             continue
-        copy = pycolmap.Point3D(xyz=point.xyz, color=point.color, error=point.error, track=pycolmap.Track(elements))
+        copy = pycolmap.Point3D(
+            xyz=point.xyz, color=point.color, error=point.error, track=pycolmap.Track(elements)
+        )
         target.add_point3D_with_id(point_id, copy)
         for element in elements:
             target.images[element.image_id].set_point3D_for_point2D(element.point2D_idx, point_id)

@@ -1,8 +1,9 @@
 """Finding the files of a COLMAP model and checking their records before pycolmap reads them.
 
-pycolmap trusts its files: on a truncated or foreign file it may loop for minutes or read nonsense, and it accepts a
-zero quaternion or a NaN without an error. Checking the records first costs little and finds such files at once.
-Layouts: COLMAP's ``src/colmap/scene/reconstruction_io_binary.cc`` and ``reconstruction_io_text.cc``.
+pycolmap trusts its files: on a truncated or foreign file it may loop for minutes or read nonsense,
+and it accepts a zero quaternion or a NaN without an error. Checking the records first costs little
+and finds such files at once. Layouts: COLMAP's ``src/colmap/scene/reconstruction_io_binary.cc`` and
+``reconstruction_io_text.cc``.
 """
 
 from __future__ import annotations
@@ -21,7 +22,8 @@ OPTIONAL = ("rigs", "frames")  # since COLMAP 3.12
 
 _COUNT = struct.Struct("<Q")
 _CAMERA = struct.Struct("<IiQQ")  # id, model, width, height; then the parameters as doubles
-_IMAGE = struct.Struct("<I7dI")  # id, quaternion, translation, camera id; then the name, zero-terminated
+# id, quaternion, translation, camera id; then the name, zero-terminated
+_IMAGE = struct.Struct("<I7dI")
 _RIG = struct.Struct("<II")  # id, number of sensors
 _SENSOR = struct.Struct("<iI")  # type, id
 _POSE = struct.Struct("<7d")
@@ -30,14 +32,28 @@ _FRAME_DATA_BYTES = 16  # sensor type, sensor id, image id
 _POINT2D_BYTES = 24  # x, y, id of the 3D point
 _POINT3D = struct.Struct("<Q3d3Bd")  # id, position, colour, error; then the length of the track
 _TRACK_ELEMENT = struct.Struct("<II")  # image id, index of the 2D point
-# Id of each camera model: its name and number of parameters. Source: COLMAP's src/colmap/sensor/models.h.
+# Id of each camera model: its name and number of parameters. Source: COLMAP's
+# src/colmap/sensor/models.h.
 _MODELS = {
-    0: ("SIMPLE_PINHOLE", 3), 1: ("PINHOLE", 4), 2: ("SIMPLE_RADIAL", 4), 3: ("RADIAL", 5), 4: ("OPENCV", 8),
-    5: ("OPENCV_FISHEYE", 8), 6: ("FULL_OPENCV", 12), 7: ("FOV", 5), 8: ("SIMPLE_RADIAL_FISHEYE", 4),
-    9: ("RADIAL_FISHEYE", 5), 10: ("THIN_PRISM_FISHEYE", 12), 11: ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
-    12: ("SIMPLE_DIVISION", 4), 13: ("DIVISION", 5), 14: ("SIMPLE_FISHEYE", 3), 15: ("FISHEYE", 4), 16: ("EUCM", 6),
+    0: ("SIMPLE_PINHOLE", 3),
+    1: ("PINHOLE", 4),
+    2: ("SIMPLE_RADIAL", 4),
+    3: ("RADIAL", 5),
+    4: ("OPENCV", 8),
+    5: ("OPENCV_FISHEYE", 8),
+    6: ("FULL_OPENCV", 12),
+    7: ("FOV", 5),
+    8: ("SIMPLE_RADIAL_FISHEYE", 4),
+    9: ("RADIAL_FISHEYE", 5),
+    10: ("THIN_PRISM_FISHEYE", 12),
+    11: ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
+    12: ("SIMPLE_DIVISION", 4),
+    13: ("DIVISION", 5),
+    14: ("SIMPLE_FISHEYE", 3),
+    15: ("FISHEYE", 4),
+    16: ("EUCM", 6),
     17: ("EQUIRECTANGULAR", 2),
-}  # fmt: skip
+}
 
 
 def model_files(folder: Path) -> list[Path]:
@@ -48,12 +64,17 @@ def model_files(folder: Path) -> list[Path]:
     for suffix in (".bin", ".txt"):
         files = [folder / f"{stem}{suffix}" for stem in REQUIRED]
         if all(file.is_file() for file in files):
-            return files + [file for stem in OPTIONAL if (file := folder / f"{stem}{suffix}").is_file()]
-    raise InputError(f"{folder}: no COLMAP model here: expected cameras, images and points3D as .bin or .txt")
+            return files + [
+                file for stem in OPTIONAL if (file := folder / f"{stem}{suffix}").is_file()
+            ]
+    raise InputError(
+        f"{folder}: no COLMAP model here: expected cameras, images and points3D as .bin or .txt"
+    )
 
 
 def check_model(folder: Path) -> None:
-    """Raise `InputError`, one line, if a file of the model is truncated, has extra bytes, or has impossible values."""
+    """Raise `InputError`, one line, if a file of the model is truncated, has extra bytes, or has
+    impossible values."""
     checks = ModelChecks()
     for file in model_files(folder):  # in this order: images refer to cameras, points to images
         binary_record, text_record = _RECORDS[file.stem]
@@ -65,13 +86,18 @@ def check_model(folder: Path) -> None:
         except (struct.error, ValueError, IndexError, OverflowError) as error:
             if isinstance(error, InputError):  # a ValueError that already says what is wrong
                 raise InputError(f"{file}: {error}: copy or export it again") from error
-            raise InputError(f"{file}: the file is truncated or damaged: copy or export it again") from error
+            raise InputError(
+                f"{file}: the file is truncated or damaged: copy or export it again"
+            ) from error
         except OSError as error:
             raise InputError(f"{file}: cannot be read ({error.strerror})") from error
 
 
-def _walk_binary(file: Path, record: Callable[[bytes, int, ModelChecks], int], checks: ModelChecks) -> None:
-    """Check a file of a count and records; ``record`` checks the one at an offset and returns the offset after it."""
+def _walk_binary(
+    file: Path, record: Callable[[bytes, int, ModelChecks], int], checks: ModelChecks
+) -> None:
+    """Check a file of a count and records; ``record`` checks the one at an offset and returns the
+    offset after it."""
     data = file.read_bytes()
     (count,) = _COUNT.unpack_from(data)
     offset = _COUNT.size
@@ -80,7 +106,9 @@ def _walk_binary(file: Path, record: Callable[[bytes, int, ModelChecks], int], c
         if offset > len(data):
             break
     if offset != len(data):
-        raise InputError(f"{abs(len(data) - offset)} bytes too {'many' if offset < len(data) else 'few'}")
+        raise InputError(
+            f"{abs(len(data) - offset)} bytes too {'many' if offset < len(data) else 'few'}"
+        )
 
 
 def _binary_camera(data: bytes, offset: int, checks: ModelChecks) -> int:
@@ -120,7 +148,8 @@ def _binary_frame(data: bytes, offset: int, checks: ModelChecks) -> int:
 
 def _binary_rig(data: bytes, offset: int, checks: ModelChecks) -> int:
     rig_id, sensors = _RIG.unpack_from(data, offset)
-    offset += _RIG.size + (_SENSOR.size if sensors else 0)  # the first sensor is the reference, without a pose
+    # the first sensor is the reference, without a pose
+    offset += _RIG.size + (_SENSOR.size if sensors else 0)
     for _ in range(1, sensors):
         (has_pose,) = struct.unpack_from("<B", data, offset + _SENSOR.size)
         offset += _SENSOR.size + 1
@@ -134,8 +163,11 @@ Lines = Iterator[str]
 DECIMAL_COMMA = re.compile(r"(?:^|(?<=\s))-?\d+,\d+(?=\s|$)", re.MULTILINE)
 
 
-def _walk_text(file: Path, record: Callable[[str, Lines, ModelChecks], None], checks: ModelChecks) -> None:
-    """Check a file line by line, without comments; ``record`` gets a line and the lines after it."""
+def _walk_text(
+    file: Path, record: Callable[[str, Lines, ModelChecks], None], checks: ModelChecks
+) -> None:
+    """Check a file line by line, without comments; ``record`` gets a line and the lines after
+    it."""
     text = without_byte_order_mark(file.read_bytes()).decode()
     lines = (line.strip() for line in text.split("\n") if not line.lstrip().startswith("#"))
     try:
@@ -143,19 +175,23 @@ def _walk_text(file: Path, record: Callable[[str, Lines, ModelChecks], None], ch
             record(line, lines, checks)
     except ValueError as error:
         if comma := DECIMAL_COMMA.search(text):
-            raise InputError(f"it has decimal commas ({comma[0].strip()}), where COLMAP writes points") from error
+            raise InputError(
+                f"it has decimal commas ({comma[0].strip()}), where COLMAP writes points"
+            ) from error
         raise
 
 
 def text_names(folder: Path) -> dict[int, str]:
-    """The names of the images of the text model in ``folder`` by their ids, with the blanks that they may contain."""
+    """The names of the images of the text model in ``folder`` by their ids, with the blanks that
+    they may contain."""
     checks = _NamesOnly()
     _walk_text(folder / "images.txt", _text_image, checks)
     return checks.names
 
 
 def count_images(folder: Path) -> int:
-    """The number of images with a pose in the model in ``folder``; raises `InputError` if it cannot be read."""
+    """The number of images with a pose in the model in ``folder``; raises `InputError` if it cannot
+    be read."""
     file = next(file for file in model_files(folder) if file.stem == "images")
     try:
         if file.suffix == ".txt":
@@ -163,7 +199,9 @@ def count_images(folder: Path) -> int:
         with file.open("rb") as stream:
             (count,) = _COUNT.unpack(stream.read(_COUNT.size))
     except (struct.error, ValueError, IndexError, OSError) as error:
-        raise InputError(f"{file}: its images cannot be counted: export it again, or set scene.sparse") from error
+        raise InputError(
+            f"{file}: its images cannot be counted: export it again, or set scene.sparse"
+        ) from error
     return int(count)
 
 
@@ -180,7 +218,8 @@ def _text_camera(line: str, _: Lines, checks: ModelChecks) -> None:
 
 def _text_image(line: str, lines: Lines, checks: ModelChecks) -> None:
     words = line.split(maxsplit=9)  # the name comes last, and may contain blanks
-    points = next(lines, "").split()  # the line after an image holds its 2D points, and may be empty
+    # the line after an image holds its 2D points, and may be empty
+    points = next(lines, "").split()
     if len(words) < 10 or len(points) % 3 or not all(map(math.isfinite, _numbers(points))):
         raise InputError(f"image {words[0]} lacks numbers")
     checks.image(int(words[0]), _numbers(words[1:8]), int(words[8]), words[9], len(points) // 3)
@@ -219,14 +258,17 @@ _RECORDS = {
 }
 
 
-MAX_LENGTH = 1e6  # of a quaternion, and 1 / MAX_LENGTH is the minimum: COLMAP normalises quaternions of any length
+# of a quaternion, and 1 / MAX_LENGTH is the minimum: COLMAP normalises quaternions of any length
+MAX_LENGTH = 1e6
 MAX_SIDE = 1_000_000  # px
-MAX_ID = 2**32 - 2  # ids of cameras and images are 32-bit; the largest number means "no id" in COLMAP
+# ids of cameras and images are 32-bit; the largest number means "no id" in COLMAP
+MAX_ID = 2**32 - 2
 MAX_POINT_ID = 2**64 - 2  # ids of 3D points are 64-bit
 
 
 class ModelChecks:
-    """Checks the records of a model one by one, cameras first; raises `InputError` for the first impossible one."""
+    """Checks the records of a model one by one, cameras first; raises `InputError` for the first
+    impossible one."""
 
     def __init__(self) -> None:
         self._cameras: set[int] = set()
@@ -234,17 +276,22 @@ class ModelChecks:
         self._names: set[str] = set()
         self._points: set[int] = set()
 
-    def camera(self, camera_id: int, model: str, width: int, height: int, params: Sequence[float]) -> None:
+    def camera(
+        self, camera_id: int, model: str, width: int, height: int, params: Sequence[float]
+    ) -> None:
         focal_lengths = params[: 1 if model.startswith(("SIMPLE_", "RADIAL")) else 2]
         is_size = 1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE
         if not is_size or not all(map(math.isfinite, params)) or min(focal_lengths) <= 0:
             raise InputError(
-                f"camera {camera_id} is damaged ({width}x{height} px, parameters {', '.join(f'{p:g}' for p in params)})"
+                f"camera {camera_id} is damaged ({width}x{height} px, parameters "
+                f"{', '.join(f'{p:g}' for p in params)})"
             )
         _check_id(camera_id, self._cameras, "camera", MAX_ID)
         self._cameras.add(camera_id)
 
-    def image(self, image_id: int, pose: Sequence[float], camera_id: int, name: str, num_points: int) -> None:
+    def image(
+        self, image_id: int, pose: Sequence[float], camera_id: int, name: str, num_points: int
+    ) -> None:
         self.pose(f"image {image_id} ({name!r})", pose)
         _check_id(image_id, self._points2d, "image", MAX_ID)
         if camera_id not in self._cameras:
@@ -258,17 +305,25 @@ class ModelChecks:
         """Check a pose: quaternion (w, x, y, z) and translation."""
         sound = len(pose) == 7 and all(map(math.isfinite, pose))
         if not sound or not 1 / MAX_LENGTH < math.hypot(*pose[:4]) < MAX_LENGTH:
-            raise InputError(f"{owner} has no pose that can be used ({', '.join(f'{value:g}' for value in pose)})")
+            raise InputError(
+                f"{owner} has no pose that can be used "
+                f"({', '.join(f'{value:g}' for value in pose)})"
+            )
 
-    def point(self, point_id: int, position: Sequence[float], track: Iterable[Sequence[int]]) -> None:
+    def point(
+        self, point_id: int, position: Sequence[float], track: Iterable[Sequence[int]]
+    ) -> None:
         if not all(map(math.isfinite, position)):
-            raise InputError(f"point {point_id} lies nowhere ({', '.join(f'{value:g}' for value in position)})")
+            raise InputError(
+                f"point {point_id} lies nowhere ({', '.join(f'{value:g}' for value in position)})"
+            )
         _check_id(point_id, self._points, "point", MAX_POINT_ID)
         self._points.add(point_id)
         for image_id, index in track:
             if not 0 <= index < self._points2d.get(image_id, 0):
                 raise InputError(
-                    f"point {point_id} is seen by 2D point {index} of image {image_id}, which is not there"
+                    f"point {point_id} is seen by 2D point {index} of image {image_id}, which is "
+                    "not there"
                 )
 
 
@@ -279,7 +334,9 @@ class _NamesOnly(ModelChecks):
         super().__init__()
         self.names: dict[int, str] = {}
 
-    def image(self, image_id: int, pose: Sequence[float], camera_id: int, name: str, num_points: int) -> None:
+    def image(
+        self, image_id: int, pose: Sequence[float], camera_id: int, name: str, num_points: int
+    ) -> None:
         self.names[image_id] = name
 
 

@@ -1,7 +1,7 @@
 """Deciding which COLMAP cameras are pinholes in effect, whatever the name of their camera model.
 
-Many exporters write photographs that are undistorted already under a model with distortion whose coefficients are zero.
-Undistorting these again would resample every pixel for nothing.
+Many exporters write photographs that are undistorted already under a model with distortion whose
+coefficients are zero. Undistorting these again would resample every pixel for nothing.
 """
 
 import zlib  # noqa: F401  must be loaded before pycolmap, whose own zlib otherwise crashes Pillow's PNG code
@@ -9,9 +9,10 @@ import zlib  # noqa: F401  must be loaded before pycolmap, whose own zlib otherw
 import numpy as np
 import pycolmap
 
-# Largest distance in px, anywhere in the image, between a camera's projection and a pinhole's that is ignored. It is a
-# tenth of the reprojection error that a good COLMAP model has (.3 to .5 px), so poses are not known as precisely.
-# Resampling costs more: it shifts the grid by up to half a pixel and averages neighbours.
+# Largest distance in px, anywhere in the image, between a camera's projection and a pinhole's that
+# is ignored. It is a tenth of the reprojection error that a good COLMAP model has (.3 to .5 px), so
+# poses are not known as precisely. Resampling costs more: it shifts the grid by up to half a pixel
+# and averages neighbours.
 MAX_IGNORED_DISTORTION = 0.05
 GRID = 33  # points a side at which the distance is measured, borders included
 
@@ -19,11 +20,15 @@ GRID = 33  # points a side at which the distance is measured, borders included
 def without_distortion(camera: pycolmap.Camera) -> pycolmap.Camera:
     """The PINHOLE camera that projects as ``camera`` does, or ``camera`` itself if no pinhole does.
 
-    Projections are compared, not coefficients: a fisheye with zero coefficients is no pinhole, while FULL_OPENCV with
-    coefficients that cancel, FOV with an angle near 0 and EUCM with alpha = 0 are. SIMPLE_PINHOLE stays as it is.
+    Projections are compared, not coefficients: a fisheye with zero coefficients is no pinhole,
+    while FULL_OPENCV with coefficients that cancel, FOV with an angle near 0 and EUCM with alpha =
+    0 are. SIMPLE_PINHOLE stays as it is.
     """
     # pycolmap's focal lengths of a panorama are not defined; asking for them ends the process.
-    if camera.model in (pycolmap.CameraModelId.PINHOLE, pycolmap.CameraModelId.SIMPLE_PINHOLE) or camera.is_spherical():
+    if (
+        camera.model in (pycolmap.CameraModelId.PINHOLE, pycolmap.CameraModelId.SIMPLE_PINHOLE)
+        or camera.is_spherical()
+    ):
         return camera
     if not largest_distortion(camera) <= MAX_IGNORED_DISTORTION:  # also for NaN
         return camera
@@ -39,12 +44,15 @@ def without_distortion(camera: pycolmap.Camera) -> pycolmap.Camera:
 
 
 def largest_distortion(camera: pycolmap.Camera) -> float:
-    """The largest distance in px between the projections of a camera and of the pinhole with its focal lengths.
+    """The largest distance in px between the projections of a camera and of the pinhole with its
+    focal lengths.
 
-    It is measured for the rays on which the pinhole has the pixels of a grid over the image, and NaN if the camera does
-    not see one of them.
+    It is measured for the rays on which the pinhole has the pixels of a grid over the image, and
+    NaN if the camera does not see one of them.
     """
-    columns, rows = np.meshgrid(np.linspace(0, camera.width, GRID), np.linspace(0, camera.height, GRID))
+    columns, rows = np.meshgrid(
+        np.linspace(0, camera.width, GRID), np.linspace(0, camera.height, GRID)
+    )
     pixels = np.stack([columns.ravel(), rows.ravel()], axis=1)  # [P, 2]
     fx, fy, cx, cy = _pinhole_parameters(camera)
     rays = np.column_stack([(pixels - (cx, cy)) / (fx, fy), np.ones(len(pixels))])  # [P, 3]
@@ -53,4 +61,9 @@ def largest_distortion(camera: pycolmap.Camera) -> float:
 
 
 def _pinhole_parameters(camera: pycolmap.Camera) -> list[float]:
-    return [camera.focal_length_x, camera.focal_length_y, camera.principal_point_x, camera.principal_point_y]
+    return [
+        camera.focal_length_x,
+        camera.focal_length_y,
+        camera.principal_point_x,
+        camera.principal_point_y,
+    ]

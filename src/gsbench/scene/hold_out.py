@@ -1,8 +1,9 @@
-"""Dividing photographs into training and test views by a rule or by lists, and the rest again for validation.
+"""Dividing photographs into training and test views by a rule or by lists, and the rest again for
+validation.
 
-Sectors need an order of cameras in which neighbours stand beside each other. Cameras that surround the scene are
-ordered by azimuth around its centre and up direction. Other cameras are ordered along the principal axis of their
-centres, so that planes across the axis separate the sectors.
+Sectors need an order of cameras in which neighbours stand beside each other. Cameras that surround
+the scene are ordered by azimuth around its centre and up direction. Other cameras are ordered along
+the principal axis of their centres, so that planes across the axis separate the sectors.
 """
 
 from collections.abc import Callable, Sequence
@@ -15,11 +16,14 @@ from gsbench.scene.options import MIN_IMAGES, TEST_EVERY, SplitRule
 from gsbench.scene.types import Array, Camera
 from gsbench.words import counted, some_of
 
-SURROUNDED = 180.0  # degrees: cameras with a wider gap between azimuths stand on one side of the scene
+# degrees: cameras with a wider gap between azimuths stand on one side of the scene
+SURROUNDED = 180.0
 OPEN_RING = 30.0  # degrees: the order begins after a gap wider than this, else at the first camera
 FACING = 0.9  # share of the cameras that must look towards the centre
-PARALLEL = 1e-3  # smallest eigenvalue of the axes' normal matrix (at most 2/3) below which axes count as parallel
-AZIMUTH_DECIMALS = 6  # azimuths are rounded to so many decimals of a degree, so that all processors agree on ties
+# smallest eigenvalue of the axes' normal matrix (at most 2/3) below which axes count as parallel
+PARALLEL = 1e-3
+# azimuths are rounded to so many decimals of a degree, so that all processors agree on ties
+AZIMUTH_DECIMALS = 6
 
 
 @dataclass(frozen=True)
@@ -31,7 +35,8 @@ class Arrangement:
 
 
 def arrange_cameras(cameras: Sequence[Camera]) -> Arrangement:
-    """Order cameras by azimuth around the scene if they surround it, else along the principal axis of their centres.
+    """Order cameras by azimuth around the scene if they surround it, else along the principal axis
+    of their centres.
 
     The azimuths start at the first camera, or after a gap of more than 30 degrees.
     """
@@ -39,26 +44,36 @@ def arrange_cameras(cameras: Sequence[Camera]) -> Arrangement:
     azimuths, fault = _azimuths(cameras, centers)
     if azimuths is not None:
         order = np.argsort(azimuths, kind="stable")
-        gaps = np.diff(azimuths[order], append=azimuths[order[0]] + 360.0)  # [V] after each camera, degrees
+        gaps = np.diff(
+            azimuths[order], append=azimuths[order[0]] + 360.0
+        )  # [V] after each camera, degrees
         widest = int(gaps.argmax())
         gap = float(gaps[widest])
         if gap >= SURROUNDED:
-            fault = f"the cameras stand on one side of the scene, with none in {gap:.0f} degrees around its centre"
+            fault = (
+                f"the cameras stand on one side of the scene, with none in {gap:.0f} degrees "
+                "around its centre"
+            )
     if fault:
         description = f"by planes across the principal axis of the cameras' centres, since {fault}"
-        return Arrangement(tuple(np.argsort(along_principal_axis(centers), kind="stable").tolist()), description)
+        return Arrangement(
+            tuple(np.argsort(along_principal_axis(centers), kind="stable").tolist()), description
+        )
     if gap > OPEN_RING:
         order = np.roll(order, -(widest + 1))
     return Arrangement(
         tuple(int(index) for index in order),
-        f"by azimuth around the scene's up and centre, as the cameras surround it (gaps up to {gap:.0f} degrees)",
+        "by azimuth around the scene's up and centre, as the cameras surround it (gaps up to "
+        f"{gap:.0f} degrees)",
     )
 
 
 def sector_range(count: int, sector: int, sectors: int, exactly: int | None = None) -> range:
-    """The positions of sector number ``sector`` when ``count`` ordered views are cut into ``sectors`` contiguous ones.
+    """The positions of sector number ``sector`` when ``count`` ordered views are cut into
+    ``sectors`` contiguous ones.
 
-    The sizes of sectors differ by at most one. With ``exactly``, only so many positions from the sector's start.
+    The sizes of sectors differ by at most one. With ``exactly``, only so many positions from the
+    sector's start.
 
     Examples:
         >>> [list(sector_range(7, sector, 3)) for sector in range(3)]
@@ -69,7 +84,8 @@ def sector_range(count: int, sector: int, sectors: int, exactly: int | None = No
 
 
 def along_principal_axis(centers: Array) -> Array:
-    """Coordinates [V] of camera centres [V, 3] on their principal axis, which points away from the first camera."""
+    """Coordinates [V] of camera centres [V, 3] on their principal axis, which points away from the
+    first camera."""
     offsets = centers - centers.mean(axis=0)
     _, _, axes = np.linalg.svd(offsets, full_matrices=False)
     coordinates: Array = offsets @ axes[0]
@@ -79,7 +95,8 @@ def along_principal_axis(centers: Array) -> Array:
 
 
 def point_looked_at(cameras: Sequence[Camera], centers: Array) -> Array | None:
-    """The point [3] nearest to all viewing axes, in least squares; None if the axes are parallel."""
+    """The point [3] nearest to all viewing axes, in least squares; None if the axes are
+    parallel."""
     forwards = np.array([camera.rotation[2] for camera in cameras])  # [V, 3]
     across = np.eye(3) - forwards[:, :, None] * forwards[:, None, :]  # [V, 3, 3]
     normal = across.mean(axis=0)
@@ -90,7 +107,8 @@ def point_looked_at(cameras: Sequence[Camera], centers: Array) -> Array | None:
 
 
 def scene_up(cameras: Sequence[Camera], centers: Array) -> Array:
-    """The mean of the cameras' up directions [3] or, if they cancel out, the normal of the plane of the centres."""
+    """The mean of the cameras' up directions [3] or, if they cancel out, the normal of the plane of
+    the centres."""
     mean = -np.array([camera.rotation[1] for camera in cameras]).mean(axis=0)
     length = float(np.linalg.norm(mean))
     if length > 0.5:
@@ -102,7 +120,8 @@ def scene_up(cameras: Sequence[Camera], centers: Array) -> Array:
 
 
 def _azimuths(cameras: Sequence[Camera], centers: Array) -> tuple[Array | None, str]:
-    """Azimuths [V] in [0, 360) degrees from the first camera, counter-clockwise from above; or None and the reason."""
+    """Azimuths [V] in [0, 360) degrees from the first camera, counter-clockwise from above; or None
+    and the reason."""
     center = point_looked_at(cameras, centers)
     if center is None:
         return None, "the cameras look in one direction"
@@ -119,9 +138,11 @@ def _azimuths(cameras: Sequence[Camera], centers: Array) -> tuple[Array | None, 
 
 
 def select_images(names: Sequence[str], max_images: int, least: int = MIN_IMAGES) -> list[str]:
-    """Select at most ``max_images`` of n names, evenly spaced: the k-th of m selected names has index ``k * n // m``.
+    """Select at most ``max_images`` of n names, evenly spaced: the k-th of m selected names has
+    index ``k * n // m``.
 
-    The first name is always kept, and views on a closed ring stay evenly spaced. Images are selected before the split.
+    The first name is always kept, and views on a closed ring stay evenly spaced. Images are
+    selected before the split.
 
     Examples:
         >>> select_images(["a", "b", "c", "d", "e"], 3)
@@ -142,14 +163,17 @@ def split_names(
 ) -> tuple[list[str], list[str]]:
     """Split sorted names into (training, test).
 
-    Every ``test_every``-th name from the first is a test view; ``test_every=0`` holds out none. Explicit lists replace
-    this rule. If only one list is given, the other side gets all other names. If both are given, names in neither list
-    are dropped.
+    Every ``test_every``-th name from the first is a test view; ``test_every=0`` holds out none.
+    Explicit lists replace this rule. If only one list is given, the other side gets all other
+    names. If both are given, names in neither list are dropped.
 
-    Raises `InputError` if there is no training view, or no test view although ``test_every`` is not 0.
+    Raises `InputError` if there is no training view, or no test view although ``test_every`` is not
+    0.
     """
     if test_every < 0:
-        raise InputError(f"scene.test_every must be 0 (no test views) or positive, got {test_every}")
+        raise InputError(
+            f"scene.test_every must be 0 (no test views) or positive, got {test_every}"
+        )
     if train is None and test is None:
         held_out = set(names[::test_every]) if test_every else set()
     elif test is None:
@@ -157,22 +181,28 @@ def split_names(
     else:
         held_out = set(test)
         if both := sorted(held_out & set(train or ())):
-            raise InputError(f"the split lists hold {some_of(both)} for training and for testing: name each image once")
+            raise InputError(
+                f"the split lists hold {some_of(both)} for training and for testing: name each "
+                "image once"
+            )
     kept = set(names if train is None else train)
     training = [name for name in names if name in kept and name not in held_out]
     testing = [name for name in names if name in held_out]
     if not training:
         raise InputError(
-            f"the split leaves no training view of {len(names)}: raise scene.test_every or correct the lists"
+            f"the split leaves no training view of {len(names)}: raise scene.test_every or "
+            "correct the lists"
         )
     if not testing and test_every:
         raise InputError(
-            f"the split leaves no test view of {len(names)}: correct the lists, or give scene.test_every=0"
+            f"the split leaves no test view of {len(names)}: correct the lists, or give "
+            "scene.test_every=0"
         )
     return training, testing
 
 
-SplitLists = tuple[Sequence[str] | None, Sequence[str] | None]  # names for training, names for testing
+# names for training, names for testing
+SplitLists = tuple[Sequence[str] | None, Sequence[str] | None]
 CamerasByName = Callable[[Sequence[str]], Sequence[Camera]]
 
 
@@ -186,25 +216,33 @@ class Split:
 
 
 def hold_out(
-    names: Sequence[str], rule: SplitRule, lists: SplitLists = (None, None), cameras: CamerasByName | None = None
+    names: Sequence[str],
+    rule: SplitRule,
+    lists: SplitLists = (None, None),
+    cameras: CamerasByName | None = None,
 ) -> Split:
     """Divide sorted ``names`` by ``rule``.
 
-    ``lists`` are the resolved names of the training and the test list. ``cameras`` returns the cameras of names; it is
-    None for photographs without cameras. With ``rule.validation``, the test views are dropped and the training views
-    are divided again. Raises InputError if no view is left for training or for testing.
+    ``lists`` are the resolved names of the training and the test list. ``cameras`` returns the
+    cameras of names; it is None for photographs without cameras. With ``rule.validation``, the test
+    views are dropped and the training views are divided again. Raises InputError if no view is left
+    for training or for testing.
     """
     rule.check()
     split = _divide(names, rule, lists, cameras)
     if not rule.validation:
         return split
-    again = replace(rule, split="every_nth", train_list=None, test_list=None) if rule.by_lists else rule
+    again = (
+        replace(rule, split="every_nth", train_list=None, test_list=None) if rule.by_lists else rule
+    )
     validation = _divide(split.train, again, (None, None), cameras)
     away = f"the {counted(len(split.test), 'test view')} ({split.description}) put away unseen"
     return replace(validation, description=f"for validation {validation.description}, with {away}")
 
 
-def _divide(names: Sequence[str], rule: SplitRule, lists: SplitLists, cameras: CamerasByName | None) -> Split:
+def _divide(
+    names: Sequence[str], rule: SplitRule, lists: SplitLists, cameras: CamerasByName | None
+) -> Split:
     matched = max(1, len(names) // rule.sectors) if rule.match_views else None
     if rule.by_lists:
         train, test = split_names(names, rule.test_every, *lists)
@@ -213,10 +251,17 @@ def _divide(names: Sequence[str], rule: SplitRule, lists: SplitLists, cameras: C
         test, description = _sector(names, rule, matched, cameras)
     elif matched is not None:
         test = select_images(names, matched, least=1)
-        description = f"{matched} evenly spread over the sorted names, as many as in a sector of {rule.sectors}"
+        description = (
+            f"{matched} evenly spread over the sorted names, as many as in a sector of "
+            f"{rule.sectors}"
+        )
     else:
         train, test = split_names(names, rule.test_every)
-        return Split(tuple(train), tuple(test), f"every {rule.test_every}th image" if rule.test_every else "none")
+        return Split(
+            tuple(train),
+            tuple(test),
+            f"every {rule.test_every}th image" if rule.test_every else "none",
+        )
     train, test = split_names(names, test=test)
     return Split(tuple(train), tuple(test), description)
 
@@ -226,11 +271,14 @@ def _sector(
 ) -> tuple[list[str], str]:
     if cameras is None:
         raise InputError(
-            "scene.split=sector needs the cameras, and these photographs came without: give a COLMAP model "
+            "scene.split=sector needs the cameras, and these photographs came without: give a "
+            "COLMAP model "
             "(scene=colmap; gsbench export writes that of a trial)"
         )
     if len(names) < rule.sectors:
-        raise InputError(f"scene.sectors={rule.sectors} are more than the {len(names)} images: give fewer")
+        raise InputError(
+            f"scene.sectors={rule.sectors} are more than the {len(names)} images: give fewer"
+        )
     arrangement = arrange_cameras(cameras(names))
     positions = sector_range(len(names), rule.sector, rule.sectors, exactly)
     test = [names[arrangement.order[position]] for position in positions]

@@ -1,11 +1,14 @@
-"""Photographs and masks: finding them by name, reading, resizing, and filling in what a mask ignores.
+"""Photographs and masks: finding them by name, reading, resizing, and filling in what a mask
+ignores.
 
-Every image becomes uint8 RGB. EXIF orientation is ignored, as in COLMAP, because cameras refer to the stored pixels.
+Every image becomes uint8 RGB. EXIF orientation is ignored, as in COLMAP, because cameras refer to
+the stored pixels.
 
-A mask says which pixels of a photograph count: black pixels are ignored, all others count. COLMAP extracts no features
-where a mask "is black (pixel intensity value 0 in grayscale)" (its FAQ, "Mask image regions"), and nerfstudio trains
-only where a mask is not 0 (its page "Data conventions"). Ignored pixels are replaced before any other step reads a
-photograph, so that they cannot influence a result.
+A mask says which pixels of a photograph count: black pixels are ignored, all others count. COLMAP
+extracts no features where a mask "is black (pixel intensity value 0 in grayscale)" (its FAQ, "Mask
+image regions"), and nerfstudio trains only where a mask is not 0 (its page "Data conventions").
+Ignored pixels are replaced before any other step reads a photograph, so that they cannot influence
+a result.
 """
 
 import logging
@@ -30,11 +33,17 @@ log = logging.getLogger(__name__)
 Resample = Literal["lanczos", "area", "bicubic"]
 
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp"})
-HEIC_SUFFIXES = frozenset({".heic", ".heif"})  # photographs of telephones; neither Pillow nor COLMAP reads them
-# The formats of files with these suffixes. Without this list, Pillow would try some forty formats on every file.
+# photographs of telephones; neither Pillow nor COLMAP reads them
+HEIC_SUFFIXES = frozenset({".heic", ".heif"})
+# The formats of files with these suffixes. Without this list, Pillow would try some forty formats
+# on every file.
 FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP")  # JPEG includes MPO, which holds several JPEGs
 EXIF_ORIENTATION = 0x0112
-_FILTERS = {"lanczos": Image.Resampling.LANCZOS, "area": Image.Resampling.BOX, "bicubic": Image.Resampling.BICUBIC}
+_FILTERS = {
+    "lanczos": Image.Resampling.LANCZOS,
+    "area": Image.Resampling.BOX,
+    "bicubic": Image.Resampling.BICUBIC,
+}
 _SIXTEEN_BIT_MODES = ("I;16", "I;16L", "I;16B", "I;16N")
 _WIDE_MODES = ("I", "F")  # 32-bit integer and float, which have no agreed value for white
 
@@ -43,12 +52,14 @@ Mask = NDArray[np.bool_]  # [H, W], True where a pixel counts
 SUFFIX = ".png"
 WHITE = np.uint8(255)
 IMAGES, MASKS = "images", "masks"  # in the folder of `prepare_photograph`
-MAX_GREY_SHARE = 0.05  # of pixels between black and the brightest value; a photograph given as a mask has far more
+# of pixels between black and the brightest value; a photograph given as a mask has far more
+MAX_GREY_SHARE = 0.05
 NEARLY_ONE = 1 - 1e-6  # a mean of ones in float32 may round to less than 1
 
 
 def list_images(folder: Path) -> list[str]:
-    """The sorted image files in a folder and its sub-folders, relative, with "/" as separator, without hidden files.
+    """The sorted image files in a folder and its sub-folders, relative, with "/" as separator,
+    without hidden files.
 
     Links to folders are followed, and no folder is read twice.
     """
@@ -56,7 +67,8 @@ def list_images(folder: Path) -> list[str]:
     unread = 0
     folders, links, seen = [folder], list[Path](), set[tuple[int, int]]()
     while folders or links:
-        # Links come last, so that images are listed under their real folder rather than under a link to it.
+        # Links come last, so that images are listed under their real folder rather than under a
+        # link to it.
         parent = folders.pop() if folders else links.pop(0)
         status = parent.stat()
         if (status.st_dev, status.st_ino) in seen:  # also ends circles of links
@@ -73,7 +85,9 @@ def list_images(folder: Path) -> list[str]:
                 unread += 1
     if unread:
         log.warning(
-            "%s: %s not read: save as JPEG", folder, f"{counted(unread, 'HEIC file')} {'is' if unread == 1 else 'are'}"
+            "%s: %s not read: save as JPEG",
+            folder,
+            f"{counted(unread, 'HEIC file')} {'is' if unread == 1 else 'are'}",
         )
     return sorted(names)
 
@@ -89,14 +103,16 @@ def _entries(folder: Path) -> list[os.DirEntry[str]]:
 def match_names(wanted: Iterable[str], files: Iterable[str]) -> dict[str, str]:
     """Map each wanted image name to its file; names without a file are left out.
 
-    A file of the same name comes first, then the only file whose path differs in the extension alone (``a.png`` for
-    ``a.JPG``), then the only one that differs in capitals too (``IMG_1.JPG`` for ``img_1.jpg``). Raises `InputError` if
-    several such files fit a name, or if several names fit such a file.
+    A file of the same name comes first, then the only file whose path differs in the extension
+    alone (``a.png`` for ``a.JPG``), then the only one that differs in capitals too (``IMG_1.JPG``
+    for ``img_1.jpg``). Raises `InputError` if several such files fit a name, or if several names
+    fit such a file.
     """
     unmatched, free = dict.fromkeys(wanted), set(files)
     matches = {name: name for name in unmatched if name in free}
     for key_of in (stem_of, lambda path: path.casefold(), lambda path: stem_of(path).casefold()):
-        # Better matches come first and take their files, so that a name is never matched to another one's file.
+        # Better matches come first and take their files, so that a name is never matched to another
+        # one's file.
         free -= set(matches.values())
         by_key: dict[str, list[str]] = defaultdict(list)
         for file in free:
@@ -109,10 +125,14 @@ def match_names(wanted: Iterable[str], files: Iterable[str]) -> dict[str, str]:
             found = sorted(by_key[key])
             if len(found) > 1:
                 raise InputError(
-                    f"{names[0]} may be {' or '.join(found)}: keep one of these files, or name one exactly"
+                    f"{names[0]} may be {' or '.join(found)}: keep one of these files, or name "
+                    "one exactly"
                 )
             if len(names) > 1:
-                raise InputError(f"{found[0]} may be {' or '.join(sorted(names))}: give each image a file of its own")
+                raise InputError(
+                    f"{found[0]} may be {' or '.join(sorted(names))}: give each image a file of "
+                    "its own"
+                )
             matches[names[0]] = found[0]
     return matches
 
@@ -124,17 +144,20 @@ def stem_of(name: str) -> str:
 
 
 def check_picture_names(names: Iterable[str], folder: Path) -> None:
-    """Raise `InputError` if a view's picture would have a too long name, or the same name as another view's."""
+    """Raise `InputError` if a view's picture would have a too long name, or the same name as
+    another view's."""
     view_of: dict[str, str] = {}
     for name in names:
         picture = png_name(name)
         if len(picture.encode()) > MAX_NAME_BYTES:
             raise InputError(
-                f"{folder / name}: a name of more than {MAX_NAME_BYTES} bytes, folders included: shorten it"
+                f"{folder / name}: a name of more than {MAX_NAME_BYTES} bytes, folders included: "
+                "shorten it"
             )
         if picture in view_of:
             raise InputError(
-                f"{folder}: the pictures of {view_of[picture]} and {name} would both be {picture}: rename one"
+                f"{folder}: the pictures of {view_of[picture]} and {name} would both be "
+                f"{picture}: rename one"
             )
         view_of[picture] = name
 
@@ -165,17 +188,22 @@ def exif_orientation(path: Path) -> int:
 def read_image(path: Path, backdrop: Backdrop = "black") -> NDArray[np.uint8]:
     """The image as [H, W, 3] uint8 RGB.
 
-    Grey and palette images become RGB, 16-bit values keep their high byte, and transparent pixels are blended over
-    ``backdrop`` (black is the default background of 3DGS). Raises `InputError` if the file is missing, truncated, not
-    an image, or holds 32-bit or float pixels.
+    Grey and palette images become RGB, 16-bit values keep their high byte, and transparent pixels
+    are blended over ``backdrop`` (black is the default background of 3DGS). Raises `InputError` if
+    the file is missing, truncated, not an image, or holds 32-bit or float pixels.
     """
     with open_image(path) as image:
         if image.mode in _WIDE_MODES:
-            raise InputError(f"{path}: pixels of type {image.mode!r} have no defined white: convert it to 8-bit RGB")
+            raise InputError(
+                f"{path}: pixels of type {image.mode!r} have no defined white: convert it to "
+                "8-bit RGB"
+            )
         try:
             image.load()
         except Exception as error:  # as in `open_image`
-            raise InputError(f"{path}: the image is damaged ({error}): replace or remove it") from error
+            raise InputError(
+                f"{path}: the image is damaged ({error}): replace or remove it"
+            ) from error
         if image.mode in _SIXTEEN_BIT_MODES:
             grey = (np.asarray(image).astype(np.uint16) >> 8).astype(np.uint8)  # [H, W]
             return np.repeat(grey[..., None], 3, axis=2)
@@ -190,8 +218,9 @@ def resize_image(
 ) -> NDArray[np.uint8]:
     """The image [H, W, 3] at another size.
 
-    ``lanczos`` is Pillow's windowed sinc with three lobes, widened by the scale against aliasing. ``bicubic`` is
-    Pillow's with a = -0.5, widened too. ``area`` is the mean over each new pixel's area.
+    ``lanczos`` is Pillow's windowed sinc with three lobes, widened by the scale against aliasing.
+    ``bicubic`` is Pillow's with a = -0.5, widened too. ``area`` is the mean over each new pixel's
+    area.
     """
     if resample not in _FILTERS:
         raise InputError(f"scene.resample must be one of {', '.join(_FILTERS)}, got {resample!r}")
@@ -201,23 +230,29 @@ def resize_image(
 
 
 def check_size(path: Path, size: tuple[int, int], camera_size: tuple[int, int]) -> None:
-    """Raise `InputError` if the aspect ratios of image and camera differ by more than rounding to whole pixels."""
+    """Raise `InputError` if the aspect ratios of image and camera differ by more than rounding to
+    whole pixels."""
     (width, height), (camera_width, camera_height) = size, camera_size
     if same_up_to_rounding(size, camera_size):
         return
     message = (
-        f"{path}: the image is {width}x{height} px but its camera in the COLMAP model {camera_width}x{camera_height}"
+        f"{path}: the image is {width}x{height} px but its camera in the COLMAP model "
+        f"{camera_width}x{camera_height}"
     )
     if same_up_to_rounding((height, width), camera_size):
         raise InputError(
-            f"{message}: it is stored on its side (EXIF orientation {exif_orientation(path)}, which COLMAP ignores); "
+            f"{message}: it is stored on its side (EXIF orientation {exif_orientation(path)}, "
+            "which COLMAP ignores); "
             "use the files that the model was made from"
         )
-    raise InputError(f"{message}: use the files that the model was made from, or an evenly scaled copy")
+    raise InputError(
+        f"{message}: use the files that the model was made from, or an evenly scaled copy"
+    )
 
 
 def same_up_to_rounding(size: tuple[int, int], reference: tuple[int, int]) -> bool:
-    """Return whether one scale maps ``reference`` to ``size`` with an error of at most one pixel on each side."""
+    """Return whether one scale maps ``reference`` to ``size`` with an error of at most one pixel on
+    each side."""
     (width, height), (reference_width, reference_height) = size, reference
     lowest = max((width - 1) / reference_width, (height - 1) / reference_height)
     highest = min((width + 1) / reference_width, (height + 1) / reference_height)
@@ -225,7 +260,8 @@ def same_up_to_rounding(size: tuple[int, int], reference: tuple[int, int]) -> bo
 
 
 def open_image(path: Path) -> Image.Image:
-    """Open an image with Pillow, without reading pixels; raises `InputError` if it is missing or is not an image."""
+    """Open an image with Pillow, without reading pixels; raises `InputError` if it is missing or is
+    not an image."""
     require_regular(path)
     try:
         return Image.open(path, formats=FORMATS)
@@ -237,22 +273,26 @@ def open_image(path: Path) -> Image.Image:
 
 
 def find_masks(folder: Path, images: Path, names: Sequence[str]) -> dict[str, Path]:
-    """The mask file in ``folder`` of each image: ``a/b.jpg.png`` for ``a/b.jpg``, as COLMAP names it.
+    """The mask file in ``folder`` of each image: ``a/b.jpg.png`` for ``a/b.jpg``, as COLMAP names
+    it.
 
-    ``names`` are paths below ``images``, the folder of the images. Raises InputError naming the images without a mask,
-    or for a mask that is not an image or differs in size from its photograph.
+    ``names`` are paths below ``images``, the folder of the images. Raises InputError naming the
+    images without a mask, or for a mask that is not an image or differs in size from its
+    photograph.
     """
     masks = {name: folder / f"{name}{SUFFIX}" for name in names}
     if missing := [name for name, mask in masks.items() if not mask.is_file()]:
         raise InputError(
-            f"scene.masks: no mask of {some_of(missing)} in {folder}: add {missing[0]}{SUFFIX} (all white where every "
+            f"scene.masks: no mask of {some_of(missing)} in {folder}: add {missing[0]}{SUFFIX} "
+            "(all white where every "
             "pixel counts)"
         )
     for name, mask in masks.items():
         size, wanted = image_size(mask), image_size(images / name)
         if size != wanted:
             raise InputError(
-                f"{mask}: the mask is {size[0]}x{size[1]} px and its image {name} {wanted[0]}x{wanted[1]}: give masks "
+                f"{mask}: the mask is {size[0]}x{size[1]} px and its image {name} "
+                f"{wanted[0]}x{wanted[1]}: give masks "
                 "of the images' size"
             )
     return masks
@@ -261,29 +301,47 @@ def find_masks(folder: Path, images: Path, names: Sequence[str]) -> dict[str, Pa
 def read_mask(path: Path) -> Mask:
     """Read a mask [H, W]: False where the file is black.
 
-    Raises InputError for a file that is no mask: with colours, with many greys, or black everywhere.
+    Raises InputError for a file that is no mask: with colours, with many greys, or black
+    everywhere.
     """
     with open_image(path) as image:
         try:
             image.load()
-            if image.has_transparency_data and np.asarray(image.convert("RGBA"))[..., 3].min() < 255:
-                raise InputError(f"{path}: a mask says by black what is ignored, not by transparency: save it as grey")
-            pixels = np.asarray(image.convert("RGB") if image.mode in ("P", "CMYK", "YCbCr", "RGBA", "LA") else image)
+            if (
+                image.has_transparency_data
+                and np.asarray(image.convert("RGBA"))[..., 3].min() < 255
+            ):
+                raise InputError(
+                    f"{path}: a mask says by black what is ignored, not by transparency: save it "
+                    "as grey"
+                )
+            pixels = np.asarray(
+                image.convert("RGB")
+                if image.mode in ("P", "CMYK", "YCbCr", "RGBA", "LA")
+                else image
+            )
         except InputError:
             raise
         except Exception as error:  # Pillow's readers may raise any exception on a damaged file
             raise InputError(f"{path}: the mask is damaged ({error}): replace it") from error
     if pixels.ndim == 3:
         if (pixels != pixels[..., :1]).any():
-            raise InputError(f"{path}: is in colours, and no mask: make it black where pixels are ignored, else white")
+            raise InputError(
+                f"{path}: is in colours, and no mask: make it black where pixels are ignored, "
+                "else white"
+            )
         pixels = pixels.max(axis=2)
     mask: Mask = pixels != 0
     if not mask.any():
-        raise InputError(f"{path}: the mask is black all over, so no pixel counts: correct it, or leave the image out")
+        raise InputError(
+            f"{path}: the mask is black all over, so no pixel counts: correct it, or leave the "
+            "image out"
+        )
     grey_share = float((mask & (pixels != pixels.max())).mean())
     if grey_share > MAX_GREY_SHARE:
         raise InputError(
-            f"{path}: {grey_share:.0%} of its pixels are grey, so it is not a mask: make it black where pixels are "
+            f"{path}: {grey_share:.0%} of its pixels are grey, so it is not a mask: make it black "
+            "where pixels are "
             "ignored, else white"
         )
     return mask
@@ -303,10 +361,11 @@ def write_png(image: NDArray[np.uint8], path: Path, exif: bytes = b"") -> None:
 def prepare_photograph(
     folder: Path, images: Path, masks: Mapping[str, Path], name: str, backdrop: Backdrop = "black"
 ) -> None:
-    """Write the photograph ``name`` with its ignored pixels replaced and its transparent pixels over ``backdrop``.
+    """Write the photograph ``name`` with its ignored pixels replaced and its transparent pixels
+    over ``backdrop``.
 
-    The photograph goes to ``images/<name>`` below ``folder``: a copy if nothing changes, else a PNG with the original
-    EXIF data. Its mask, if any, goes to ``masks/<name>.png`` in black and white.
+    The photograph goes to ``images/<name>`` below ``folder``: a copy if nothing changes, else a PNG
+    with the original EXIF data. Its mask, if any, goes to ``masks/<name>.png`` in black and white.
     """
     target, mask_target = folder / IMAGES / name, prepared_mask(folder, name)
     for path in (target, mask_target):
@@ -329,16 +388,18 @@ def prepare_photograph(
 
 
 def prepared_mask(folder: Path, name: str) -> Path:
-    """The file to which `prepare_photograph` writes the mask of the image ``name``, as COLMAP names it."""
+    """The file to which `prepare_photograph` writes the mask of the image ``name``, as COLMAP names
+    it."""
     return folder / MASKS / f"{name}{SUFFIX}"
 
 
 def fill_ignored(image: NDArray[np.uint8], mask: Mask) -> NDArray[np.uint8]:
     """``image`` [H, W, 3] with its ignored pixels interpolated from counted pixels nearby.
 
-    Uses the pull and push of Gortler et al. 1996, "The Lumigraph", section 3.4.1: the counted pixels are averaged over
-    blocks of 2, 4, 8, … pixels; then coarser levels are interpolated bilinearly into finer pixels without a value. The
-    filling leaves no edge at the border of the mask where features would be detected.
+    Uses the pull and push of Gortler et al. 1996, "The Lumigraph", section 3.4.1: the counted
+    pixels are averaged over blocks of 2, 4, 8, … pixels; then coarser levels are interpolated
+    bilinearly into finer pixels without a value. The filling leaves no edge at the border of the
+    mask where features would be detected.
     """
     filled = _pull_push(image.astype(np.float32), mask)
     return np.where(mask[..., None], image, np.rint(filled).astype(np.uint8))
@@ -352,7 +413,9 @@ def _pull_push(image: NDArray[np.float32], mask: Mask) -> NDArray[np.float32]:
     weights = np.pad(mask, to_even).astype(np.float32)
     rows, columns = weights.shape[0] // 2, weights.shape[1] // 2
     blocks = (rows, 2, columns, 2)
-    sums = (np.pad(image * mask[..., None], (*to_even, (0, 0)))).reshape(*blocks, 3).sum((1, 3))  # [H/2, W/2, 3]
+    sums = (
+        (np.pad(image * mask[..., None], (*to_even, (0, 0)))).reshape(*blocks, 3).sum((1, 3))
+    )  # [H/2, W/2, 3]
     counted = weights.reshape(blocks).sum((1, 3))  # [H/2, W/2]
     coarse = _pull_push(sums / np.maximum(counted, 1)[..., None], counted > 0)
     pushed = _double(_double(coarse, 0), 1)[:height, :width]
@@ -372,10 +435,11 @@ def _double(image: NDArray[np.float32], axis: int) -> NDArray[np.float32]:
 
 
 def resize_mask(mask: Mask, width: int, height: int) -> Mask:
-    """The mask at another size: a pixel counts if all original pixels with centres in its area count.
+    """The mask at another size: a pixel counts if all original pixels with centres in its area
+    count.
 
-    The filters that resize photographs reach further than that. Beyond the mask's border they use the pixels that
-    `fill_ignored` made.
+    The filters that resize photographs reach further than that. Beyond the mask's border they use
+    the pixels that `fill_ignored` made.
     """
     if mask.shape == (height, width):
         return mask

@@ -1,12 +1,13 @@
-"""Loading a `Scene` with pinhole cameras and images at their final size, from a capture and a COLMAP model.
+"""Loading a `Scene` with pinhole cameras and images at their final size, from a capture and a
+COLMAP model.
 
-Prepared images are cached below ``cache_dir`` as PNG files, one folder for each set. The folder's name is a digest of
-everything that the pixels depend on. A folder appears by one rename, so a set is either complete or absent. Images that
-need no change are read from the capture.
+Prepared images are cached below ``cache_dir`` as PNG files, one folder for each set. The folder's
+name is a digest of everything that the pixels depend on. A folder appears by one rename, so a set
+is either complete or absent. Images that need no change are read from the capture.
 
-Undistortion is COLMAP's, with the defaults of its ``image_undistorter``, which INRIA's ``convert.py`` uses too: the
-largest pinhole image without blank pixels, at the original focal length. It runs on pixels in memory, so images are not
-compressed as JPEG again.
+Undistortion is COLMAP's, with the defaults of its ``image_undistorter``, which INRIA's
+``convert.py`` uses too: the largest pinhole image without blank pixels, at the original focal
+length. It runs on pixels in memory, so images are not compressed as JPEG again.
 """
 
 import hashlib
@@ -54,7 +55,8 @@ PrincipalPoint = Literal["used", "centred"]
 CACHE_VERSION = 2  # to be raised when prepared pixels or the form of cameras.json change
 CAMERAS_FILE = "cameras.json"
 INTRINSICS = ("width", "height", "fx", "fy", "cx", "cy")
-_CHUNK = 16  # images per isolated process: limits what a crash loses, and progress is reported after each chunk
+# images per isolated process: limits what a crash loses, and progress is reported after each chunk
+_CHUNK = 16
 
 
 @dataclass(frozen=True)
@@ -83,13 +85,14 @@ def load_scene(
 ) -> Scene:
     """Load the views of a capture with the cameras of the COLMAP model in ``model_dir``.
 
-    Images of a distorted camera are undistorted. Then all images are shrunk by ``downscale`` and to a longest side of
-    ``max_size`` px (see `downscaled_size`). ``principal_point="centred"`` moves principal points to the image centre,
-    as 3DGS assumes. Views without a pose in the model are left out with a warning. ``made_by`` are the versions of code
-    and packages that prepare images: the cache does not return images that other versions made. ``progress`` counts
-    images.
+    Images of a distorted camera are undistorted. Then all images are shrunk by ``downscale`` and to
+    a longest side of ``max_size`` px (see `downscaled_size`). ``principal_point="centred"`` moves
+    principal points to the image centre, as 3DGS assumes. Views without a pose in the model are
+    left out with a warning. ``made_by`` are the versions of code and packages that prepare images:
+    the cache does not return images that other versions made. ``progress`` counts images.
 
-    Raises `InputError` if fewer than three views or no training view have a pose, or an image does not fit its camera.
+    Raises `InputError` if fewer than three views or no training view have a pose, or an image does
+    not fit its camera.
     """
     if principal_point not in ("used", "centred"):
         raise InputError(f"scene.principal_point must be used or centred, got {principal_point!r}")
@@ -112,7 +115,9 @@ def load_scene(
         image = read_image(folder / entry["file"] if entry["file"] else capture.images / name)
         camera = _camera(entry)
         if image.shape[:2] != (camera.height, camera.width):
-            raise InputError(f"{folder}: {name} is not as it was prepared: delete this folder and run again")
+            raise InputError(
+                f"{folder}: {name} is not as it was prepared: delete this folder and run again"
+            )
         if principal_point == "centred":
             camera = replace(camera, cx=camera.width / 2, cy=camera.height / 2)
         return View(name, camera, image, mask_of(name))
@@ -146,10 +151,14 @@ def _prepare_views(
             entries[name] = {"file": file, "pose": pose}
             if changed:
                 mask = capture.masks.get(name)
-                changes[name] = ImageToPrepare(capture.images / name, model, work / file, downscaling, mask)
+                changes[name] = ImageToPrepare(
+                    capture.images / name, model, work / file, downscaling, mask
+                )
             else:
                 entries[name] |= _intrinsics(to_pinhole(model))
-        for name, camera in zip(changes, prepare_all(list(changes.values()), progress), strict=True):
+        for name, camera in zip(
+            changes, prepare_all(list(changes.values()), progress), strict=True
+        ):
             entries[name] |= _intrinsics(camera)
         document = {"version": CACHE_VERSION, "scene": capture.name, "views": entries}
         (work / CAMERAS_FILE).write_text(json.dumps(document, indent=1), encoding="utf-8")
@@ -168,9 +177,13 @@ def _publish(work: Path, folder: Path) -> None:
         os.rename(work, folder)
 
 
-def _model_cameras(capture: Capture, model_dir: Path) -> dict[str, tuple[CameraModel, list[list[float]]]]:
-    """The COLMAP camera at the file's size and the 3x4 pose of every image of the capture that has a pose."""
-    from gsbench.scene.colmap import plain_camera, read_model, rescaled_camera  # not needed if the views are cached
+def _model_cameras(
+    capture: Capture, model_dir: Path
+) -> dict[str, tuple[CameraModel, list[list[float]]]]:
+    """The COLMAP camera at the file's size and the 3x4 pose of every image of the capture that has
+    a pose."""
+    # not needed if the views are cached
+    from gsbench.scene.colmap import plain_camera, read_model, rescaled_camera
 
     model = read_model(model_dir)
     wanted = set(capture.image_names)
@@ -185,12 +198,14 @@ def _model_cameras(capture: Capture, model_dir: Path) -> dict[str, tuple[CameraM
         cameras[image.name] = (plain, image.cam_from_world().matrix().tolist())
     if len(cameras) < MIN_IMAGES:
         raise InputError(
-            f"scene {capture.name}: {len(cameras)} of {len(wanted)} images have a pose in {model_dir}, but at least "
+            f"scene {capture.name}: {len(cameras)} of {len(wanted)} images have a pose in "
+            f"{model_dir}, but at least "
             f"{MIN_IMAGES} are needed: take more overlapping photos, or another init"
         )
     if not set(cameras) & set(capture.train_names):
         raise InputError(
-            f"scene {capture.name}: no training view has a pose in {model_dir}: change the split or the init"
+            f"scene {capture.name}: no training view has a pose in {model_dir}: change the split "
+            "or the init"
         )
     return dict(sorted(cameras.items()))
 
@@ -201,8 +216,12 @@ def _report_unregistered(capture: Capture, registered: set[str]) -> None:
         if missing:
             log.warning(
                 "scene %s: %d of %d %s views have no pose and are left out: %s",
-                capture.name, len(missing), len(names), kind, some_of(missing),
-            )  # fmt: skip
+                capture.name,
+                len(missing),
+                len(names),
+                kind,
+                some_of(missing),
+            )
 
 
 def _intrinsics(camera: Camera) -> dict[str, float]:
@@ -215,14 +234,21 @@ def _camera(entry: dict[str, object]) -> Camera:
     return Camera(**intrinsics, rotation=pose[:, :3], translation=pose[:, 3])
 
 
-def _cache_key(capture: Capture, model_dir: Path, downscaling: Downscaling, made_by: Mapping[str, str | None]) -> str:
-    """A digest of the images, the model's cameras and poses, the settings, and the versions that prepare the images."""
+def _cache_key(
+    capture: Capture, model_dir: Path, downscaling: Downscaling, made_by: Mapping[str, str | None]
+) -> str:
+    """A digest of the images, the model's cameras and poses, the settings, and the versions that
+    prepare the images."""
     digest = hashlib.sha256()
     for file in sorted(model_files(model_dir)):
         if file.stem != "points3D":
-            digest.update(f"{file.name}\0{hashlib.sha256(file.read_bytes()).hexdigest()}\n".encode())
+            digest.update(
+                f"{file.name}\0{hashlib.sha256(file.read_bytes()).hexdigest()}\n".encode()
+            )
     settings = [*vars(downscaling).values(), sorted(made_by.items())]
-    digest.update(json.dumps([CACHE_VERSION, capture.fingerprint, capture.image_names, *settings]).encode())
+    digest.update(
+        json.dumps([CACHE_VERSION, capture.fingerprint, capture.image_names, *settings]).encode()
+    )
     return digest.hexdigest()[:32]
 
 
@@ -248,8 +274,9 @@ def mask_file(image_file: str) -> str:
 def prepare_all(images: Sequence[ImageToPrepare], progress: Progress) -> list[Camera]:
     """Prepare all images and return their final cameras, at the origin, in the order of ``images``.
 
-    Distorted images are undistorted in child processes, because COLMAP's native code can abort its process. Such an
-    abort raises `InputError`, as an unreadable image does. ``progress`` counts images.
+    Distorted images are undistorted in child processes, because COLMAP's native code can abort its
+    process. Such an abort raises `InputError`, as an unreadable image does. ``progress`` counts
+    images.
     """
     cameras: list[Camera] = []
     for start in range(0, len(images), _CHUNK):
@@ -259,7 +286,9 @@ def prepare_all(images: Sequence[ImageToPrepare], progress: Progress) -> list[Ca
                 cameras += run_isolated(prepare_chunk, chunk, what="undistortion")
             except CrashError as error:
                 names = f"{chunk[0].source} to {chunk[-1].source.name}"
-                raise InputError(f"{error} ({names}): check these images and their cameras") from error
+                raise InputError(
+                    f"{error} ({names}): check these images and their cameras"
+                ) from error
         else:
             cameras += prepare_chunk(chunk)
         progress("views", len(cameras), len(images))
@@ -273,7 +302,8 @@ def prepare_chunk(images: Sequence[ImageToPrepare]) -> list[Camera]:
 
 
 def prepare_image(image: ImageToPrepare) -> Camera:
-    """Read, undistort if needed, downscale, and write one image as PNG; returns its final camera, at the origin."""
+    """Read, undistort if needed, downscale, and write one image as PNG; returns its final camera,
+    at the origin."""
     pixels = read_image(image.source)  # [H, W, 3]
     if pixels.shape[:2] != (image.camera.height, image.camera.width):
         raise InputError(f"{image.source}: the image changed its size while it was read: run again")
@@ -291,29 +321,36 @@ def prepare_image(image: ImageToPrepare) -> Camera:
 
 
 def _prepare_mask(source: Path, image: ImageToPrepare, width: int, height: int) -> None:
-    """Undistort and shrink the mask as the image: a pixel counts if no ignored pixel contributes to its area."""
+    """Undistort and shrink the mask as the image: a pixel counts if no ignored pixel contributes to
+    its area."""
     mask = read_mask(source)
     if image.camera.distorted:
         levels = np.repeat(mask[..., None].astype(np.uint8) * WHITE, 3, axis=2)  # [H, W, 3]
         mask = (undistort(levels, image.camera)[0] == WHITE).all(axis=2)
     mask = resize_mask(mask, width, height)
     if not mask.any():
-        raise InputError(f"{source}: no pixel is left that counts at {width}x{height} px: leave its image out")
+        raise InputError(
+            f"{source}: no pixel is left that counts at {width}x{height} px: leave its image out"
+        )
     write_mask(mask, image.target.with_name(mask_file(image.target.name)))
 
 
 def undistort(image: NDArray[np.uint8], camera: CameraModel) -> tuple[NDArray[np.uint8], Camera]:
     """Undistort one image [H, W, 3] of any perspective COLMAP camera model; its size changes.
 
-    Raises `InputError` for a camera without a pinhole image (a full panorama) or with impossible parameters.
+    Raises `InputError` for a camera without a pinhole image (a full panorama) or with impossible
+    parameters.
     """
     import pycolmap  # slow to load, and not needed for pinhole images
 
     from gsbench.scene.colmap import plain_camera
 
-    source = pycolmap.Camera(model=camera.name, width=camera.width, height=camera.height, params=list(camera.params))
+    source = pycolmap.Camera(
+        model=camera.name, width=camera.width, height=camera.height, params=list(camera.params)
+    )
     refusal = (
-        f"images of the camera model {camera.name} with parameters {camera.params} cannot be made pinhole images: "
+        f"images of the camera model {camera.name} with parameters {camera.params} cannot be made "
+        "pinhole images: "
         "use another camera model"
     )
     if source.is_spherical():

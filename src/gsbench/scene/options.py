@@ -1,4 +1,5 @@
-"""The settings of a scene: where its photographs lie, how many are read, how large, and which are held out."""
+"""The settings of a scene: where its photographs lie, how many are read, how large, and which are
+held out."""
 
 import math
 from dataclasses import dataclass, fields
@@ -16,8 +17,11 @@ MIN_IMAGES = 3  # with two views, no third one can reveal a wrong geometry
 MIN_SIZE = 16  # px: the smallest side of an image that is trained on
 
 
-def downscaled_size(width: int, height: int, downscale: int = 1, max_size: int | None = None) -> tuple[int, int]:
-    """The size after dividing by ``downscale``, and then shrinking the longest side to ``max_size`` if it is longer.
+def downscaled_size(
+    width: int, height: int, downscale: int = 1, max_size: int | None = None
+) -> tuple[int, int]:
+    """The size after dividing by ``downscale``, and then shrinking the longest side to ``max_size``
+    if it is longer.
 
     Sides are rounded half up to at least 1. The size never grows.
 
@@ -33,17 +37,27 @@ def downscaled_size(width: int, height: int, downscale: int = 1, max_size: int |
         raise InputError(f"scene.max_size must be at least 1 px, got {max_size}")
     longest = max(width, height)
     # One fraction for both sides, so that the longest side becomes exactly max_size.
-    numerator, denominator = (max_size, longest) if max_size and max_size * downscale < longest else (1, downscale)
-    return tuple(max(1, math.floor(side * numerator / denominator + 0.5)) for side in (width, height))  # type: ignore[return-value]
+    numerator, denominator = (
+        (max_size, longest) if max_size and max_size * downscale < longest else (1, downscale)
+    )
+    return tuple(
+        max(1, math.floor(side * numerator / denominator + 0.5)) for side in (width, height)
+    )  # type: ignore[return-value]
 
 
-def check_final_size(size: tuple[int, int], downscale: int, max_size: int | None, what: str) -> None:
-    """Raise InputError if ``what``, of ``size`` (width, height) px, would have a side below 16 px in training."""
+def check_final_size(
+    size: tuple[int, int], downscale: int, max_size: int | None, what: str
+) -> None:
+    """Raise InputError if ``what``, of ``size`` (width, height) px, would have a side below 16 px
+    in training."""
     width, height = downscaled_size(*size, downscale, max_size)
     if min(width, height) < MIN_SIZE:
-        cause = f"scene.downscale={downscale}" + ("" if max_size is None else f" with scene.max_size={max_size}")
+        cause = f"scene.downscale={downscale}" + (
+            "" if max_size is None else f" with scene.max_size={max_size}"
+        )
         raise InputError(
-            f"{cause} leaves {width}x{height} px of {what} ({size[0]}x{size[1]} px): at least {MIN_SIZE} px are needed"
+            f"{cause} leaves {width}x{height} px of {what} ({size[0]}x{size[1]} px): at least "
+            f"{MIN_SIZE} px are needed"
         )
 
 
@@ -55,11 +69,13 @@ TRAIN_LIST, TEST_LIST = "train_list.txt", "test_list.txt"  # as nerfbaselines na
 
 @dataclass(frozen=True)
 class SplitRule:
-    """Settings that say which views are held out; the fields are those of `gsbench.scene.options.SceneConfig`.
+    """Settings that say which views are held out; the fields are those of
+    `gsbench.scene.options.SceneConfig`.
 
-    ``every_nth`` holds out every ``test_every``-th name, from the first. ``sector`` holds out sector number ``sector``
-    of ``sectors`` contiguous ones (`gsbench.scene.hold_out.arrange_cameras`). ``list`` follows the lists. With
-    ``match_views``, ``every_nth`` holds out as many views as a sector has, so both leave equally many for training.
+    ``every_nth`` holds out every ``test_every``-th name, from the first. ``sector`` holds out
+    sector number ``sector`` of ``sectors`` contiguous ones
+    (`gsbench.scene.hold_out.arrange_cameras`). ``list`` follows the lists. With ``match_views``,
+    ``every_nth`` holds out as many views as a sector has, so both leave equally many for training.
     With ``validation``, the held-out views are dropped, and the rule is applied again to the rest.
     """
 
@@ -86,17 +102,24 @@ class SplitRule:
         lists = [key for key in ("train_list", "test_list") if getattr(self, key) is not None]
         if self.split == "matched":
             raise InputError(
-                "scene.split=matched is a pair of trials: sweep it, as in -m scene.split=every_nth,sector "
+                "scene.split=matched is a pair of trials: sweep it, as in -m "
+                "scene.split=every_nth,sector "
                 "scene.match_views=true"
             )
         if self.sector >= self.sectors:
             raise InputError(
-                f"scene.sector={self.sector}: of scene.sectors={self.sectors} the last is {self.sectors - 1}"
+                f"scene.sector={self.sector}: of scene.sectors={self.sectors} the last is "
+                f"{self.sectors - 1}"
             )
         if self.split == "sector" and lists:
-            raise InputError(f"scene.split=sector and scene.{lists[0]} both say what is held out: give one")
+            raise InputError(
+                f"scene.split=sector and scene.{lists[0]} both say what is held out: give one"
+            )
         if self.match_views and self.by_lists:
-            raise InputError("scene.match_views=true: what lists hold out cannot be matched; give every_nth or sector")
+            raise InputError(
+                "scene.match_views=true: what lists hold out cannot be matched; give every_nth or "
+                "sector"
+            )
 
 
 EVERY_NTH = SplitRule()
@@ -107,7 +130,8 @@ MAX_SIZE = 16_384  # px, a side of a view of the courtyard
 
 
 def folder_name(path: str | None) -> str:
-    """The last part of ``path`` as the scene's name, or ``scene`` if it cannot name a folder of results."""
+    """The last part of ``path`` as the scene's name, or ``scene`` if it cannot name a folder of
+    results."""
     name = Path(path or "").expanduser().absolute().name
     return name if is_folder_name(name) else "scene"
 
@@ -120,20 +144,25 @@ class SceneConfig:
     images: PathName | None = None  # image folder below path; null: images
     sparse: PathName | None = None  # model folder below path; null: sparse/0 or sparse
     transparent: Backdrop = "black"  # colour under transparent pixels
-    masks: PathName | None = None  # folder below path with a mask for each image, black where ignored; null: no masks
+    # folder below path with a mask for each image, black where ignored; null: no masks
+    masks: PathName | None = None
     downscale: PositiveInt = 1  # divides both sides
     max_size: Annotated[int, Ge(MIN_SIZE)] | None = None  # longest side, px; never enlarges
     resample: Literal["lanczos", "area", "bicubic"] = "lanczos"
     max_images: Annotated[int, Ge(MIN_IMAGES)] = MAX_IMAGES  # evenly spaced over the sorted names
-    test_every: Annotated[int, Ge(2)] = TEST_EVERY  # every_nth: hold out every so-many-th sorted name
-    split: SplitName = "every_nth"  # what is held out: every test_every-th image, a sector, lists; matched: see `check`
-    train_list: PathName | None = None  # file of names, one a line; null with split=list: train_list.txt
+    # every_nth: hold out every so-many-th sorted name
+    test_every: Annotated[int, Ge(2)] = TEST_EVERY
+    # views held out: every test_every-th image, a sector, lists; matched: see `check`
+    split: SplitName = "every_nth"
+    # file of names, one a line; null with split=list: train_list.txt
+    train_list: PathName | None = None
     test_list: PathName | None = None  # the same; null with split=list: test_list.txt
     sector: NonNegativeInt = 0  # number of the sector that is held out
     sectors: Annotated[int, Ge(2)] = SECTORS  # contiguous parts of the cameras
     match_views: bool = False  # every_nth and sector hold out equally many views
     validation: bool = False  # drop the test views, and measure on views held out of the rest
-    principal_point: Literal["used", "centred"] = "used"  # centred: moved to the image centre, as 3DGS assumes
+    # centred: moved to the image centre, as 3DGS assumes
+    principal_point: Literal["used", "centred"] = "used"
     views: Annotated[int, Interval(ge=3, le=9999)] = 48  # courtyard only, as are the next three
     width: Annotated[int, Interval(ge=MIN_SIZE, le=MAX_SIZE)] = 400
     height: Annotated[int, Interval(ge=MIN_SIZE, le=MAX_SIZE)] = 300
@@ -144,22 +173,31 @@ class SceneConfig:
             self.name = folder_name(self.path)
         check_settings(self, "scene")
         if self.kind != "courtyard" and not self.path:
-            raise InputError("scene.path is not set: say where the capture lies, for example scene.path=/my/photos")
+            raise InputError(
+                "scene.path is not set: say where the capture lies, for example "
+                "scene.path=/my/photos"
+            )
         if self.kind == "courtyard" and self.path:
             raise InputError(
-                f"scene.path={self.path} is not read by the built-in courtyard: add scene=photos (bare photographs), "
+                f"scene.path={self.path} is not read by the built-in courtyard: add scene=photos "
+                "(bare photographs), "
                 "scene=colmap or scene=transforms"
             )
         self.split_rule.check()
         if self.split == "sector" and self.kind == "photos":
             raise InputError(
-                "scene.split=sector needs the cameras, and these photographs came without: give a COLMAP model "
+                "scene.split=sector needs the cameras, and these photographs came without: give a "
+                "COLMAP model "
                 "(scene=colmap)"
             )
         if self.kind == "courtyard" and self.masks is not None:
-            raise InputError("scene.masks: the courtyard's photographs are made here and have none: leave it out")
+            raise InputError(
+                "scene.masks: the courtyard's photographs are made here and have none: leave it out"
+            )
         if self.kind == "courtyard":
-            check_final_size((self.width, self.height), self.downscale, self.max_size, "the courtyard")
+            check_final_size(
+                (self.width, self.height), self.downscale, self.max_size, "the courtyard"
+            )
 
     @property
     def split_rule(self) -> SplitRule:

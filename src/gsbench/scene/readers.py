@@ -14,8 +14,21 @@ from gsbench.normalization import find_normalization
 from gsbench.parsing import without_byte_order_mark
 from gsbench.scene.colmap_files import count_images, model_files
 from gsbench.scene.hold_out import CamerasByName, hold_out, select_images
-from gsbench.scene.images import IMAGE_SUFFIXES, check_picture_names, find_masks, list_images, match_names
-from gsbench.scene.options import EVERY_NTH, MAX_IMAGES, MIN_IMAGES, TEST_LIST, TRAIN_LIST, SplitRule
+from gsbench.scene.images import (
+    IMAGE_SUFFIXES,
+    check_picture_names,
+    find_masks,
+    list_images,
+    match_names,
+)
+from gsbench.scene.options import (
+    EVERY_NTH,
+    MAX_IMAGES,
+    MIN_IMAGES,
+    TEST_LIST,
+    TRAIN_LIST,
+    SplitRule,
+)
 from gsbench.scene.transforms import Transforms
 from gsbench.scene.twins import copies_by_name, copies_of_test_views, report_left_out
 from gsbench.scene.types import Capture
@@ -23,7 +36,8 @@ from gsbench.words import counted, some_of
 
 log = logging.getLogger(__name__)
 
-SPARSE_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0")  # what a message names; see `_find_sparse` for the others
+# names for messages; see `_find_sparse` for the others
+SPARSE_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0")
 
 
 def read_colmap(
@@ -36,13 +50,16 @@ def read_colmap(
     exact_poses: bool = False,
     masks: str | None = None,
 ) -> Capture:
-    """Read a COLMAP folder: ``path/<images>`` (else "images") and ``path/<sparse>`` (else "sparse/0" or "sparse").
+    """Read a COLMAP folder: ``path/<images>`` (else "images") and ``path/<sparse>`` (else
+    "sparse/0" or "sparse").
 
-    The photographs are the files in the folder that have a pose in the model; their extensions may differ from the
-    model's names. `select_images` chooses the ones that are kept, `SplitRule` the ones that are held out. ``masks`` is
-    the folder of the masks below ``path`` (see `gsbench.scene.images.find_masks`).
+    The photographs are the files in the folder that have a pose in the model; their extensions may
+    differ from the model's names. `select_images` chooses the ones that are kept, `SplitRule` the
+    ones that are held out. ``masks`` is the folder of the masks below ``path`` (see
+    `gsbench.scene.images.find_masks`).
 
-    Raises `InputError` if a folder is missing, the model is damaged, or fewer than three photographs are usable.
+    Raises `InputError` if a folder is missing, the model is damaged, or fewer than three
+    photographs are usable.
     """
     # Photographs alone need no pycolmap.
     from gsbench.scene.colmap import camera_centers, read_model, reference_cameras, registered_names
@@ -51,9 +68,13 @@ def read_colmap(
     model_folder, others = _find_sparse(root, sparse)
     if others:
         log.warning(
-            "%s has %s; %s is read because it has the most images (%s); scene.sparse chooses another",
-            root, counted(len(others) + 1, "COLMAP model"), model_folder.relative_to(root), ", ".join(others),
-        )  # fmt: skip
+            "%s has %s; %s is read because it has the most images (%s); scene.sparse chooses "
+            "another",
+            root,
+            counted(len(others) + 1, "COLMAP model"),
+            model_folder.relative_to(root),
+            ", ".join(others),
+        )
     folder = _subfolder(root, images or "images", "scene.images")
     model = read_model(model_folder)
     wanted = registered_names(model)
@@ -62,16 +83,33 @@ def read_colmap(
     missing = [image for image in wanted if image not in matches]
     if missing:
         log.warning(
-            "%s: %d of %d images of the model have no file: %s", folder, len(missing), len(wanted), some_of(missing)
+            "%s: %d of %d images of the model have no file: %s",
+            folder,
+            len(missing),
+            len(wanted),
+            some_of(missing),
         )
     _require_enough(len(matches), folder, f"that the model {model_folder} has a pose for")
     model_names = {file: image for image, file in matches.items()}
     capture = _make_capture(
-        name, folder, sorted(matches.values()), model_folder, exact_poses, max_images, split, root,
-        lambda chosen: reference_cameras(model, [model_names[file] for file in chosen]), mask_folder,
-    )  # fmt: skip
-    # A scene with exact poses is the courtyard, whose units are those of the paper's threshold as they are.
-    return capture if exact_poses else replace(capture, advised_normalization=find_normalization(camera_centers(model)))
+        name,
+        folder,
+        sorted(matches.values()),
+        model_folder,
+        exact_poses,
+        max_images,
+        split,
+        root,
+        lambda chosen: reference_cameras(model, [model_names[file] for file in chosen]),
+        mask_folder,
+    )
+    # A scene with exact poses is the courtyard, whose units are those of the paper's threshold as
+    # they are.
+    return (
+        capture
+        if exact_poses
+        else replace(capture, advised_normalization=find_normalization(camera_centers(model)))
+    )
 
 
 def read_transforms(
@@ -83,11 +121,13 @@ def read_transforms(
     split: SplitRule = EVERY_NTH,
     masks: str | None = None,
 ) -> Capture:
-    """Read the photographs that ``transforms.json`` in ``path`` names, with the cameras in the COLMAP folder ``model``.
+    """Read the photographs that ``transforms.json`` in ``path`` names, with the cameras in the
+    COLMAP folder ``model``.
 
-    ``transforms`` is the content of the file (`gsbench.scene.transforms.read_transforms`), and ``model`` was written
-    from it (`gsbench.scene.colmap.write_frames`). ``split=list`` holds out the views of Blender's file of test views.
-    ``masks`` is the folder of the masks. Raises InputError if the file names masks and no folder was given.
+    ``transforms`` is the content of the file (`gsbench.scene.transforms.read_transforms`), and
+    ``model`` was written from it (`gsbench.scene.colmap.write_frames`). ``split=list`` holds out
+    the views of Blender's file of test views. ``masks`` is the folder of the masks. Raises
+    InputError if the file names masks and no folder was given.
     """
     from gsbench.scene.colmap import read_model, reference_cameras
 
@@ -95,16 +135,29 @@ def read_transforms(
     names = list(transforms.images)
     _require_enough(len(names), root, "that its transforms.json names are")
     if transforms.has_mask_paths and masks is None:
-        raise InputError(f"{transforms.files[0]}: mask_path is not read: give the folder of the masks as scene.masks")
+        raise InputError(
+            f"{transforms.files[0]}: mask_path is not read: give the folder of the masks as "
+            "scene.masks"
+        )
     if transforms.split is not None and not split.asks_the_capture and not split.by_lists:
         log.warning("%s has a split of its own, which scene.split=list takes", transforms.files[0])
     capture = _make_capture(
-        name, root, names, model, False, max_images, split, root,
+        name,
+        root,
+        names,
+        model,
+        False,
+        max_images,
+        split,
+        root,
         lambda chosen: reference_cameras(read_model(model), chosen),
-        None if masks is None else _subfolder(root, masks, "scene.masks"), transforms.split,
-    )  # fmt: skip
+        None if masks is None else _subfolder(root, masks, "scene.masks"),
+        transforms.split,
+    )
     centers = [-rotation.T @ translation for _, rotation, translation in transforms.images.values()]
-    return replace(capture, read_from=transforms.sources, advised_normalization=find_normalization(centers))
+    return replace(
+        capture, read_from=transforms.sources, advised_normalization=find_normalization(centers)
+    )
 
 
 def read_photos(
@@ -115,10 +168,11 @@ def read_photos(
     split: SplitRule = EVERY_NTH,
     masks: str | None = None,
 ) -> Capture:
-    """Read bare photographs: all images in ``path/<images>``, or ``path/images`` if there is one, or ``path``.
+    """Read bare photographs: all images in ``path/<images>``, or ``path/images`` if there is one,
+    or ``path``.
 
-    Sub-folders are read too, except ``masks``, the folder of the masks below ``path``. A COLMAP model beside the
-    photographs is ignored.
+    Sub-folders are read too, except ``masks``, the folder of the masks below ``path``. A COLMAP
+    model beside the photographs is ignored.
 
     Raises `InputError` if the folder is missing or holds fewer than three images.
     """
@@ -128,8 +182,12 @@ def read_photos(
     else:
         folder = root / "images" if (root / "images").is_dir() else root
     mask_folder, names = _masks_and_images(root, folder, masks)
-    _require_enough(len(names), folder, f"({', '.join(sorted(suffix[1:] for suffix in IMAGE_SUFFIXES))})")
-    return _make_capture(name, folder, names, None, False, max_images, split, root, None, mask_folder)
+    _require_enough(
+        len(names), folder, f"({', '.join(sorted(suffix[1:] for suffix in IMAGE_SUFFIXES))})"
+    )
+    return _make_capture(
+        name, folder, names, None, False, max_images, split, root, None, mask_folder
+    )
 
 
 def _masks_and_images(root: Path, folder: Path, masks: str | None) -> tuple[Path | None, list[str]]:
@@ -139,13 +197,21 @@ def _masks_and_images(root: Path, folder: Path, masks: str | None) -> tuple[Path
     mask_folder = _subfolder(root, masks, "scene.masks")
     resolved = mask_folder.resolve()
     if resolved == folder.resolve():
-        raise InputError(f"scene.masks: {mask_folder} is the folder of the images: put the masks into one of their own")
-    images = [name for name in list_images(folder) if not (folder / name).resolve().is_relative_to(resolved)]
+        raise InputError(
+            f"scene.masks: {mask_folder} is the folder of the images: put the masks into one of "
+            "their own"
+        )
+    images = [
+        name
+        for name in list_images(folder)
+        if not (folder / name).resolve().is_relative_to(resolved)
+    ]
     return mask_folder, images
 
 
 def existing_folder(name: str, path: Path | str) -> Path:
-    """The folder ``path`` of the scene ``name``; raises `InputError` if it is not set or does not exist."""
+    """The folder ``path`` of the scene ``name``; raises `InputError` if it is not set or does not
+    exist."""
     if path is None or str(path) == "":
         raise InputError(f"scene {name}: scene.path is not set: give the folder of the photos")
     root = Path(path).expanduser()
@@ -160,7 +226,8 @@ def missing_folder(name: str, root: Path) -> str:
 
 
 def missing_model(name: str, root: Path, sparse: str | None) -> str:
-    """The reason why the folder ``root`` of the scene ``name`` has no COLMAP model, or "" if it has one."""
+    """The reason why the folder ``root`` of the scene ``name`` has no COLMAP model, or "" if it has
+    one."""
     try:
         _find_sparse(root, sparse)
     except InputError as error:
@@ -174,7 +241,8 @@ def fingerprint(
     model_files: Iterable[Path] = (),
     masks: Mapping[str, Path] = MappingProxyType({}),
 ) -> str:
-    """sha256 over the names and contents of images, model files and masks, independent of their folders."""
+    """sha256 over the names and contents of images, model files and masks, independent of their
+    folders."""
     digest = hashlib.sha256()
     entries = [(f"image/{name}", folder / name) for name in sorted(names)]
     entries += [(f"model/{file.name}", file) for file in sorted(model_files)]
@@ -215,7 +283,9 @@ def _make_capture(
     report_left_out(folder, copies, "with the content of a test view")
     kept = tuple(sorted({*held_out.train, *held_out.test} - set(copies)))
     check_picture_names(held_out.test, folder)
-    _require_enough(len(kept), folder, "in the split lists" if split.by_lists else "left by the split")
+    _require_enough(
+        len(kept), folder, "in the split lists" if split.by_lists else "left by the split"
+    )
     masks = {} if mask_folder is None else find_masks(mask_folder, folder, kept)
     return Capture(
         name=name,
@@ -224,7 +294,9 @@ def _make_capture(
         test_names=held_out.test,
         model=model,
         exact_poses=exact_poses,
-        fingerprint=fingerprint(folder, kept, model_files(model) if model is not None else (), masks),
+        fingerprint=fingerprint(
+            folder, kept, model_files(model) if model is not None else (), masks
+        ),
         held_out=held_out.description,
         masks=masks,
         left_out=left_out | copies,
@@ -232,23 +304,29 @@ def _make_capture(
 
 
 def _resolve(wanted: Sequence[str], names: Sequence[str], folder: Path) -> list[str]:
-    """The image files that the names in a split list mean; names may lack an extension or have another one."""
+    """The image files that the names in a split list mean; names may lack an extension or have
+    another one."""
     matches = match_names(wanted, names)
     if unknown := [name for name in wanted if name not in matches]:
         raise InputError(
-            f"the split lists name {some_of(unknown)}, not among the usable images of {folder}: correct the lists"
+            f"the split lists name {some_of(unknown)}, not among the usable images of {folder}: "
+            "correct the lists"
         )
     return sorted(matches.values())
 
 
 def _read_lists(root: Path, split: SplitRule) -> tuple[list[str] | None, list[str] | None]:
-    """The training and the test list; ``split=list`` without file names reads the lists that nerfbaselines writes."""
+    """The training and the test list; ``split=list`` without file names reads the lists that
+    nerfbaselines writes."""
     train, test = split.train_list, split.test_list
     if split.split == "list" and train is None and test is None:
-        train, test = (name if (root / name).is_file() else None for name in (TRAIN_LIST, TEST_LIST))
+        train, test = (
+            name if (root / name).is_file() else None for name in (TRAIN_LIST, TEST_LIST)
+        )
         if train is None and test is None:
             raise InputError(
-                f"scene.split=list: neither {TRAIN_LIST} nor {TEST_LIST} is in {root}: name the files with "
+                f"scene.split=list: neither {TRAIN_LIST} nor {TEST_LIST} is in {root}: name the "
+                "files with "
                 "scene.train_list and scene.test_list"
             )
     return _read_list(root, train, "scene.train_list"), _read_list(root, test, "scene.test_list")
@@ -263,7 +341,9 @@ def _read_list(root: Path, file: str | None, key: str) -> list[str] | None:
         lines = without_byte_order_mark(path.read_bytes()).decode().splitlines()
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
-        raise InputError(f"{key}: {path} cannot be read ({reason}): name a text file of image names") from error
+        raise InputError(
+            f"{key}: {path} cannot be read ({reason}): name a text file of image names"
+        ) from error
     return [line.strip() for line in lines if line.strip() and not line.startswith("#")]
 
 
@@ -272,33 +352,46 @@ def _subfolder(root: Path, folder: str, key: str) -> Path:
     if not path.is_dir():
         existing = sorted(entry.name for entry in root.iterdir() if entry.is_dir())
         raise InputError(
-            f"{path}: no such folder; set {key} to one of: {', '.join(existing) or '(there is no folder)'}"
+            f"{path}: no such folder; set {key} to one of: "
+            f"{', '.join(existing) or '(there is no folder)'}"
         )
     return path
 
 
 def _find_sparse(root: Path, sparse: str | None) -> tuple[Path, list[str]]:
-    """The folder of the COLMAP model, and the others that were found, each with its number of images.
+    """The folder of the COLMAP model, and the others that were found, each with its number of
+    images.
 
-    COLMAP writes a folder sparse/0, sparse/1, … for each part that it could not connect, in no order of size. The model
-    with the most images is taken, and of equal ones the first.
+    COLMAP writes a folder sparse/0, sparse/1, … for each part that it could not connect, in no
+    order of size. The model with the most images is taken, and of equal ones the first.
     """
     if sparse is not None:
         model_files(root / sparse)
         return root / sparse, []
     for parent in (root / "sparse", root / "colmap" / "sparse"):
-        numbered = [folder for folder in parent.glob("*") if folder.name.isdecimal() and folder.is_dir()]
-        found = [folder for folder in (*sorted(numbered, key=lambda path: int(path.name)), parent) if _is_model(folder)]
+        numbered = [
+            folder for folder in parent.glob("*") if folder.name.isdecimal() and folder.is_dir()
+        ]
+        found = [
+            folder
+            for folder in (*sorted(numbered, key=lambda path: int(path.name)), parent)
+            if _is_model(folder)
+        ]
         if len(found) == 1:
             return found[0], []
         if found:
             counts = {folder: count_images(folder) for folder in found}
             largest = max(found, key=counts.__getitem__)
             others = [
-                f"{path.relative_to(root)}: {counted(counts[path], 'image')}" for path in found if path != largest
+                f"{path.relative_to(root)}: {counted(counts[path], 'image')}"
+                for path in found
+                if path != largest
             ]
             return largest, others
-    raise InputError(f"{root}: no COLMAP model in {' or '.join(SPARSE_FOLDERS)}: set scene.sparse, or use scene=photos")
+    raise InputError(
+        f"{root}: no COLMAP model in {' or '.join(SPARSE_FOLDERS)}: set scene.sparse, or use "
+        "scene=photos"
+    )
 
 
 def _is_model(folder: Path) -> bool:
@@ -310,4 +403,6 @@ def _is_model(folder: Path) -> bool:
 
 def _require_enough(count: int, folder: Path, which: str) -> None:
     if count < MIN_IMAGES:
-        raise InputError(f"{folder}: {counted(count, 'image')} {which}, but at least {MIN_IMAGES} are needed")
+        raise InputError(
+            f"{folder}: {counted(count, 'image')} {which}, but at least {MIN_IMAGES} are needed"
+        )

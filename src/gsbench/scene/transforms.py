@@ -1,10 +1,12 @@
-"""Reading ``transforms.json`` of nerfstudio, instant-ngp and Blender, and converting its cameras to COLMAP's form.
+"""Reading ``transforms.json`` of nerfstudio, instant-ngp and Blender, and converting its cameras to
+COLMAP's form.
 
-A ``transform_matrix`` maps camera coordinates to world coordinates, in OpenGL axes (x right, y up, looking along -z).
-Intrinsics have COLMAP's meaning. ``applied_transform`` and ``applied_scale`` were applied to the original data:
-``saved = applied_scale * applied_transform(original)``. Both are undone for cameras and points, so that lengths are
-those of the original data. Sources: nerfstudio's page "Data conventions" and its reader of this format
-(nerfstudio_dataparser.py), the Blender scenes of NeRF (Mildenhall et al. 2020).
+A ``transform_matrix`` maps camera coordinates to world coordinates, in OpenGL axes (x right, y up,
+looking along -z). Intrinsics have COLMAP's meaning. ``applied_transform`` and ``applied_scale``
+were applied to the original data: ``saved = applied_scale * applied_transform(original)``. Both are
+undone for cameras and points, so that lengths are those of the original data. Sources: nerfstudio's
+page "Data conventions" and its reader of this format (nerfstudio_dataparser.py), the Blender scenes
+of NeRF (Mildenhall et al. 2020).
 """
 
 from __future__ import annotations
@@ -42,11 +44,19 @@ Row = Annotated[list[Number], Len(4, 4)]
 Matrix = Annotated[list[Row], Len(3, 4)]  # a fourth row is ignored
 
 ONE_FILE = "transforms.json"
-SPLIT_FILES = {"train": "transforms_train.json", "test": "transforms_test.json", "val": "transforms_val.json"}
+SPLIT_FILES = {
+    "train": "transforms_train.json",
+    "test": "transforms_test.json",
+    "val": "transforms_val.json",
+}
 OPENGL = np.diag([1.0, -1.0, -1.0])  # from OpenCV's camera axes to OpenGL's, and back
-PosedCamera = tuple[CameraModel, Array, Array]  # with the world-to-camera rotation [3, 3] and translation [3]
+# with the world-to-camera rotation [3, 3] and translation [3]
+PosedCamera = tuple[CameraModel, Array, Array]
 ROTATION_TOLERANCE = 1e-3  # largest error of an entry, for matrices written with few digits
-PERSPECTIVE, FISHEYE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"), "OPENCV_FISHEYE"
+PERSPECTIVE, FISHEYE = (
+    ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"),
+    "OPENCV_FISHEYE",
+)
 RATIONAL = "FULL_OPENCV"  # OpenCV's: a polynomial of k1, k2, k3 divided by one of k4, k5, k6
 
 
@@ -102,9 +112,9 @@ class TransformsRecord(Intrinsics):
 class Transforms:
     """Converted content of a folder's files: cameras by image name, their split, and their points.
 
-    ``split`` are the names for training and for testing, or None if one file holds all images. ``points`` is a PLY
-    file; ``applied.undo`` converts its coordinates to those of the cameras. ``has_mask_paths`` says that at least one
-    image names a mask.
+    ``split`` are the names for training and for testing, or None if one file holds all images.
+    ``points`` is a PLY file; ``applied.undo`` converts its coordinates to those of the cameras.
+    ``has_mask_paths`` says that at least one image names a mask.
     """
 
     files: tuple[Path, ...]
@@ -141,10 +151,13 @@ def find_files(folder: Path) -> dict[str, Path]:
     """
     if (folder / ONE_FILE).is_file():
         return {"": folder / ONE_FILE}
-    files = {split: folder / name for split, name in SPLIT_FILES.items() if (folder / name).is_file()}
+    files = {
+        split: folder / name for split, name in SPLIT_FILES.items() if (folder / name).is_file()
+    }
     if "train" not in files:
         raise InputError(
-            f"{folder}: neither {ONE_FILE} nor {SPLIT_FILES['train']} is here: give the folder that holds it, or take "
+            f"{folder}: neither {ONE_FILE} nor {SPLIT_FILES['train']} is here: give the folder "
+            "that holds it, or take "
             "scene=colmap or scene=photos"
         )
     if "test" in files:
@@ -153,7 +166,8 @@ def find_files(folder: Path) -> dict[str, Path]:
 
 
 def read_transforms(folder: Path) -> Transforms:
-    """Read the cameras in ``folder``; raises InputError, one line, for a file that cannot be understood."""
+    """Read the cameras in ``folder``; raises InputError, one line, for a file that cannot be
+    understood."""
     files = find_files(folder)
     records = {split: _read_record(path) for split, path in files.items()}
     find = _FileFinder(folder)
@@ -174,7 +188,11 @@ def read_transforms(folder: Path) -> Transforms:
             names[split].append(name)
         if missing:
             log.warning(
-                "%s: %d of %d images have no file: %s", path, len(missing), len(record.frames), some_of(missing)
+                "%s: %d of %d images have no file: %s",
+                path,
+                len(missing),
+                len(record.frames),
+                some_of(missing),
             )
         if record.ply_file_path is not None:
             points = folder / _relative_path(path, record.ply_file_path)
@@ -193,10 +211,13 @@ def read_transforms(folder: Path) -> Transforms:
 
 
 def _relative_path(path: Path, written: str) -> PurePosixPath:
-    """The path ``written`` in the file ``path``; raises InputError if it leads out of the file's folder."""
+    """The path ``written`` in the file ``path``; raises InputError if it leads out of the file's
+    folder."""
     relative = PurePosixPath(written.replace("\\", "/"))
     if relative.is_absolute() or ".." in relative.parts or PureWindowsPath(written).drive:
-        raise InputError(f"{path}: {written} lies outside the folder of the file: name images relative to it")
+        raise InputError(
+            f"{path}: {written} lies outside the folder of the file: name images relative to it"
+        )
     return relative
 
 
@@ -217,7 +238,8 @@ def names_of(kind: type[Record]) -> frozenset[str]:
 
 
 class _FileFinder:
-    """Finds the image file that ``file_path`` means, as images of COLMAP models are found (`match_names`)."""
+    """Finds the image file that ``file_path`` means, as images of COLMAP models are found
+    (`match_names`)."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -227,7 +249,8 @@ class _FileFinder:
         return list_images(self.folder)
 
     def __call__(self, path: Path, written: str) -> str | None:
-        """The name below the folder, or None if there is no file. Blender's files leave out the extension."""
+        """The name below the folder, or None if there is no file. Blender's files leave out the
+        extension."""
         relative = _relative_path(path, written)
         if relative.suffix.lower() in IMAGE_SUFFIXES and (self.folder / relative).is_file():
             return relative.as_posix()
@@ -237,8 +260,11 @@ class _FileFinder:
             raise InputError(f"{path}: {error}") from error
 
 
-def _named_split(path: Path, record: TransformsRecord, images: Collection[str]) -> tuple[list[str], list[str]] | None:
-    """nerfstudio's lists of names: those to train on, and those to test on or else to validate on."""
+def _named_split(
+    path: Path, record: TransformsRecord, images: Collection[str]
+) -> tuple[list[str], list[str]] | None:
+    """nerfstudio's lists of names: those to train on, and those to test on or else to validate
+    on."""
     train, val, test = record.train_filenames, record.val_filenames, record.test_filenames
     held_out = val if test is None else test
     if held_out is None:
@@ -249,10 +275,16 @@ def _named_split(path: Path, record: TransformsRecord, images: Collection[str]) 
         wanted = [_relative_path(path, name).as_posix() for name in listed]
         matches = match_names(wanted, images)
         if missing := [name for name in wanted if name not in matches]:
-            raise InputError(f"{path}: its {which} filenames name {some_of(missing)}, which is no frame with a file")
+            raise InputError(
+                f"{path}: its {which} filenames name {some_of(missing)}, which is no frame with a "
+                "file"
+            )
         chosen[which] = set(matches.values())
     if both := sorted(chosen["train"] & chosen["held-out"]):
-        raise InputError(f"{path}: {some_of(both)} would be trained and tested on: correct its lists of filenames")
+        raise InputError(
+            f"{path}: {some_of(both)} would be trained and tested on: correct its lists of "
+            "filenames"
+        )
     kept = chosen["train"] if train is not None else set(images) - chosen["held-out"]
     return sorted(kept), sorted(chosen["held-out"])
 
@@ -264,11 +296,14 @@ def _applied_transform(path: Path, record: TransformsRecord) -> AppliedTransform
     if record.applied_transform is None:
         return AppliedTransform(scale=scale)
     matrix = np.array(record.applied_transform[:3])  # [3, 4]
-    return AppliedTransform(nearest_rotation(matrix[:, :3], f"{path}: applied_transform"), matrix[:, 3], scale)
+    return AppliedTransform(
+        nearest_rotation(matrix[:, :3], f"{path}: applied_transform"), matrix[:, 3], scale
+    )
 
 
 def nearest_rotation(matrix: Array, what: str) -> Array:
-    """The rotation nearest to ``matrix`` [3, 3]; raises InputError if ``matrix`` is far from a rotation."""
+    """The rotation nearest to ``matrix`` [3, 3]; raises InputError if ``matrix`` is far from a
+    rotation."""
     left, _, right = np.linalg.svd(matrix)
     nearest: Array = left @ right
     if np.abs(nearest - matrix).max() > ROTATION_TOLERANCE or np.linalg.det(matrix) < 0.0:
@@ -302,10 +337,14 @@ def _camera(image: Path, path: Path, record: TransformsRecord, frame: FrameRecor
     focal_x = _focal_length(width, value("fl_x"), value("camera_angle_x"), value("x_fov"))
     focal_y = _focal_length(height, value("fl_y"), value("camera_angle_y"), value("y_fov"))
     # Pixels are square if only one of both is given, as in instant-ngp and nerfstudio.
-    focal_x, focal_y = focal_y if focal_x is None else focal_x, focal_x if focal_y is None else focal_y
+    focal_x, focal_y = (
+        focal_y if focal_x is None else focal_x,
+        focal_x if focal_y is None else focal_y,
+    )
     if focal_x is None or focal_y is None or min(focal_x, focal_y) <= 0.0:
         raise InputError(
-            f"{where}: no focal length: fl_x, camera_angle_x (between 0 and pi) or x_fov (between 0 and 180) must be "
+            f"{where}: no focal length: fl_x, camera_angle_x (between 0 and pi) or x_fov (between "
+            "0 and 180) must be "
             "given, or the same for y"
         )
     cx, cy = value("cx"), value("cy")
@@ -314,34 +353,48 @@ def _camera(image: Path, path: Path, record: TransformsRecord, frame: FrameRecor
     return CameraModel(model, int(width), int(height), (focal_x, focal_y, *center, *distortion))
 
 
-def _distortion(where: str, record: TransformsRecord, frame: FrameRecord) -> tuple[str, tuple[float, ...]]:
+def _distortion(
+    where: str, record: TransformsRecord, frame: FrameRecord
+) -> tuple[str, tuple[float, ...]]:
     """COLMAP's name of the camera model, and its parameters after the principal point."""
     names = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
     # A frame with a coefficient of its own uses none of the file's.
     own = any(getattr(frame, name) is not None for name in names)
-    k1, k2, k3, k4, k5, k6, p1, p2 = (getattr(frame if own else record, name) or 0.0 for name in names)
+    k1, k2, k3, k4, k5, k6, p1, p2 = (
+        getattr(frame if own else record, name) or 0.0 for name in names
+    )
     fisheye = record.is_fisheye if frame.is_fisheye is None else frame.is_fisheye
     model = frame.camera_model or record.camera_model or (FISHEYE if fisheye else "OPENCV")
     if model == FISHEYE:
         if any((k5, k6, p1, p2)):
-            raise InputError(f"{where}: {FISHEYE} has k1 to k4 alone, but k5, k6, p1 or p2 is not 0")
+            raise InputError(
+                f"{where}: {FISHEYE} has k1 to k4 alone, but k5, k6, p1 or p2 is not 0"
+            )
         return model, (k1, k2, k3, k4)
     if model == RATIONAL:
         return model, (k1, k2, p1, p2, k3, k4, k5, k6)
     if model not in PERSPECTIVE:
         raise InputError(
-            f"{where}: camera_model {model} is not known here ({', '.join((*PERSPECTIVE, RATIONAL, FISHEYE))})"
+            f"{where}: camera_model {model} is not known here "
+            f"({', '.join((*PERSPECTIVE, RATIONAL, FISHEYE))})"
         )
-    # k4 is a coefficient of r^8 in nerfstudio and Metashape, but a divisor in OpenCV; only RATIONAL says which.
+    # k4 is a coefficient of r^8 in nerfstudio and Metashape, but a divisor in OpenCV; only RATIONAL
+    # says which.
     if any((k4, k5, k6)):
-        raise InputError(f"{where}: k4, k5 and k6 are read of {FISHEYE} and {RATIONAL} alone: make a COLMAP model")
+        raise InputError(
+            f"{where}: k4, k5 and k6 are read of {FISHEYE} and {RATIONAL} alone: make a COLMAP "
+            "model"
+        )
     if k3:
         return RATIONAL, (k1, k2, p1, p2, k3, 0.0, 0.0, 0.0)
     return ("OPENCV", (k1, k2, p1, p2)) if any((k1, k2, p1, p2)) else ("PINHOLE", ())
 
 
-def _focal_length(side: float, given: float | None, angle: float | None, degrees: float | None) -> float | None:
-    """The focal length in px along a side in px: as given, else from the field of view in radians or degrees.
+def _focal_length(
+    side: float, given: float | None, angle: float | None, degrees: float | None
+) -> float | None:
+    """The focal length in px along a side in px: as given, else from the field of view in radians
+    or degrees.
 
     None if nothing is given, and 0 for a field of view that is none.
     """

@@ -1,7 +1,9 @@
-"""The keys of ``transforms.json`` that other programs write, and what becomes of those that gsbench does not use.
+"""The keys of ``transforms.json`` that other programs write, and what becomes of those that gsbench
+does not use.
 
-Sources: nerfstudio's page "Data conventions" and its reader; instant-ngp's page "Tips for training NeRF models" and its
-loader (nerf_loader.cu), whose keys most exporters write (Metashape, Polycam and others).
+Sources: nerfstudio's page "Data conventions" and its reader; instant-ngp's page "Tips for training
+NeRF models" and its loader (nerf_loader.cu), whose keys most exporters write (Metashape, Polycam
+and others).
 """
 
 from __future__ import annotations
@@ -16,23 +18,42 @@ from gsbench.words import counted
 
 log = logging.getLogger(__name__)
 
-# Keys that change no photograph, camera or initial point: how another program frames, thins or samples the scene.
-# The box, axes and scale in which instant-ngp and nerfstudio train; gsbench keeps the coordinates of the file.
+# Keys that change no photograph, camera or initial point: how another program frames, thins or
+# samples the scene. The box, axes and scale in which instant-ngp and nerfstudio train; gsbench
+# keeps the coordinates of the file.
 BOX = ("aabb", "aabb_scale", "render_aabb", "near", "far")
 AXES = ("scale", "offset", "up", "from_na", "orientation_override")
 # Data besides photographs, which gsbench does not train on.
-DEPTH = ("depth_file_path", "depth_path", "integer_depth_scale", "enable_depth_loading", "depth_unit_scale_factor")
+DEPTH = (
+    "depth_file_path",
+    "depth_path",
+    "integer_depth_scale",
+    "enable_depth_loading",
+    "depth_unit_scale_factor",
+)
 OTHER_DATA = ("enable_ray_loading", "normal_file_path", "envmap")
 # `black_transparent` makes black pixels transparent, which lie over black.
 TRAINING = ("importance_sampling", "n_extra_learnable_dims", "black_transparent")
-NOTES = ("sharpness", "blur_score", "colmap_im_id", "camera_id", "rotation", "timestamp", "camera_label")
+NOTES = (
+    "sharpness",
+    "blur_score",
+    "colmap_im_id",
+    "camera_id",
+    "rotation",
+    "timestamp",
+    "camera_label",
+)
 HARMLESS = frozenset((*BOX, *AXES, *DEPTH, *OTHER_DATA, *TRAINING, *NOTES))
-# Keys that change pixels, cameras or the choice of frames, and why a file that uses them is refused.
+# Keys that change pixels, cameras or the choice of frames, and why a file that uses them is
+# refused.
 REFUSED = {
     "rolling_shutter": "photographs with a rolling shutter have no single pose",
     "transform_matrix_start": "a frame that moves has no single pose",
     "transform_matrix_end": "a frame that moves has no single pose",
-    **dict.fromkeys(("ftheta_p0", "ftheta_p1", "ftheta_p2", "ftheta_p3", "ftheta_p4"), "the F-theta lens is not known"),
+    **dict.fromkeys(
+        ("ftheta_p0", "ftheta_p1", "ftheta_p2", "ftheta_p3", "ftheta_p4"),
+        "the F-theta lens is not known",
+    ),
     "latlong": "a panorama is no pinhole image",
     "equirectangular": "a panorama is no pinhole image",
     **dict.fromkeys(("s1", "s2", "s3", "s4"), "thin-prism distortion is not read"),
@@ -46,15 +67,22 @@ REFUSED = {
 }
 
 
-def check_keys(path: Path, document: Any, file_keys: Collection[str], frame_keys: Collection[str]) -> None:
-    """Look at all keys of the parsed file ``path`` that are not in ``file_keys`` and, for frames, ``frame_keys``.
+def check_keys(
+    path: Path, document: Any, file_keys: Collection[str], frame_keys: Collection[str]
+) -> None:
+    """Look at all keys of the parsed file ``path`` that are not in ``file_keys`` and, for frames,
+    ``frame_keys``.
 
-    Raises InputError for a key of `REFUSED` whose value says something. Logs one line that names unknown keys.
+    Raises InputError for a key of `REFUSED` whose value says something. Logs one line that names
+    unknown keys.
     """
     unknown: set[str] = set()
     for place, record, used in (
         ("", document, file_keys),
-        *((f" (frame {number})", frame, frame_keys) for number, frame in enumerate(document["frames"])),
+        *(
+            (f" (frame {number})", frame, frame_keys)
+            for number, frame in enumerate(document["frames"])
+        ),
     ):
         for key, value in record.items():
             if key in REFUSED and says_something(key, value):
@@ -62,11 +90,17 @@ def check_keys(path: Path, document: Any, file_keys: Collection[str], frame_keys
             if key not in used and key not in HARMLESS and key not in REFUSED:
                 unknown.add(key)
     if unknown:
-        log.warning("%s: %s not known and not used: %s", path, _are(len(unknown)), ", ".join(sorted(unknown)))
+        log.warning(
+            "%s: %s not known and not used: %s",
+            path,
+            _are(len(unknown)),
+            ", ".join(sorted(unknown)),
+        )
 
 
 def says_something(key: str, value: Any) -> bool:
-    """Return whether a value asks for more than its absence: not null, false, empty, zero or a list of zeros."""
+    """Return whether a value asks for more than its absence: not null, false, empty, zero or a list
+    of zeros."""
     if key.startswith("transform_matrix"):
         return value is not None
     if isinstance(value, list):

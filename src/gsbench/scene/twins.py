@@ -1,7 +1,8 @@
-"""Photographs that a capture has twice: copies by name, by content and by pixels, and views that look nearly the same.
+"""Photographs that a capture has twice: copies by name, by content and by pixels, and views that
+look nearly the same.
 
-A test view whose copy is trained on measures memory, so copies of test views are left out of training. Near twins, such
-as the next shot of a burst, are used and reported.
+A test view whose copy is trained on measures memory, so copies of test views are left out of
+training. Near twins, such as the next shot of a burst, are used and reported.
 """
 
 import logging
@@ -22,13 +23,15 @@ from gsbench.words import counted, some_of
 
 log = logging.getLogger(__name__)
 
-# Formats in the order of preference between equally frequent ones: a JPEG usually has a focal length in its EXIF data.
+# Formats in the order of preference between equally frequent ones: a JPEG usually has a focal
+# length in its EXIF data.
 FORMATS = (".jpg", ".png", ".tif", ".webp", ".bmp")
 SAME_FORMAT = {".jpeg": ".jpg", ".tiff": ".tif"}
 
-# Near twins are compared as grey pictures with a longest side of 32 px. In 16 captures, a second shot that is moved by
-# half a percent of its width correlates by at least .978 with the first, and one that is encoded again by over .99.
-# Between neighbours of ordinary captures the median is .25 to .92.
+# Near twins are compared as grey pictures with a longest side of 32 px. In 16 captures, a second
+# shot that is moved by half a percent of its width correlates by at least .978 with the first, and
+# one that is encoded again by over .99. Between neighbours of ordinary captures the median is .25
+# to .92.
 GRID = 32  # px
 NEAR = 0.975  # correlation
 LEAST_CELLS = 64  # of a small picture, that both masks count; fewer say nothing
@@ -36,10 +39,11 @@ LEAST_DEVIATION = 1.0  # of 255 grey values: smaller pictures of less have no co
 
 
 def copies_by_name(names: Sequence[str], wanted: Collection[str] = ()) -> dict[str, str]:
-    """Map each photograph whose path differs from another's in the extension alone to the one that is used instead.
+    """Map each photograph whose path differs from another's in the extension alone to the one that
+    is used instead.
 
-    A name in ``wanted`` is used first; then the format that more of the ``names`` have, so that a folder which has
-    all photographs in one format is read in that format; then a JPEG.
+    A name in ``wanted`` is used first; then the format that more of the ``names`` have, so that a
+    folder which has all photographs in one format is read in that format; then a JPEG.
 
     Examples:
         >>> copies_by_name(["a.jpg", "a.png", "b.jpg"])
@@ -82,16 +86,25 @@ def copies_of_test_views(folder: Path, train: Sequence[str], test: Sequence[str]
 
 
 def report_left_out(folder: Path, left_out: Mapping[str, str], why: str) -> None:
-    """Write one line on photographs that are left out; ``left_out`` maps each to the one that it copies."""
+    """Write one line on photographs that are left out; ``left_out`` maps each to the one that it
+    copies."""
     if left_out:
         pairs = [f"{name} ({other} is used)" for name, other in left_out.items()]
-        log.warning("%s: %s left out, %s: %s", folder, counted(len(left_out), "photograph"), why, some_of(pairs))
+        log.warning(
+            "%s: %s left out, %s: %s",
+            folder,
+            counted(len(left_out), "photograph"),
+            why,
+            some_of(pairs),
+        )
 
 
 def without_copies(scene: Scene) -> Scene:
-    """The scene without training views that have the same pixels as a test view, and with its near twins noted.
+    """The scene without training views that have the same pixels as a test view, and with its near
+    twins noted.
 
-    Pixels are compared at their final size, where both masks count. Raises InputError if no training view is left.
+    Pixels are compared at their final size, where both masks count. Raises InputError if no
+    training view is left.
     """
     small = {view.name: small_picture(view) for view in (*scene.train, *scene.test)}
     equal: dict[str, str] = {}
@@ -114,19 +127,27 @@ def without_copies(scene: Scene) -> Scene:
     if near:
         pairs = some_of([f"{name} ({twin})" for name, twin in near.items()])
         log.warning(
-            "%s: %d of %d test views have a near twin in training: %s", scene.name, len(near), len(scene.test), pairs
+            "%s: %d of %d test views have a near twin in training: %s",
+            scene.name,
+            len(near),
+            len(scene.test),
+            pairs,
         )
     train = tuple(view for view in scene.train if view.name not in equal)
     if not train:
-        raise InputError(f"scene {scene.name}: all training views are copies of test views: change the split")
+        raise InputError(
+            f"scene {scene.name}: all training views are copies of test views: change the split"
+        )
     return replace(scene, train=train, twins=Twins(left_out=equal, near=near))
 
 
-SmallPicture = tuple[NDArray[np.float64], NDArray[np.bool_], tuple[int, int]]  # grey, counted cells, size of the view
+# grey, counted cells, size of the view
+SmallPicture = tuple[NDArray[np.float64], NDArray[np.bool_], tuple[int, int]]
 
 
 def small_picture(view: View) -> SmallPicture:
-    """The view as a small grey picture, the cells that its mask counts, and its own (width, height) in px."""
+    """The view as a small grey picture, the cells that its mask counts, and its own (width, height)
+    in px."""
     height, width = view.image.shape[:2]
     scale = GRID / max(width, height)
     size = (max(1, round(width * scale)), max(1, round(height * scale)))
@@ -136,9 +157,11 @@ def small_picture(view: View) -> SmallPicture:
 
 
 def likeness(one: SmallPicture, other: SmallPicture) -> float:
-    """The correlation of two small pictures where both count; -1 for another shape, NaN where too little counts.
+    """The correlation of two small pictures where both count; -1 for another shape, NaN where too
+    little counts.
 
-    A correlation ignores brightness and contrast, which a camera's exposure changes between two shots.
+    A correlation ignores brightness and contrast, which a camera's exposure changes between two
+    shots.
     """
     if one[0].shape != other[0].shape or not same_up_to_rounding(one[2], other[2]):
         return -1.0
@@ -152,7 +175,8 @@ def likeness(one: SmallPicture, other: SmallPicture) -> float:
 
 
 def same_pixels(one: View, other: View) -> bool:
-    """Return whether two views have the same pixels where both count; False if there is no such pixel."""
+    """Return whether two views have the same pixels where both count; False if there is no such
+    pixel."""
     if one.image.shape != other.image.shape:
         return False
     both = np.ones(one.image.shape[:2], bool)

@@ -1,6 +1,8 @@
-"""Types of a scene: a `Camera`, a `Capture` of photographs before initialisation, and a `Scene` of views with cameras.
+"""Types of a scene: a `Camera`, a `Capture` of photographs before initialisation, and a `Scene` of
+views with cameras.
 
-Also measures of cameras: the scene extent, and the distance of test cameras from the training cameras.
+Also measures of cameras: the scene extent, and the distance of test cameras from the training
+cameras.
 """
 
 from __future__ import annotations
@@ -17,7 +19,8 @@ from gsbench.normalization import IDENTITY, Normalization
 
 Array = NDArray[np.float64]
 
-EXTENT_MARGIN = 1.1  # 3DGS: cameras_extent = 1.1 x the largest distance of a training camera to their mean
+# 3DGS: cameras_extent = 1.1 x the largest distance of a training camera to their mean
+EXTENT_MARGIN = 1.1
 PINHOLE_NAMES = ("SIMPLE_PINHOLE", "PINHOLE")
 
 
@@ -25,9 +28,10 @@ PINHOLE_NAMES = ("SIMPLE_PINHOLE", "PINHOLE")
 class Camera:
     """A pinhole camera in OpenCV axes (x right, y down, z forward).
 
-    ``fx, fy, cx, cy`` are in pixels, in COLMAP's convention: the centre of the first pixel is (0.5, 0.5), so a centred
-    principal point is ``cx = width / 2``. ``rotation`` [3, 3] and ``translation`` [3] map a world point to camera
-    coordinates: ``x_camera = rotation @ x_world + translation`` (float64).
+    ``fx, fy, cx, cy`` are in pixels, in COLMAP's convention: the centre of the first pixel is (0.5,
+    0.5), so a centred principal point is ``cx = width / 2``. ``rotation`` [3, 3] and
+    ``translation`` [3] map a world point to camera coordinates: ``x_camera = rotation @ x_world +
+    translation`` (float64).
     """
 
     width: int
@@ -41,9 +45,13 @@ class Camera:
 
     def __post_init__(self) -> None:
         if self.width < 1 or self.height < 1:
-            raise ValueError(f"camera: width and height must be at least 1 px, got {self.width}x{self.height}")
+            raise ValueError(
+                f"camera: width and height must be at least 1 px, got {self.width}x{self.height}"
+            )
         if not (np.isfinite(self.fx) and np.isfinite(self.fy) and self.fx > 0 and self.fy > 0):
-            raise ValueError(f"camera: fx and fy must be finite and positive, got fx={self.fx}, fy={self.fy}")
+            raise ValueError(
+                f"camera: fx and fy must be finite and positive, got fx={self.fx}, fy={self.fy}"
+            )
         if not (np.isfinite(self.cx) and np.isfinite(self.cy)):
             raise ValueError(f"camera: cx and cy must be finite, got cx={self.cx}, cy={self.cy}")
         rotation = np.asarray(self.rotation, dtype=np.float64)
@@ -70,13 +78,20 @@ class Camera:
         """The same camera for the same image at another size in pixels."""
         sx, sy = width / self.width, height / self.height
         return replace(
-            self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy
+            self,
+            width=width,
+            height=height,
+            fx=self.fx * sx,
+            fy=self.fy * sy,
+            cx=self.cx * sx,
+            cy=self.cy * sy,
         )
 
 
 @dataclass(frozen=True)
 class CameraModel:
-    """A COLMAP camera as plain values: the model's name, the size in px, and the parameters in COLMAP's order."""
+    """A COLMAP camera as plain values: the model's name, the size in px, and the parameters in
+    COLMAP's order."""
 
     name: str
     width: int
@@ -90,7 +105,9 @@ class CameraModel:
 
 def to_pinhole(camera: CameraModel) -> Camera:
     """Convert an undistorted COLMAP camera to a `Camera` at the origin."""
-    fx, fy, cx, cy = camera.params if camera.name == "PINHOLE" else (camera.params[0], *camera.params)
+    fx, fy, cx, cy = (
+        camera.params if camera.name == "PINHOLE" else (camera.params[0], *camera.params)
+    )
     return Camera(camera.width, camera.height, fx, fy, cx, cy, np.eye(3), np.zeros(3))
 
 
@@ -98,8 +115,8 @@ def to_pinhole(camera: CameraModel) -> Camera:
 class Twins:
     """Photographs that occur twice (`gsbench.scene.twins`).
 
-    ``left_out`` maps each photograph that is not used to the one that it copies. ``near`` maps a test view to the
-    training view that looks nearly the same, and is used.
+    ``left_out`` maps each photograph that is not used to the one that it copies. ``near`` maps a
+    test view to the training view that looks nearly the same, and is used.
     """
 
     left_out: Mapping[str, str] = field(default_factory=dict)
@@ -110,15 +127,17 @@ class Twins:
 class Capture:
     """Photographs on disk, and the cameras that came with them, if any.
 
-    ``images`` is the folder, ``image_names`` are the selected files in it (relative, sorted), and ``test_names`` are
-    the held-out ones. ``held_out`` describes in words how they were chosen. ``model`` is a COLMAP sparse folder with
-    reference cameras, or None for bare photographs; ``exact_poses`` says that its poses are the truth (a procedural
-    scene), not an estimate. ``masks`` are mask files by image name; it is empty if every pixel counts. ``fingerprint``
-    is a sha256 over names and contents of the selected images, their masks and the model. ``read_from`` are further
-    files of the user that the cameras were read from. ``advised_normalization`` maps the given coordinates to those in
-    which the scene should be trained (`gsbench.scene.colmap.normalize_capture`). ``normalization`` is the map that was
-    applied to ``model`` already. ``left_out`` maps each photograph that is left out, since another
-    has its name or content, to that other.
+    ``images`` is the folder, ``image_names`` are the selected files in it (relative, sorted), and
+    ``test_names`` are the held-out ones. ``held_out`` describes in words how they were chosen.
+    ``model`` is a COLMAP sparse folder with reference cameras, or None for bare photographs;
+    ``exact_poses`` says that its poses are the truth (a procedural scene), not an estimate.
+    ``masks`` are mask files by image name; it is empty if every pixel counts. ``fingerprint`` is a
+    sha256 over names and contents of the selected images, their masks and the model. ``read_from``
+    are further files of the user that the cameras were read from. ``advised_normalization`` maps
+    the given coordinates to those in which the scene should be trained
+    (`gsbench.scene.colmap.normalize_capture`). ``normalization`` is the map that was applied to
+    ``model`` already. ``left_out`` maps each photograph that is left out, since another has its
+    name or content, to that other.
     """
 
     name: str
@@ -145,8 +164,8 @@ class Capture:
 class View:
     """One photograph with its camera; ``image`` is [H, W, 3] uint8, sRGB.
 
-    ``mask`` [H, W] is True where a pixel counts, or None if all pixels count. Ignored pixels hold the colours made by
-    `gsbench.scene.images.fill_ignored`.
+    ``mask`` [H, W] is True where a pixel counts, or None if all pixels count. Ignored pixels hold
+    the colours made by `gsbench.scene.images.fill_ignored`.
     """
 
     name: str
@@ -176,12 +195,14 @@ class Scene:
 
 
 def extent_of_centers(centers: NDArray[np.float64]) -> float:
-    """1.1 x the largest distance of a camera centre [V, 3] from their mean, in world units (3DGS's getNerfppNorm)."""
+    """1.1 x the largest distance of a camera centre [V, 3] from their mean, in world units (3DGS's
+    getNerfppNorm)."""
     return float(EXTENT_MARGIN * np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
 
 
 ANGLE, DISTANCE = "angle_to_nearest", "distance_to_nearest"
-COUNTED = "counted"  # the share of a view's pixels that its mask does not ignore; only for views with masks
+# the share of a view's pixels that its mask does not ignore; only for views with masks
+COUNTED = "counted"
 
 
 def angles_between(directions: Array, references: Array) -> Array:
@@ -194,19 +215,25 @@ def angles_between(directions: Array, references: Array) -> Array:
 def nearest_training_cameras(
     cameras: Sequence[Camera], training: Sequence[Camera], extent: float
 ) -> list[dict[str, float]]:
-    """Measure how far each camera is from the training camera nearest in angle, and from the one nearest in position.
+    """Measure how far each camera is from the training camera nearest in angle, and from the one
+    nearest in position.
 
-    ``angle_to_nearest`` is the smallest angle between the viewing directions, in degrees. ``distance_to_nearest`` is
-    the smallest distance between the centres, in scene extents; it is left out if the extent is 0.
+    ``angle_to_nearest`` is the smallest angle between the viewing directions, in degrees.
+    ``distance_to_nearest`` is the smallest distance between the centres, in scene extents; it is
+    left out if the extent is 0.
     """
     if not cameras or not training:
         return [{} for _ in cameras]
     directions, training_directions = (
         np.array([camera.rotation[2] for camera in group]) for group in (cameras, training)
     )
-    centers, training_centers = (np.array([camera.center for camera in group]) for group in (cameras, training))
+    centers, training_centers = (
+        np.array([camera.center for camera in group]) for group in (cameras, training)
+    )
     angles = angles_between(directions, training_directions).min(axis=1)  # [V]
-    distances = np.linalg.norm(centers[:, None] - training_centers[None], axis=-1).min(axis=1)  # [V]
+    distances = np.linalg.norm(centers[:, None] - training_centers[None], axis=-1).min(
+        axis=1
+    )  # [V]
     measured = []
     for angle, distance in zip(angles, distances, strict=True):
         values = {ANGLE: float(angle)}

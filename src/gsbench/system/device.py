@@ -8,20 +8,29 @@ from gsbench.errors import InputError
 def select_device(name: str, setting: str = "device") -> torch.device:
     """Return the device called ``name``; ``auto`` is the GPU if torch can use one, else the CPU.
 
-    On a GPU, float32 is then not rounded to TF32 (`disable_tf32`). Raises InputError, which names the ``setting``, for
-    a device that is not there or that another program holds.
+    On a GPU, float32 is then not rounded to TF32 (`disable_tf32`). Raises InputError, which names
+    the ``setting``, for a device that is not there or that another program holds.
     """
     available = "cuda" if torch.cuda.is_available() else "cpu"
     try:
         device = torch.device(available if name == "auto" else name)
     except RuntimeError as error:
-        raise InputError(f"{setting}={name} is not known to torch; use auto, cpu, cuda or cuda:1") from error
+        raise InputError(
+            f"{setting}={name} is not known to torch; use auto, cpu, cuda or cuda:1"
+        ) from error
     if device.type == "cuda" and not torch.cuda.is_available():
         raise InputError(
-            f"{setting}={name}: torch finds no CUDA device here; use {setting}=cpu, or install torch for CUDA"
+            f"{setting}={name}: torch finds no CUDA device here; use {setting}=cpu, or install "
+            "torch for CUDA"
         )
-    if device.type == "cuda" and device.index is not None and device.index >= torch.cuda.device_count():
-        raise InputError(f"{setting}={name}: there are {torch.cuda.device_count()} CUDA devices, numbered from 0")
+    if (
+        device.type == "cuda"
+        and device.index is not None
+        and device.index >= torch.cuda.device_count()
+    ):
+        raise InputError(
+            f"{setting}={name}: there are {torch.cuda.device_count()} CUDA devices, numbered from 0"
+        )
     if device.type == "cuda":
         disable_tf32()
         try:
@@ -35,10 +44,11 @@ def select_device(name: str, setting: str = "device") -> torch.device:
 
 
 def disable_tf32() -> None:
-    """Make GPUs compute float32 without rounding to TF32 in the whole process, also in backward passes.
+    """Make GPUs compute float32 without rounding to TF32 in the whole process, also in backward
+    passes.
 
-    By default torch lets cuDNN's convolutions round to TF32, which has 10 bits. SSIM subtracts nearly equal moments:
-    with TF32 its map had errors of up to 350, and its gradient was noise.
+    By default torch lets cuDNN's convolutions round to TF32, which has 10 bits. SSIM subtracts
+    nearly equal moments: with TF32 its map had errors of up to 350, and its gradient was noise.
     """
     torch.backends.cudnn.allow_tf32 = False
     torch.backends.cuda.matmul.allow_tf32 = False

@@ -1,4 +1,5 @@
-"""The installation of gsbench: its folder, the command that installs extras, and its state in git."""
+"""The installation of gsbench: its folder, the command that installs extras, and its state in
+git."""
 
 import json
 import os
@@ -17,7 +18,8 @@ DISTRIBUTION = "gsbench-3dgs"  # the name on the package index, where "gsbench" 
 
 
 def install_command(extra: str = "") -> str:
-    """The shell command that installs gsbench with an extra such as ``view``, from the place it was installed from."""
+    """The shell command that installs gsbench with an extra such as ``view``, from the place it was
+    installed from."""
     extras = f"[{extra}]" if extra else ""
     root = checkout()
     if root is None:
@@ -26,7 +28,8 @@ def install_command(extra: str = "") -> str:
 
 
 def installed_from() -> Path | None:
-    """The folder that pip installed gsbench from, by pip's record (PEP 610); None for a package index."""
+    """The folder that pip installed gsbench from, by pip's record (PEP 610); None for a package
+    index."""
     try:
         record = distribution(DISTRIBUTION).read_text("direct_url.json")
     except PackageNotFoundError:
@@ -37,9 +40,14 @@ def installed_from() -> Path | None:
 
 
 def checkout() -> Path | None:
-    """The folder of the source checkout that gsbench runs from; None if it was installed as a wheel."""
+    """The folder of the source checkout that gsbench runs from; None if it was installed as a
+    wheel."""
     root = Path(__file__).resolve().parents[3]
-    return root if (root / "pyproject.toml").is_file() and (root / "src" / "gsbench").is_dir() else None
+    return (
+        root
+        if (root / "pyproject.toml").is_file() and (root / "src" / "gsbench").is_dir()
+        else None
+    )
 
 
 def version_of(package: str) -> str | None:
@@ -59,7 +67,8 @@ def conf_dir() -> Path:
 
 SECONDS_FOR_GIT = 10
 SECONDS_FOR_A_TREE = 300
-# gsbench may run in a git hook, whose environment names the repository of the hook by these variables.
+# gsbench may run in a git hook, whose environment names the repository of the hook by these
+# variables.
 REPOSITORY_VARIABLES = (
     "GIT_DIR",
     "GIT_WORK_TREE",
@@ -73,7 +82,8 @@ SAFE_SETTINGS = ("core.fsmonitor=false", f"core.hooksPath={os.devnull}", "protoc
 
 
 def checkout_of(folder: Path, tracked: str) -> dict[str, Any]:
-    """The ``commit`` of the checkout that contains ``folder``, and whether it is ``edited``: None if that is unknown.
+    """The ``commit`` of the checkout that contains ``folder``, and whether it is ``edited``: None
+    if that is unknown.
 
     Empty if there is no checkout, or if git does not track the file ``tracked``.
     """
@@ -82,20 +92,25 @@ def checkout_of(folder: Path, tracked: str) -> dict[str, Any]:
         return {}
     changes = None
     if not _has_filters(folder):
-        changes = _git(folder, "status", "--porcelain", "--untracked-files=no", "--ignore-submodules=all")
+        changes = _git(
+            folder, "status", "--porcelain", "--untracked-files=no", "--ignore-submodules=all"
+        )
     return {"commit": commit, "edited": None if changes is None else bool(changes)}
 
 
 @cache
 def own_checkout() -> dict[str, Any]:
-    """The commit of gsbench's own checkout, and whether tracked files had changed; empty if it is no checkout."""
+    """The commit of gsbench's own checkout, and whether tracked files had changed; empty if it is
+    no checkout."""
     return checkout_of(Path(__file__).parent, Path(__file__).name)
 
 
 def _has_filters(folder: Path) -> bool:
-    """Return whether the repository names programs (filters) that git would run to compare files, or may do so.
+    """Return whether the repository names programs (filters) that git would run to compare files,
+    or may do so.
 
-    A capture from a stranger may be a repository. Filters of the user's own configuration do not count.
+    A capture from a stranger may be a repository. Filters of the user's own configuration do not
+    count.
     """
     listed = _git(folder, "config", "--list", "--show-scope", "--name-only")
     if listed is None:
@@ -104,24 +119,31 @@ def _has_filters(folder: Path) -> bool:
 
 
 class WorkTrees:
-    """Work trees of commits of the repository that contains ``folder``, made below the empty folder ``place``.
+    """Work trees of commits of the repository that contains ``folder``, made below the empty folder
+    ``place``.
 
-    They belong to a new repository that shares the objects. So the user's checkout and its list of work trees do not
-    change, and no hook, filter or other program of the repository's configuration runs.
+    They belong to a new repository that shares the objects. So the user's checkout and its list of
+    work trees do not change, and no hook, filter or other program of the repository's configuration
+    runs.
     """
 
     def __init__(self, folder: Path, place: Path) -> None:
-        self.prefix = run_git(folder, "rev-parse", "--show-prefix")  # of the folder, within the work tree
+        # of the folder, within the work tree
+        self.prefix = run_git(folder, "rev-parse", "--show-prefix")
         self._folder, self._place = folder, place
         objects = run_git(folder, "rev-parse", "--path-format=absolute", "--git-path", "objects")
         run_git(place, "init", "--quiet", "--template=", "own")
         (place / "own" / ".git" / "objects" / "info").mkdir(parents=True, exist_ok=True)
-        (place / "own" / ".git" / "objects" / "info" / "alternates").write_text(f"{objects}\n", encoding="utf-8")
+        (place / "own" / ".git" / "objects" / "info" / "alternates").write_text(
+            f"{objects}\n", encoding="utf-8"
+        )
 
     def commits(self, first: str, last: str) -> list[tuple[str, str, str]]:
-        """List (hash, date, subject) of the commits from ``first`` to ``last``, without those inside merges.
+        """List (hash, date, subject) of the commits from ``first`` to ``last``, without those
+        inside merges.
 
-        Raises InputError if one of them is not a commit, or if ``first`` does not come before ``last``.
+        Raises InputError if one of them is not a commit, or if ``first`` does not come before
+        ``last``.
         """
         names = [
             run_git(self._folder, "rev-parse", "--verify", "--end-of-options", f"{one}^{{commit}}")
@@ -130,7 +152,9 @@ class WorkTrees:
         log = ("log", "--no-show-signature", "--no-color", "--format=%H%x09%cs%x09%s")
         good = run_git(self._folder, *log, "-1", names[0])
         between = f"{names[0]}..{names[1]}"
-        later = run_git(self._folder, *log, "--first-parent", "--ancestry-path", "--reverse", between)
+        later = run_git(
+            self._folder, *log, "--first-parent", "--ancestry-path", "--reverse", between
+        )
         if not later:
             raise InputError(f"{last} does not come after {first}: give the good commit first")
         parts = [[*line.split("\t", 2), "", ""] for line in (good, *later.split("\n"))]
@@ -140,20 +164,32 @@ class WorkTrees:
         """The work tree of a commit, made at the first call."""
         path = self._place / commit
         if not path.exists():
-            run_git(self._place / "own", "worktree", "add", "--quiet", "--detach", str(path), commit)
+            run_git(
+                self._place / "own", "worktree", "add", "--quiet", "--detach", str(path), commit
+            )
         return path
 
 
 def run_git(folder: Path, *words: str, seconds: float = SECONDS_FOR_A_TREE) -> str:
-    """Run git in ``folder``, with `SAFE_SETTINGS` and without `REPOSITORY_VARIABLES`, and return its output.
+    """Run git in ``folder``, with `SAFE_SETTINGS` and without `REPOSITORY_VARIABLES`, and return
+    its output.
 
     Raises InputError with git's message if it fails.
     """
-    environment = {key: value for key, value in os.environ.items() if key not in REPOSITORY_VARIABLES}
+    environment = {
+        key: value for key, value in os.environ.items() if key not in REPOSITORY_VARIABLES
+    }
     try:
         return subprocess.run(
-            ["git", *(word for setting in SAFE_SETTINGS for word in ("-c", setting)), "-C", str(folder), *words],
-            env=environment | {"GIT_OPTIONAL_LOCKS": "0", "GIT_NO_LAZY_FETCH": "1"},  # read only: no locks, no network
+            [
+                "git",
+                *(word for setting in SAFE_SETTINGS for word in ("-c", setting)),
+                "-C",
+                str(folder),
+                *words,
+            ],
+            # read only: no locks, no network
+            env=environment | {"GIT_OPTIONAL_LOCKS": "0", "GIT_NO_LAZY_FETCH": "1"},
             capture_output=True,
             encoding="utf-8",
             errors="replace",  # subjects of commits may have any encoding
@@ -165,7 +201,9 @@ def run_git(folder: Path, *words: str, seconds: float = SECONDS_FOR_A_TREE) -> s
     except subprocess.TimeoutExpired:
         raise InputError(f"git {words[0]} took more than {seconds:g} s in {folder}") from None
     except subprocess.CalledProcessError as error:
-        raise InputError(f"git {words[0]}: {(error.stderr or error.stdout).strip() or 'it failed'}") from None
+        raise InputError(
+            f"git {words[0]}: {(error.stderr or error.stdout).strip() or 'it failed'}"
+        ) from None
 
 
 def _git(folder: Path, *words: str) -> str | None:

@@ -1,13 +1,16 @@
-"""Run a function in a separate process, so that a crash in native code becomes an error with a reason.
+"""Run a function in a separate process, so that a crash in native code becomes an error with a
+reason.
 
-The child is a fresh interpreter, not a fork, so it inherits no threads or locks. It imports only what the function
-needs and never the parent's ``__main__``, so it works from console scripts, notebooks, pytest and Hydra. The child and
-all programs that it starts end with the parent, even if the parent is killed, and do not outlive the function. On
-Linux this includes daemons; on other systems a program that starts its own session escapes.
+The child is a fresh interpreter, not a fork, so it inherits no threads or locks. It imports only
+what the function needs and never the parent's ``__main__``, so it works from console scripts,
+notebooks, pytest and Hydra. The child and all programs that it starts end with the parent, even if
+the parent is killed, and do not outlive the function. On Linux this includes daemons; on other
+systems a program that starts its own session escapes.
 
-For this, the child forks once: its own child runs the function, while it waits and then kills all descendants. A daemon
-forks twice and starts its own session, so neither its parent nor its process group identifies it. On Linux a process
-can adopt all orphans among its descendants (PR_SET_CHILD_SUBREAPER), so none can escape.
+For this, the child forks once: its own child runs the function, while it waits and then kills all
+descendants. A daemon forks twice and starts its own session, so neither its parent nor its process
+group identifies it. On Linux a process can adopt all orphans among its descendants
+(PR_SET_CHILD_SUBREAPER), so none can escape.
 """
 
 import ctypes
@@ -32,16 +35,18 @@ from gsbench.logs import Progress
 from gsbench.system.own_modules import allowed_modules
 
 PR_SET_PDEATHSIG, PR_SET_CHILD_SUBREAPER = 1, 36  # linux/prctl.h
-SECONDS_TO_END = 5.0  # time limit for descendants that SIGKILL does not end, such as those of another user
+# time limit for descendants that SIGKILL does not end, such as those of another user
+SECONDS_TO_END = 5.0
 SECONDS_BETWEEN_LOOKS = 0.01
 
 
 def continue_in_child() -> bool:
-    """Fork, and return True in the child. This process does not return: it waits for the child, kills all descendants,
-    and ends with the exit status of the child.
+    """Fork, and return True in the child. This process does not return: it waits for the child,
+    kills all descendants, and ends with the exit status of the child.
 
-    All of them also end when the standard input of this process is closed, that is, when its parent is gone. Call it
-    while there is only one thread. Returns False, in this process, on systems without fork.
+    All of them also end when the standard input of this process is closed, that is, when its parent
+    is gone. Call it while there is only one thread. Returns False, in this process, on systems
+    without fork.
     """
     if not hasattr(os, "fork"):
         return False
@@ -50,7 +55,8 @@ def continue_in_child() -> bool:
         _control(PR_SET_PDEATHSIG, signal.SIGKILL)
         return True
     _control(PR_SET_CHILD_SUBREAPER, 1)
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # the child may end its whole process group and wait for it
+    # the child may end its whole process group and wait for it
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     status = 0
     ended = 0
@@ -62,8 +68,10 @@ def continue_in_child() -> bool:
 
 
 def end_descendants() -> None:
-    """Kill all descendants of this process. It repeats this, since they may start others meanwhile."""
-    import psutil  # not at the top: the import takes longer than many of the functions that run here
+    """Kill all descendants of this process. It repeats this, since they may start others
+    meanwhile."""
+    # not at the top: the import takes longer than many of the functions that run here
+    import psutil
 
     deadline = time.monotonic() + SECONDS_TO_END
     while time.monotonic() < deadline:
@@ -95,7 +103,8 @@ def _exit_as(code: int) -> None:
     if code < 0:
         import resource
 
-        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))  # no second core file beside that of the child
+        # no second core file beside that of the child
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
         with suppress(OSError):
             signal.signal(-code, signal.SIG_DFL)
         os.kill(os.getpid(), -code)
@@ -113,28 +122,35 @@ T = TypeVar("T")
 
 _BOOTSTRAP = (
     "import json, sys; path, own = json.loads(sys.argv[1]); sys.path[:] = path; "
-    "from gsbench.system.own_modules import adopt_modules; adopt_modules(own); from {module} import {name}; {name}()"
+    "from gsbench.system.own_modules import adopt_modules; adopt_modules(own); from {module} "
+    "import {name}; {name}()"
 )
-_SECONDS_TO_END = 10.0  # time limit for a child to end the programs that it started, before it is killed
+# time limit for a child to end the programs that it started, before it is killed
+_SECONDS_TO_END = 10.0
 _TAIL_LINES = 3
 _TAIL_BYTES = 1 << 20  # the part of an output that is searched: a program may print gigabytes
 _STACK_LINE = re.compile(r"^\s*(@|PC:|\*\*\* )|^\s*File |^\s*$")  # crash dumps of glog, blank lines
-_REASON_LINE = re.compile(r"what\(\)|terminate called|Check failed|Error|error|free\(\)|malloc|corrupt")
+_REASON_LINE = re.compile(
+    r"what\(\)|terminate called|Check failed|Error|error|free\(\)|malloc|corrupt"
+)
 
 
 class CrashError(GsbenchError):
     """An isolated function has no result: its process crashed, was killed, or ran out of memory."""
 
 
-def run_isolated(function: Callable[..., T], *args: Any, what: str | None = None, log: Path | None = None) -> T:
+def run_isolated(
+    function: Callable[..., T], *args: Any, what: str | None = None, log: Path | None = None
+) -> T:
     """Return ``function(*args)``, computed in a fresh child process.
 
-    ``function`` must be a top-level function of a module other than ``__main__``. It, its arguments and its result are
-    pickled. ``what`` names the work in errors ("undistortion"). The output of the child, also of native libraries, is
-    appended to the file ``log``; without ``log`` it is dropped on success.
+    ``function`` must be a top-level function of a module other than ``__main__``. It, its arguments
+    and its result are pickled. ``what`` names the work in errors ("undistortion"). The output of
+    the child, also of native libraries, is appended to the file ``log``; without ``log`` it is
+    dropped on success.
 
-    An exception of the function is raised again here, with the child's traceback as a note. A crash of the process
-    raises `CrashError`, whose message ends with the last error lines of the output.
+    An exception of the function is raised again here, with the child's traceback as a note. A crash
+    of the process raises `CrashError`, whose message ends with the last error lines of the output.
     """
     what = what or function.__name__
     with tempfile.TemporaryDirectory(prefix="gsbench-isolate-") as folder:
@@ -145,7 +161,9 @@ def run_isolated(function: Callable[..., T], *args: Any, what: str | None = None
             start = stream.seek(0, os.SEEK_END)
             code = _run_child(call, result, stream)
         if code != 0 or not result.is_file():
-            raise CrashError(f"{what} {describe_exit(code)}; its last lines: {error_tail(output, start)}")
+            raise CrashError(
+                f"{what} {describe_exit(code)}; its last lines: {error_tail(output, start)}"
+            )
         succeeded, value, trace = pickle.loads(result.read_bytes())
     if succeeded:
         return value
@@ -157,7 +175,8 @@ POLL_SECONDS = 0.25
 
 
 class ProgressFile:
-    """A `Progress` that appends to a file, from which the parent process reads. Its short writes are atomic."""
+    """A `Progress` that appends to a file, from which the parent process reads. Its short writes
+    are atomic."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -168,14 +187,21 @@ class ProgressFile:
 
 
 def run_with_progress(
-    function: Callable[[Any, Progress], T], job: Any, progress: Progress, what: str, log: Path | None = None
+    function: Callable[[Any, Progress], T],
+    job: Any,
+    progress: Progress,
+    what: str,
+    log: Path | None = None,
 ) -> T:
-    """Return ``function(job, progress)``, computed in a fresh process (`run_isolated`), and forward its progress."""
+    """Return ``function(job, progress)``, computed in a fresh process (`run_isolated`), and forward
+    its progress."""
     with tempfile.TemporaryDirectory(prefix="gsbench-progress-") as folder:
         channel = ProgressFile(Path(folder, "progress.txt"))
         channel.path.touch()
         ended = threading.Event()
-        listener = threading.Thread(target=_listen, args=(channel.path, progress, ended), daemon=True)
+        listener = threading.Thread(
+            target=_listen, args=(channel.path, progress, ended), daemon=True
+        )
         listener.start()
         try:
             return run_isolated(function, job, channel, what=what, log=log)
@@ -199,22 +225,36 @@ def _listen(path: Path, progress: Progress, ended: threading.Event) -> None:
 
 
 def python_command(module: str, name: str, *arguments: str) -> list[str]:
-    """The command of a fresh interpreter, with the same module search path, that calls ``name`` of ``module``.
+    """The command of a fresh interpreter, with the same module search path, that calls ``name`` of
+    ``module``.
 
     The function has no parameters; ``arguments`` are in ``sys.argv[2:]``.
     """
     search_path = json.dumps([sys.path, allowed_modules()])
     # -P: a stranger's capture in the current folder may have a json.py, which must not be imported.
-    return [sys.executable, "-P", "-c", _BOOTSTRAP.format(module=module, name=name), search_path, *arguments]
+    return [
+        sys.executable,
+        "-P",
+        "-c",
+        _BOOTSTRAP.format(module=module, name=name),
+        search_path,
+        *arguments,
+    ]
 
 
 def _run_child(call: Path, result: Path, output: BinaryIO) -> int:
-    """Start the child, wait for it and return its exit code. On any exception here, also Ctrl-C, end it."""
+    """Start the child, wait for it and return its exit code. On any exception here, also Ctrl-C,
+    end it."""
     command = python_command("gsbench.system.isolate", "_child", str(call), str(result))
-    # In its own session, the child does not receive Ctrl-C. The parent does and ends it: one traceback, not two.
-    # Nothing is written to the pipe at stdin. When it closes, the child ends, because the parent wants it or is gone.
+    # In its own session, the child does not receive Ctrl-C. The parent does and ends it: one
+    # traceback, not two. Nothing is written to the pipe at stdin. When it closes, the child ends,
+    # because the parent wants it or is gone.
     child = subprocess.Popen(
-        command, stdin=subprocess.PIPE, stdout=output, stderr=subprocess.STDOUT, start_new_session=True
+        command,
+        stdin=subprocess.PIPE,
+        stdout=output,
+        stderr=subprocess.STDOUT,
+        start_new_session=True,
     )
     try:
         return child.wait()
@@ -232,12 +272,14 @@ def _run_child(call: Path, result: Path, output: BinaryIO) -> int:
 def _end_group(leader: int) -> None:
     """Kill programs that the child left running in its session, the process group ``leader``."""
     if hasattr(os, "killpg"):
-        with suppress(ProcessLookupError, PermissionError):  # none is left (macOS: only zombies are)
+        # none is left (macOS: only zombies are)
+        with suppress(ProcessLookupError, PermissionError):
             os.killpg(leader, signal.SIGKILL)
 
 
 def _child() -> None:
-    """The main function of the child. Its arguments are the paths of the pickled call and of the result to write."""
+    """The main function of the child. Its arguments are the paths of the pickled call and of the
+    result to write."""
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     if not continue_in_child():
         threading.Thread(target=_end_with_parent, daemon=True).start()
@@ -250,7 +292,8 @@ def _child() -> None:
     result.write_bytes(pickle.dumps(outcome))
     sys.stdout.flush()
     sys.stderr.flush()
-    os._exit(0)  # without unloading native libraries, which may crash then; the result is already written
+    # without unloading native libraries, which may crash then; the result is already written
+    os._exit(0)
 
 
 def _portable(error: Exception) -> Exception:
@@ -263,7 +306,8 @@ def _portable(error: Exception) -> Exception:
 
 
 def describe_exit(code: int) -> str:
-    """Describe the unexpected end of a process by its exit code: "crashed (SIGSEGV)", "ended early (exit code 1)"."""
+    """Describe the unexpected end of a process by its exit code: "crashed (SIGSEGV)", "ended early
+    (exit code 1)"."""
     if code < 0:
         try:
             name = signal.Signals(-code).name

@@ -1,4 +1,5 @@
-"""Compilation of kernels by numba: options, the cache on disk, and the message to the user during compilation."""
+"""Compilation of kernels by numba: options, the cache on disk, and the message to the user during
+compilation."""
 
 import functools
 import hashlib
@@ -16,7 +17,8 @@ numba = load_numba()  # first: it protects the import of numba
 from numba.core import event  # noqa: E402
 
 PACKAGE = Path(__file__).resolve().parents[1]
-# Files and folders with the functions and constants of kernels. A test compares them with the imports.
+# Files and folders with the functions and constants of kernels. A test compares them with the
+# imports.
 SOURCES = (
     "raster/cpu",
     "raster/base.py",
@@ -58,9 +60,10 @@ def cache_base() -> Path:
 def cache_folder(package: Path = PACKAGE) -> Path:
     """The folder of compiled kernels, a different one for each state of their sources.
 
-    numba checks the file of a kernel, but not the files that it imports, so after a change of a helper it would use
-    outdated machine code. The name of the folder is a digest of all `SOURCES` and of the processor. numba itself
-    separates processors only in an index file, which two machines with a common home folder could write at once.
+    numba checks the file of a kernel, but not the files that it imports, so after a change of a
+    helper it would use outdated machine code. The name of the folder is a digest of all `SOURCES`
+    and of the processor. numba itself separates processors only in an index file, which two
+    machines with a common home folder could write at once.
     """
     digest = hashlib.sha256("\n".join((numba.__version__, *numba_target())).encode())
     for source in SOURCES:
@@ -71,12 +74,14 @@ def cache_folder(package: Path = PACKAGE) -> Path:
 
 
 def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile ``function`` at its first call: without the GIL, without Python's division checks, cached on disk.
+    """Compile ``function`` at its first call: without the GIL, without Python's division checks,
+    cached on disk.
 
-    Reference counts are off, too (``_nrt``): numba would update them atomically at each inlined call. So a kernel must
-    not allocate memory; the caller owns all arrays.
+    Reference counts are off, too (``_nrt``): numba would update them atomically at each inlined
+    call. So a kernel must not allocate memory; the caller owns all arrays.
     """
-    previous = config.CACHE_DIR  # read when the decorator runs; other users of numba in this process keep theirs
+    # read when the decorator runs; other users of numba in this process keep theirs
+    previous = config.CACHE_DIR
     config.CACHE_DIR = str(cache_folder())
     try:
         return njit(nogil=True, cache=True, error_model="numpy", _nrt=False)(function)
@@ -105,4 +110,5 @@ class _Announcement(event.Listener):
         pass
 
 
-event.register("numba:compile", _Announcement())  # the event means that the cache had no machine code
+# the event means that the cache had no machine code
+event.register("numba:compile", _Announcement())

@@ -34,8 +34,8 @@ class BusyError(Exception):
 def hold(path: Path, what: str, wait: bool = True) -> Iterator[None]:
     """Hold the lock ``path`` while the block runs; ``what`` is the work that it guards.
 
-    The system frees the lock when the process ends for any reason; the file stays. Raises BusyError if another process
-    holds the lock and ``wait`` is False.
+    The system frees the lock when the process ends for any reason; the file stays. Raises BusyError
+    if another process holds the lock and ``wait`` is False.
     """
     lock = FileLock(path)
     try:
@@ -50,7 +50,9 @@ def hold(path: Path, what: str, wait: bool = True) -> Iterator[None]:
         holder.unlink(missing_ok=True)  # first: another process may have made it a link to any file
         with os.fdopen(open_plain(holder, os.O_WRONLY | os.O_CREAT | os.O_EXCL), "w") as stream:
             job = os.environ.get("SLURM_JOB_ID")
-            this = LockHolder(host=socket.gethostname(), pid=os.getpid(), since=time.time(), slurm=job, what=what)
+            this = LockHolder(
+                host=socket.gethostname(), pid=os.getpid(), since=time.time(), slurm=job, what=what
+            )
             stream.write(json.dumps(this.to_json()))
     try:
         yield
@@ -82,7 +84,8 @@ def is_held(path: Path) -> bool:
 
 @dataclass(frozen=True, kw_only=True)
 class LockHolder(Record):
-    """Record of a lock's holder about itself: host, process, Slurm job, start (Unix time) and work."""
+    """Record of a lock's holder about itself: host, process, Slurm job, start (Unix time) and
+    work."""
 
     host: str
     pid: int
@@ -93,11 +96,14 @@ class LockHolder(Record):
     @property
     def description(self) -> str:
         """``process 17 on node3, Slurm job 5``"""
-        return f"process {self.pid} on {self.host}{f', Slurm job {self.slurm}' if self.slurm else ''}"
+        return (
+            f"process {self.pid} on {self.host}{f', Slurm job {self.slurm}' if self.slurm else ''}"
+        )
 
 
 def read_holder(path: Path) -> LockHolder | None:
-    """Read what the holder of the lock ``path`` wrote about itself; None if that is not readable."""
+    """Read what the holder of the lock ``path`` wrote about itself; None if that is not
+    readable."""
     return read_if_sound(_holder_file(path), LockHolder)
 
 

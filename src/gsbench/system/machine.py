@@ -1,7 +1,8 @@
 """Description of the machine, which can change results even if code, settings and seed are equal.
 
-Compiled kernels, torch and linear algebra libraries choose instructions by the processor, and fused or wider
-instructions round differently. So results are equal to the bit only on one kind of machine (docs/reproducibility.md).
+Compiled kernels, torch and linear algebra libraries choose instructions by the processor, and fused
+or wider instructions round differently. So results are equal to the bit only on one kind of machine
+(docs/reproducibility.md).
 """
 
 from __future__ import annotations
@@ -21,22 +22,25 @@ if TYPE_CHECKING:
     import torch
 
 CPU_INFO = Path("/proc/cpuinfo")
-CPU_NAME_KEYS = ("model name", "Processor", "cpu model", "Model", "cpu")  # x86, old ARM, MIPS, Raspberry Pi, POWER
-# Features that each level requires beyond the level before it, as far as they distinguish processors (x86-64 psABI,
-# table 3.1), by their LLVM names.
+# x86, old ARM, MIPS, Raspberry Pi, POWER
+CPU_NAME_KEYS = ("model name", "Processor", "cpu model", "Model", "cpu")
+# Features that each level requires beyond the level before it, as far as they distinguish
+# processors (x86-64 psABI, table 3.1), by their LLVM names.
 X86_LEVELS = {
     "x86-64-v2": ("cx16", "sahf", "popcnt", "sse3", "sse4.1", "sse4.2", "ssse3"),
     "x86-64-v3": ("avx", "avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe"),
     "x86-64-v4": ("avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"),
 }
-NUMBA_MINIMA = {"NUMBA_NUM_THREADS": 1, "NUMBA_DISABLE_JIT": 0}  # variables that numba reads as whole numbers
+# variables that numba reads as whole numbers
+NUMBA_MINIMA = {"NUMBA_NUM_THREADS": 1, "NUMBA_DISABLE_JIT": 0}
 
 
 def describe_machine(device: torch.device) -> dict[str, str]:
-    """Describe this machine for results: ``cpu``, ``architecture``, ``kernels``, ``torch``, ``device``.
+    """Describe this machine for results: ``cpu``, ``architecture``, ``kernels``, ``torch``,
+    ``device``.
 
-    ``kernels`` is the processor type that kernels are compiled for, with its instruction set; ``torch`` is the
-    instruction set that torch uses; ``device`` is the name of the GPU, or "cpu".
+    ``kernels`` is the processor type that kernels are compiled for, with its instruction set;
+    ``torch`` is the instruction set that torch uses; ``device`` is the name of the GPU, or "cpu".
     """
     import torch
 
@@ -50,7 +54,8 @@ def describe_machine(device: torch.device) -> dict[str, str]:
 
 
 def kind_of_machine(record: Mapping[str, Any]) -> str:
-    """A record of `describe_machine` as one phrase. Results with equal phrases can be equal to the bit."""
+    """A record of `describe_machine` as one phrase. Results with equal phrases can be equal to the
+    bit."""
     cpu = f"{record['cpu']} ({record['kernels']}, torch {record['torch']})"
     return cpu if record["device"] == "cpu" else f"{record['device']}, {cpu}"
 
@@ -58,7 +63,9 @@ def kind_of_machine(record: Mapping[str, Any]) -> str:
 @functools.cache
 def cpu_name() -> str:
     """The name of the processor from the operating system, else its architecture."""
-    return " ".join((_linux_name() or platform.processor() or platform.machine() or "unknown").split())
+    return " ".join(
+        (_linux_name() or platform.processor() or platform.machine() or "unknown").split()
+    )
 
 
 def _linux_name() -> str:
@@ -68,16 +75,22 @@ def _linux_name() -> str:
     named = next((entries[key] for key in CPU_NAME_KEYS if key in entries), "")
     if named or "CPU part" not in entries:
         return named
-    return f"ARM implementer {entries.get('CPU implementer', '?')} part {entries['CPU part']}"  # no name on 64-bit ARM
+    # no name on 64-bit ARM
+    return f"ARM implementer {entries.get('CPU implementer', '?')} part {entries['CPU part']}"
 
 
 def load_numba() -> Any:
-    """Import numba. Raises InputError if one of its environment variables would make the import fail."""
+    """Import numba. Raises InputError if one of its environment variables would make the import
+    fail."""
     for name, minimum in NUMBA_MINIMA.items():
         value = os.environ.get(name, str(minimum))
         if not value.isascii() or not value.isdigit() or int(value) < minimum:
-            raise InputError(f"{name}={value}: numba needs a whole number from {minimum} on: set another, or unset it")
-    # numba reads `.numba_config.yaml` in the current folder, where a stranger's capture may be: import it elsewhere.
+            raise InputError(
+                f"{name}={value}: numba needs a whole number from {minimum} on: set another, or "
+                "unset it"
+            )
+    # numba reads `.numba_config.yaml` in the current folder, where a stranger's capture may be:
+    # import it elsewhere.
     with contextlib.chdir(Path(__file__).parent):
         import numba
         from numba.core import config
@@ -86,7 +99,8 @@ def load_numba() -> Any:
 
 
 def numba_target() -> tuple[str, str]:
-    """The processor that numba compiles for, and its features in LLVM's form ("+sse2,-avx512f,…")."""
+    """The processor that numba compiles for, and its features in LLVM's form
+    ("+sse2,-avx512f,…")."""
     import llvmlite.binding
 
     numba = load_numba()
@@ -98,15 +112,20 @@ def numba_target() -> tuple[str, str]:
 
 
 def kernel_target() -> str:
-    """The target of numba, this processor or ``NUMBA_CPU_NAME``: its LLVM name and, on x86-64, its level."""
+    """The target of numba, this processor or ``NUMBA_CPU_NAME``: its LLVM name and, on x86-64, its
+    level."""
     name, features = numba_target()
     if platform.machine().lower() not in ("x86_64", "amd64"):
         return name
-    return f"{name}, {x86_level({feature[1:] for feature in features.split(',') if feature.startswith('+')})}"
+    return (
+        f"{name}, "
+        f"{x86_level({feature[1:] for feature in features.split(',') if feature.startswith('+')})}"
+    )
 
 
 def x86_level(features: set[str]) -> str:
-    """The highest x86-64 micro-architecture level whose features (LLVM names) are all in ``features``."""
+    """The highest x86-64 micro-architecture level whose features (LLVM names) are all in
+    ``features``."""
     level = "x86-64-v1"
     for name, required in X86_LEVELS.items():
         if not features.issuperset(required):

@@ -1,6 +1,7 @@
 """Import of a user's own modules: only allowed names, from one folder, after installed packages.
 
-The current folder is not in Python's search path, because a stranger's capture may contain a ``plyfile.py``.
+The current folder is not in Python's search path, because a stranger's capture may contain a
+``plyfile.py``.
 """
 
 import os
@@ -10,7 +11,8 @@ from importlib.abc import MetaPathFinder
 from importlib.machinery import ModuleSpec, PathFinder
 from types import ModuleType
 
-# The variable that removes the current folder from Python's search path, with a value that shows that gsbench set it.
+# The variable that removes the current folder from Python's search path, with a value that shows
+# that gsbench set it.
 SAFE_PATH = ("PYTHONSAFEPATH", "gsbench")
 
 

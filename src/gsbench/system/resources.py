@@ -1,4 +1,5 @@
-"""Cores, GPUs and slots for trials that run at once on a machine, and their peak memory. Does not import torch.
+"""Cores, GPUs and slots for trials that run at once on a machine, and their peak memory. Does not
+import torch.
 
 For work on a GPU, peak memory is that of the GPU, else that of this process.
 """
@@ -38,13 +39,19 @@ SECONDS_BETWEEN_TRIES = 0.5
 CORES_OF_TRIAL = 4  # with more cores, more trials at once gain more than more threads per trial
 MEMORY_OF_TRIAL, MEMORY_OF_GAUSSIAN = 545 * 2**20, 1592  # bytes, of a training on the CPU
 USUAL_GAUSSIANS = 1_000_000  # assumed count without a cap
-THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
+THREAD_VARIABLES = (
+    "OMP_NUM_THREADS",
+    "MKL_NUM_THREADS",
+    "OPENBLAS_NUM_THREADS",
+    "NUMBA_NUM_THREADS",
+)
 
 log = logging.getLogger(__name__)
 
 
 def available_threads(parallel: int = 1) -> int:
-    """The number of CPU threads for one of ``parallel`` trials: that of Slurm, else an equal share of the cores."""
+    """The number of CPU threads for one of ``parallel`` trials: that of Slurm, else an equal share
+    of the cores."""
     slurm = os.environ.get("SLURM_CPUS_PER_TASK", "")
     if slurm.isdigit() and int(slurm) > 0:
         return int(slurm)
@@ -53,7 +60,8 @@ def available_threads(parallel: int = 1) -> int:
 
 @cache
 def trials_at_once(max_gaussians: int | None, device: str) -> int:
-    """A good number of trials at once: the number of GPUs, if they train, else by cores and memory."""
+    """A good number of trials at once: the number of GPUs, if they train, else by cores and
+    memory."""
     if names_one_gpu(device):
         return 1
     if device != "cpu" and (gpus := installed_gpus()):
@@ -66,7 +74,8 @@ def trials_at_once(max_gaussians: int | None, device: str) -> int:
 
 @contextmanager
 def take_slot(runs: Path, count: int) -> Iterator[int]:
-    """Hold the first free one of ``count`` slots of this machine: a limit for trials of all commands together."""
+    """Hold the first free one of ``count`` slots of this machine: a limit for trials of all
+    commands together."""
     folder = runs / ".slots" / socket.gethostname()
     folder.mkdir(parents=True, exist_ok=True)
     while True:
@@ -82,8 +91,13 @@ def take_slot(runs: Path, count: int) -> Iterator[int]:
 
 
 def assign_gpu(slot: int, visible: str | None) -> None:
-    """Let this process see one GPU, by its slot, of those that the parent saw. Call it before importing torch."""
-    gpus = [gpu.strip() for gpu in visible.split(",") if gpu.strip()] if visible is not None else installed_gpus()
+    """Let this process see one GPU, by its slot, of those that the parent saw. Call it before
+    importing torch."""
+    gpus = (
+        [gpu.strip() for gpu in visible.split(",") if gpu.strip()]
+        if visible is not None
+        else installed_gpus()
+    )
     if gpus:
         os.environ["CUDA_VISIBLE_DEVICES"] = gpus[slot % len(gpus)]
     elif visible is None:
@@ -91,7 +105,8 @@ def assign_gpu(slot: int, visible: str | None) -> None:
 
 
 def names_one_gpu(device: str) -> bool:
-    """Return whether the setting ``device`` names a GPU by its number, such as cuda:1, which all trials then use."""
+    """Return whether the setting ``device`` names a GPU by its number, such as cuda:1, which all
+    trials then use."""
     return device.startswith("cuda:")
 
 
@@ -101,7 +116,8 @@ def installed_gpus() -> list[str]:
 
 
 def nvidia_smi(query: str) -> list[str]:
-    """The answers of ``nvidia-smi`` to ``--query-gpu=QUERY``, one for each GPU; [] without a driver."""
+    """The answers of ``nvidia-smi`` to ``--query-gpu=QUERY``, one for each GPU; [] without a
+    driver."""
     try:
         listing = subprocess.run(
             ["nvidia-smi", f"--query-gpu={query}", "--format=csv,noheader"],
@@ -116,7 +132,8 @@ def nvidia_smi(query: str) -> list[str]:
 
 
 def assign_threads(threads: int | str, parallel: int) -> None:
-    """Limit threads of libraries in this process to ``threads`` ("auto": its share). Call it before importing torch."""
+    """Limit threads of libraries in this process to ``threads`` ("auto": its share). Call it before
+    importing torch."""
     count = available_threads(parallel) if threads == "auto" else int(threads)
     for variable in THREAD_VARIABLES:
         os.environ[variable] = str(count)
@@ -144,7 +161,8 @@ def reset_peak_memory(device: torch.device) -> None:
 
 
 def peak_memory_mb(device: torch.device) -> float:
-    """Peak memory since `reset_peak_memory`, MiB: torch's allocations on a GPU, else this process's resident memory."""
+    """Peak memory since `reset_peak_memory`, MiB: torch's allocations on a GPU, else this process's
+    resident memory."""
     if device.type == "cuda":
         import torch
 
@@ -167,7 +185,8 @@ def peak_resident_mb() -> float:
 
 
 def peak_child_mb() -> float:
-    """The largest peak resident memory of an ended child of this process, MiB; 0 if the platform does not report it."""
+    """The largest peak resident memory of an ended child of this process, MiB; 0 if the platform
+    does not report it."""
     return 0.0 if resource is None else _max_resident_mb(resource.RUSAGE_CHILDREN)
 
 

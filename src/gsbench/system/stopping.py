@@ -1,7 +1,8 @@
 """Stopping on a signal: at once, or, in a training, after the current iteration, with a checkpoint.
 
-The state in this module is global, because signals belong to the process. SIGINT is Ctrl-C. SIGTERM comes from shells,
-and from Slurm when a job is preempted or cancelled. SIGUSR2 comes from submitit shortly before a job's time is up.
+The state in this module is global, because signals belong to the process. SIGINT is Ctrl-C. SIGTERM
+comes from shells, and from Slurm when a job is preempted or cancelled. SIGUSR2 comes from submitit
+shortly before a job's time is up.
 """
 
 import signal
@@ -10,7 +11,9 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from types import FrameType
 
-SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGUSR2") if hasattr(signal, name))
+SIGNALS = tuple(
+    getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGUSR2") if hasattr(signal, name)
+)
 # For a process that ignores Ctrl-C because its parent handles it and ends the process.
 SIGNALS_WITHOUT_INTERRUPT = tuple(signum for signum in SIGNALS if signum != signal.SIGINT)
 
@@ -41,7 +44,8 @@ def requested() -> bool:
 
 @contextmanager
 def stop_on_signals(signals: Sequence[int] = SIGNALS) -> Iterator[None]:
-    """Raise `Stopped` in the main thread if a signal comes within the block; restore the earlier handlers after it."""
+    """Raise `Stopped` in the main thread if a signal comes within the block; restore the earlier
+    handlers after it."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -58,7 +62,8 @@ def stop_on_signals(signals: Sequence[int] = SIGNALS) -> Iterator[None]:
 
 @contextmanager
 def interrupts_ignored() -> Iterator[None]:
-    """Ignore Ctrl-C within the block. Processes started in it inherit this and always ignore Ctrl-C."""
+    """Ignore Ctrl-C within the block. Processes started in it inherit this and always ignore
+    Ctrl-C."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -70,7 +75,8 @@ def interrupts_ignored() -> Iterator[None]:
 
 
 def reinstall_handlers() -> None:
-    """Install the handlers of `stop_on_signals` again: importing pycolmap replaces the handler of SIGTERM."""
+    """Install the handlers of `stop_on_signals` again: importing pycolmap replaces the handler of
+    SIGTERM."""
     if threading.current_thread() is threading.main_thread():
         for signum in _State.signals:
             signal.signal(signum, _on_signal)
@@ -78,7 +84,8 @@ def reinstall_handlers() -> None:
 
 @contextmanager
 def deferred() -> Iterator[None]:
-    """Defer a first signal within the block: it sets `requested` and raises `Stopped` at the end; a second stops."""
+    """Defer a first signal within the block: it sets `requested` and raises `Stopped` at the end; a
+    second stops."""
     reinstall_handlers()
     _State.deferring += 1
     try:

@@ -1,7 +1,8 @@
 """Tracking: the files of a trial mirrored to MLflow, TensorBoard or Weights & Biases.
 
-Trials write only files. A process beside them follows the files and writes to the tracker in batches, so a tracker that
-is slow, down or read-only never harms a trial. ``gsbench sync`` sends later what the tracker missed.
+Trials write only files. A process beside them follows the files and writes to the tracker in
+batches, so a tracker that is slow, down or read-only never harms a trial. ``gsbench sync`` sends
+later what the tracker missed.
 """
 
 from gsbench.tracking.comparison import publish

@@ -1,8 +1,10 @@
-"""The page of an experiment in MLflow: table and verdict as its description, and a view that compares the arms.
+"""The page of an experiment in MLflow: table and verdict as its description, and a view that
+compares the arms.
 
-MLflow's page keeps what it shows (columns, groups, charts) in a tag of the experiment, if somebody shares that as a
-link: ``mlflow.sharedViewState.KEY`` holds JSON, and the address has ``viewStateShareKey=KEY``. The format is not
-documented, and was tried with MLflow 3.17: `addresses` gives the plain page for other versions.
+MLflow's page keeps what it shows (columns, groups, charts) in a tag of the experiment, if somebody
+shares that as a link: ``mlflow.sharedViewState.KEY`` holds JSON, and the address has
+``viewStateShareKey=KEY``. The format is not documented, and was tried with MLflow 3.17: `addresses`
+gives the plain page for other versions.
 """
 
 from __future__ import annotations
@@ -41,7 +43,8 @@ Sections = dict[str, list[dict[str, Any]]]  # charts by the headings of their se
 
 
 def publish(home: Path, uri: str | None) -> str:
-    """Renew the page of the experiment in ``home``; returns the experiment's id in the tracker ``uri``.
+    """Renew the page of the experiment in ``home``; returns the experiment's id in the tracker
+    ``uri``.
 
     Raises InputError, and any error of the tracker's client.
     """
@@ -49,7 +52,11 @@ def publish(home: Path, uri: str | None) -> str:
     experiment_id = ensure_experiment(client, home.name, home.parent)
     experiment = read_experiment(home)
     if experiment.trials:
-        _set(client, experiment_id, {NOTE: description(experiment), VIEW: packed(view_state(experiment.trials))})
+        _set(
+            client,
+            experiment_id,
+            {NOTE: description(experiment), VIEW: packed(view_state(experiment.trials))},
+        )
     return experiment_id
 
 
@@ -83,7 +90,8 @@ def description(experiment: Experiment) -> str:
         return f"No table: {error}\n\n{OWN_NOTE} {experiment.name}`"
     verdicts = [line for line in lines if line.startswith(VERDICT)]
     rest = [line for line in lines if line not in verdicts and not line.startswith("#")]
-    # The page shows only the first line until it is clicked: decided pairs of arms come first there.
+    # The page shows only the first line until it is clicked: decided pairs of arms come first
+    # there.
     short = [line.removeprefix(VERDICT).partition(" (")[0] for line in verdicts]
     answer = "; ".join(sorted(short, key=lambda text: "undecided" in text))
     end = f"\n\n{OWN_NOTE} {experiment.name}` shows more."
@@ -99,9 +107,13 @@ def packed(state: dict[str, Any]) -> str:
 
 
 def view_state(trials: Sequence[TrialResult]) -> dict[str, Any]:
-    """The state of MLflow's page that shows the ``trials`` in groups by arm, with a chart for each result."""
+    """The state of MLflow's page that shows the ``trials`` in groups by arm, with a chart for each
+    result."""
     measured = {key for trial in trials for key in trial.metrics}
-    keys = [*(key for key in known_keys() if key in measured), *sorted(measured - set(known_keys()))]
+    keys = [
+        *(key for key in known_keys() if key in measured),
+        *sorted(measured - set(known_keys())),
+    ]
     results = [*map(eval_name, keys), f"{EVAL}/gaussians", f"{EVAL}/minutes"]
     curves = ["train/gaussians", "train/loss"]
     if any(trial.record.metrics_at for trial in trials):  # eval.at
@@ -119,12 +131,17 @@ def view_state(trials: Sequence[TrialResult]) -> dict[str, Any]:
 
 def _group_of(trial: TrialResult, swept: Sequence[str]) -> str:
     """The id of the trial's group on MLflow's page."""
-    values = {ARM: arm_name(trial.densify, trial.init)} | {key: str(trial.config.get(key, "")) for key in swept}
+    values = {ARM: arm_name(trial.densify, trial.init)} | {
+        key: str(trial.config.get(key, "")) for key in swept
+    }
     return ",".join(f"param.{key}.{value or 'null'}" for key, value in values.items())
 
 
-def _state(results: list[str], sections: Sections, groups: Any, expanded: dict[str, bool]) -> dict[str, Any]:
-    """The state of MLflow's page with these metrics in its list, charts in sections, and groups of runs."""
+def _state(
+    results: list[str], sections: Sections, groups: Any, expanded: dict[str, bool]
+) -> dict[str, Any]:
+    """The state of MLflow's page with these metrics in its list, charts in sections, and groups of
+    runs."""
     columns = [*(f"tags.`{tag}`" for tag in COLUMNS), *(f"metrics.`{name}`" for name in results)]
     return {
         # the search
@@ -154,7 +171,14 @@ def _state(results: list[str], sections: Sections, groups: Any, expanded: dict[s
         "autoRefreshEnabled": True,
         "compareRunCharts": list(_placed(sections)),
         "compareRunSections": [
-            {"uuid": name, "name": name, "display": True, "isReordered": True, "deleted": False, "isGenerated": False}
+            {
+                "uuid": name,
+                "name": name,
+                "display": True,
+                "isReordered": True,
+                "deleted": False,
+                "isGenerated": False,
+            }
             | {"columns": 3, "cardHeight": CHART_HEIGHT}
             for name in sections
         ],

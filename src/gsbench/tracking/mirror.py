@@ -1,12 +1,14 @@
-"""Mirroring: reads the files of trials and sends new records to their tracker, in a process beside the trials.
+"""Mirroring: reads the files of trials and sends new records to their tracker, in a process beside
+the trials.
 
-Why a process: a tracker's client may hang in a socket, a lock or a C library for any time. A hanging thread cannot be
-ended, and a thread that is inside a C library when the interpreter exits crashes the process, after a trial that was
-complete. A process can be killed.
+Why a process: a tracker's client may hang in a socket, a lock or a C library for any time. A
+hanging thread cannot be ended, and a thread that is inside a C library when the interpreter exits
+crashes the process, after a trial that was complete. A process can be killed.
 
-`Mirror` starts the process, and at the end waits for it a bounded time. `follow` is the main function of the process.
-It gets the folders to follow on stdin, and reads everything else from files. Its exit code says how it ended, and the
-last line on its stderr says why. `sync` mirrors once, trials that have ended.
+`Mirror` starts the process, and at the end waits for it a bounded time. `follow` is the main
+function of the process. It gets the folders to follow on stdin, and reads everything else from
+files. Its exit code says how it ended, and the last line on its stderr says why. `sync` mirrors
+once, trials that have ended.
 """
 
 from __future__ import annotations
@@ -41,7 +43,8 @@ from gsbench.words import counted
 
 log = logging.getLogger(__name__)
 
-TRACKER_FAILED = 3  # exit code if the tracker, or a file, is at fault: the last line on stderr says why
+# exit code if the tracker, or a file, is at fault: the last line on stderr says why
+TRACKER_FAILED = 3
 SECONDS_BETWEEN_TABLES = 60.0  # an experiment of thousands of trials takes seconds to read
 SECONDS_TO_STOP = 3.0  # patience after a signal that asks to end
 SINKS: dict[str, Any] = {"mlflow": MlflowSink, "tensorboard": TensorBoardSink, "wandb": WandbSink}
@@ -57,10 +60,11 @@ class MirrorError(Exception):
 
 
 class Mirror:
-    """Mirrors the trials that begin within a ``with`` block, all by one process; none if it is ``idle``.
+    """Mirrors the trials that begin within a ``with`` block, all by one process; none if it is
+    ``idle``.
 
-    At the end of the block, it waits a bounded time for the tracker. Errors of the tracker are never raised: one line
-    in the log says what is missing.
+    At the end of the block, it waits a bounded time for the tracker. Errors of the tracker are
+    never raised: one line in the log says what is missing.
     """
 
     def __init__(self, idle: bool = False) -> None:
@@ -72,7 +76,8 @@ class Mirror:
         return self
 
     def follow(self, folder: Path, options: dict[str, Any]) -> None:
-        """Mirror the trial in ``folder``, with the settings ``tracking``, from when it runs until it has ended."""
+        """Mirror the trial in ``folder``, with the settings ``tracking``, from when it runs until
+        it has ended."""
         if self._idle or not options["enabled"]:
             return
         self._options = options
@@ -90,10 +95,14 @@ class Mirror:
     def __exit__(self, kind: type[BaseException] | None, error: object, trace: object) -> None:
         stopped = kind is not None and not issubclass(kind, Exception)
         if self._process is not None:
-            self._finish(self._process, SECONDS_TO_STOP if stopped else float(self._options["patience_seconds"]))
+            self._finish(
+                self._process,
+                SECONDS_TO_STOP if stopped else float(self._options["patience_seconds"]),
+            )
 
     def _start(self) -> subprocess.Popen[bytes]:
-        """A fresh interpreter that runs `gsbench.tracking.mirror.follow`. Raises OSError where it cannot start."""
+        """A fresh interpreter that runs `gsbench.tracking.mirror.follow`. Raises OSError where it
+        cannot start."""
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - open as long as the process runs
         words = (str(self._options["flush_seconds"]), str(self._options["patience_seconds"]))
         return subprocess.Popen(
@@ -101,7 +110,8 @@ class Mirror:
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,  # what MLflow prints
             stderr=self._errors,
-            start_new_session=True,  # Ctrl-C must reach only the trials' process, which then ends this one
+            # Ctrl-C must reach only the trials' process, which then ends this one
+            start_new_session=True,
         )
 
     def _finish(self, process: subprocess.Popen[bytes], seconds: float) -> None:
@@ -111,7 +121,10 @@ class Mirror:
             try:
                 process.communicate(timeout=seconds)
             except subprocess.TimeoutExpired:
-                log.warning("tracking: %s is slow; `gsbench sync` mirrors the rest later", sink_of(self._options).name)
+                log.warning(
+                    "tracking: %s is slow; `gsbench sync` mirrors the rest later",
+                    sink_of(self._options).name,
+                )
                 return
             finally:  # also where a signal interrupts the wait
                 process.kill()
@@ -122,26 +135,36 @@ class Mirror:
             log.debug("tracking failed:\n%s", text)
             self._warn(text.splitlines()[-1])
         elif process.returncode != 0:
-            self._warn(f"the mirror {describe_exit(process.returncode)}; its last lines: {error_lines(stderr)}")
+            self._warn(
+                f"the mirror {describe_exit(process.returncode)}; its last lines: "
+                f"{error_lines(stderr)}"
+            )
 
     def _warn(self, error: object) -> None:
-        log.warning("tracking: %s; the files are complete, `gsbench sync` mirrors them later", error)
+        log.warning(
+            "tracking: %s; the files are complete, `gsbench sync` mirrors them later", error
+        )
 
 
 # ---- a trial and its tracker
 
-LOCK = ".mlflow.lock"  # in the trial's folder: one process at a time mirrors a trial, to any tracker
-SECONDS_AFTER_PARENT = 10.0  # to tell the tracker how trials ended after the sweep's process is gone
+# in the trial's folder: one process at a time mirrors a trial, to any tracker
+LOCK = ".mlflow.lock"
+# to tell the tracker how trials ended after the sweep's process is gone
+SECONDS_AFTER_PARENT = 10.0
 
 
 class TrackerRun:
-    """The tracker's run of the trial in ``folder``, new or continued. It is locked until it is closed.
+    """The tracker's run of the trial in ``folder``, new or continued. It is locked until it is
+    closed.
 
-    ``options`` are the settings ``tracking``, ``values`` the whole configuration. Raises BusyError if another process
-    mirrors the trial, and any error of the tracker.
+    ``options`` are the settings ``tracking``, ``values`` the whole configuration. Raises BusyError
+    if another process mirrors the trial, and any error of the tracker.
     """
 
-    def __init__(self, folder: TrialFolder, options: dict[str, Any], values: dict[str, Any]) -> None:
+    def __init__(
+        self, folder: TrialFolder, options: dict[str, Any], values: dict[str, Any]
+    ) -> None:
         folder.require_no_links()
         self._options, self._trial = options, TrackedTrial(folder, values)
         with ExitStack() as held:
@@ -162,7 +185,8 @@ class TrackerRun:
         return self._state.shows(self._trial.results_hash())
 
     def add_curves(self) -> None:
-        """Log the records that were written since the last call. A run that shows results is left as it is."""
+        """Log the records that were written since the last call. A run that shows results is left
+        as it is."""
         if self._state.complete is not None:
             return
         for name, newest, scalars in self._trial.curves(self._state.logged):
@@ -171,10 +195,12 @@ class TrackerRun:
         self._note()
 
     def end(self) -> None:
-        """Log the rest, and close the run with the trial's end by its files: failed, done, or otherwise killed."""
+        """Log the rest, and close the run with the trial's end by its files: failed, done, or
+        otherwise killed."""
         if self.is_complete:
             return
-        if self._state.complete is not None:  # the run shows earlier results, which new ones have replaced
+        # the run shows earlier results, which new ones have replaced
+        if self._state.complete is not None:
             self._open()
         self.add_curves()
         folder = self._trial.folder
@@ -200,7 +226,8 @@ class TrackerRun:
 
 
 def sync(folders: Iterable[TrialFolder], uri: str | None) -> Iterator[str]:
-    """Mirror ended trials that the tracker lacks; yields a line for each mirrored or left-out trial, and a summary.
+    """Mirror ended trials that the tracker lacks; yields a line for each mirrored or left-out
+    trial, and a summary.
 
     Raises MirrorError if the tracker refuses a trial.
     """
@@ -218,10 +245,12 @@ def sync(folders: Iterable[TrialFolder], uri: str | None) -> Iterator[str]:
             yield f"left out: {error}"
             continue
         options = values["tracking"] | ({"uri": uri} if uri else {})
-        # The runs folder may be somebody else's: it must not make us send files or passwords to an address of theirs.
+        # The runs folder may be somebody else's: it must not make us send files or passwords to an
+        # address of theirs.
         if address := untyped_address(options, uri):
             yield (
-                f"left out: {folder.label}: its configuration names the tracker {address}, and --uri {address} was "
+                f"left out: {folder.label}: its configuration names the tracker {address}, and "
+                f"--uri {address} was "
                 "not typed"
             )
             continue
@@ -241,7 +270,8 @@ def sync(folders: Iterable[TrialFolder], uri: str | None) -> Iterator[str]:
 
 
 def mirror_ended(folder: TrialFolder, options: dict[str, Any], values: dict[str, Any]) -> bool:
-    """Mirror an ended trial; returns False if the tracker lacked nothing. Raises the errors of `TrackerRun`."""
+    """Mirror an ended trial; returns False if the tracker lacked nothing. Raises the errors of
+    `TrackerRun`."""
     with closing(TrackerRun(folder, options, values)) as run:
         if run.is_complete:
             return False
@@ -256,7 +286,8 @@ def refusal(folder: TrialFolder, options: dict[str, Any], error: Exception) -> M
     return MirrorError(f"{sink_of(options).name} does not take {folder.label} ({reason})")
 
 
-Pages = dict[tuple[Path, str | None], tuple[TrialFolder, dict[str, Any]]]  # by experiment and tracker: a trial there
+# by experiment and tracker: a trial there
+Pages = dict[tuple[Path, str | None], tuple[TrialFolder, dict[str, Any]]]
 
 
 def _renew(pages: Pages) -> None:
@@ -276,10 +307,11 @@ Lines = Queue[str | None]  # of stdin; None is the end
 
 
 def follow() -> NoReturn:
-    """Mirror the trials whose folders come as lines on stdin, until stdin ends and the trials have ended.
+    """Mirror the trials whose folders come as lines on stdin, until stdin ends and the trials have
+    ended.
 
-    Arguments of the process: the time between two readings of the files, and how long the parent waits for this process
-    at the end; both in seconds.
+    Arguments of the process: the time between two readings of the files, and how long the parent
+    waits for this process at the end; both in seconds.
     """
     pause, patience = map(float, sys.argv[2:4])
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
@@ -312,7 +344,8 @@ def _follow(lines: Lines, pause: float) -> None:
                 trial.catch_up(last)
             except BusyError:
                 pass
-            except Exception as error:  # any error of the tracker's client: tried again, and raised the last time
+            # any error of the tracker's client: tried again, and raised the last time
+            except Exception as error:
                 if last:
                     raise refusal(trial.folder, trial.options, error) from error
         for trial in trials:
@@ -325,7 +358,8 @@ def _follow(lines: Lines, pause: float) -> None:
 
 
 class _FollowedTrial:
-    """A trial to mirror. Its run is opened once the trial runs or has ended, or when the sweep ends."""
+    """A trial to mirror. Its run is opened once the trial runs or has ended, or when the sweep
+    ends."""
 
     def __init__(self, folder: TrialFolder) -> None:
         self.folder, self.has_ended = folder, False
@@ -334,8 +368,10 @@ class _FollowedTrial:
         self._run: TrackerRun | None = None
 
     def catch_up(self, last: bool) -> None:
-        """Send the new records, and the trial's end once it has ended. ``last`` says that the sweep has ended."""
-        # The state is read before the curves: if it says that the trial has ended, the curves are complete.
+        """Send the new records, and the trial's end once it has ended. ``last`` says that the sweep
+        has ended."""
+        # The state is read before the curves: if it says that the trial has ended, the curves are
+        # complete.
         state = self.folder.state()
         is_waiting = state != "running" and self._run is None and not self._has_ended_since()
         if not (self.folder.path / CONFIG).exists() or (is_waiting and not last):
@@ -351,7 +387,8 @@ class _FollowedTrial:
             self.has_ended = True
 
     def _has_ended_since(self) -> bool:
-        """Return whether the trial has ended since it was added. Older result files are of an earlier run."""
+        """Return whether the trial has ended since it was added. Older result files are of an
+        earlier run."""
         for name in (RESULTS, FAILED):
             with suppress(OSError):
                 if (self.folder.path / name).stat().st_mtime >= self._added_at:
@@ -363,7 +400,7 @@ def _read_input(lines: Lines, patience: float) -> None:
     for line in sys.stdin:
         lines.put(line.rstrip("\n"))
     lines.put(None)
-    # The parent kills this process after its patience. If the parent was killed itself, this ends the process, even
-    # while the tracker's client hangs.
+    # The parent kills this process after its patience. If the parent was killed itself, this ends
+    # the process, even while the tracker's client hangs.
     time.sleep(patience + SECONDS_AFTER_PARENT)
     os._exit(1)

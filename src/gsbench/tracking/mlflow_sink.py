@@ -1,7 +1,8 @@
 """MLflow: the tracker's address, its client, and a trial as an MLflow run.
 
-A metric's time is computed from the trial's files, not from the clock. MLflow drops exact repetitions, so a metric that
-is sent twice is stored once. The trial's folder keeps the run's id, so that no trial gets two runs.
+A metric's time is computed from the trial's files, not from the clock. MLflow drops exact
+repetitions, so a metric that is sent twice is stored once. The trial's folder keeps the run's id,
+so that no trial gets two runs.
 """
 
 from __future__ import annotations
@@ -29,7 +30,8 @@ if TYPE_CHECKING:
 
 VARIABLE = "MLFLOW_TRACKING_URI"
 LOCK = ".mlflow.lock"  # in the runs folder: one process at a time makes tables and experiments
-KIND = {"mlflow.experimentKind": "custom_model_development"}  # else its page opens in the view for chat models
+# else its page opens in the view for chat models
+KIND = {"mlflow.experimentKind": "custom_model_development"}
 # Environment against printing, telemetry and hanging for minutes.
 SETTINGS = {
     "MLFLOW_DISABLE_TELEMETRY": "true",
@@ -38,7 +40,8 @@ SETTINGS = {
     "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "2",
     "MLFLOW_HTTP_REQUEST_TIMEOUT": "20",
     "PGCONNECT_TIMEOUT": "20",
-    # A machine that vanishes within a transaction would lock its rows until TCP gives up, after hours.
+    # A machine that vanishes within a transaction would lock its rows until TCP gives up, after
+    # hours.
     "PGOPTIONS": "-c idle_in_transaction_session_timeout=60s",
 }
 
@@ -48,23 +51,30 @@ def default_uri(runs: Path) -> str:
 
 
 def tracker_uri(uri: str | None, runs: Path) -> str:
-    """The tracker's address: the configured ``uri``, else MLFLOW_TRACKING_URI, else the database in the runs folder."""
+    """The tracker's address: the configured ``uri``, else MLFLOW_TRACKING_URI, else the database in
+    the runs folder."""
     return uri or os.environ.get(VARIABLE) or default_uri(runs)
 
 
 def untyped_address(options: Mapping[str, Any], typed: str | None = None) -> str | None:
-    """The tracker's address in the settings ``tracking`` of a file, if it may not be used; else None.
+    """The tracker's address in the settings ``tracking`` of a file, if it may not be used; else
+    None.
 
     It may be used if it is the ``typed`` one or that of the environment.
     """
     address = options.get("uri")
-    if not options.get("enabled", True) or not address or address in (typed, os.environ.get(VARIABLE)):
+    if (
+        not options.get("enabled", True)
+        or not address
+        or address in (typed, os.environ.get(VARIABLE))
+    ):
         return None
     return str(address)
 
 
 def connect(uri: str | None, runs: Path) -> MlflowClient:
-    """A client of the tracker. Creates a missing database under a lock, since MLflow's own set-up has races."""
+    """A client of the tracker. Creates a missing database under a lock, since MLflow's own set-up
+    has races."""
     for name, value in SETTINGS.items():
         os.environ.setdefault(name, value)
     import mlflow
@@ -82,15 +92,18 @@ def connect(uri: str | None, runs: Path) -> MlflowClient:
 
 
 def ensure_experiment(client: MlflowClient, name: str, runs: Path) -> str:
-    """The id of experiment ``name``, which is created under a lock if missing, and restored if deleted."""
+    """The id of experiment ``name``, which is created under a lock if missing, and restored if
+    deleted."""
     from mlflow.exceptions import MlflowException
 
     with FileLock(runs / LOCK):
         experiment = client.get_experiment_by_name(name)
         if experiment is None:
-            served = str(client.tracking_uri).startswith(("http:", "https:"))  # a server chooses the location itself
+            # a server chooses the location itself
+            served = str(client.tracking_uri).startswith(("http:", "https:"))
             location = None if served else (runs / ARTIFACTS / name).as_uri()
-            with suppress(MlflowException):  # a process on another machine may have created it in the meantime
+            # a process on another machine may have created it in the meantime
+            with suppress(MlflowException):
                 return str(client.create_experiment(name, artifact_location=location, tags=KIND))
             experiment = client.get_experiment_by_name(name)
         if experiment is None:
@@ -104,7 +117,8 @@ def ensure_experiment(client: MlflowClient, name: str, runs: Path) -> str:
 
 
 def require_own_artifacts(client: MlflowClient, address: str, runs: Path) -> None:
-    """Raise InputError if a run in the runs folder's own database has its artifacts outside of that folder.
+    """Raise InputError if a run in the runs folder's own database has its artifacts outside of that
+    folder.
 
     ``address`` is the run's artifact location. Other trackers are not checked: the user typed them.
     """
@@ -112,11 +126,13 @@ def require_own_artifacts(client: MlflowClient, address: str, runs: Path) -> Non
 
     if client.tracking_uri != default_uri(runs):
         return
-    # The runs folder may be somebody else's, and its database name a server that would get files and our password.
+    # The runs folder may be somebody else's, and its database name a server that would get files
+    # and our password.
     place = Path(local_file_uri_to_path(address))
     if not place.is_relative_to(runs / ARTIFACTS) or ".." in place.parts:
         raise InputError(
-            f"{runs / DATABASE} would send artifacts to {address}; if this runs folder was moved, remove {DATABASE} "
+            f"{runs / DATABASE} would send artifacts to {address}; if this runs folder was moved, "
+            f"remove {DATABASE} "
             f"and {ARTIFACTS} there: `gsbench sync` makes them again"
         )
     require_no_links(runs, place, below=True)
@@ -125,8 +141,8 @@ def require_own_artifacts(client: MlflowClient, address: str, runs: Path) -> Non
 def _create_sqlite(uri: str) -> None:
     """Make the database file of a SQLite address if it is missing, completely or not at all.
 
-    MLflow's migrations of SQLite are no transaction: a process that is killed during them leaves tables that no later
-    process can use.
+    MLflow's migrations of SQLite are no transaction: a process that is killed during them leaves
+    tables that no later process can use.
     """
     import sqlalchemy
     from mlflow.store.tracking.sqlalchemy_store import SqlAlchemyStore
@@ -150,7 +166,8 @@ PARAMS_TAG = "gsbench"  # set once all settings are logged
 ERROR_TAG = "error"
 NOTE = "mlflow.note.content"  # the description, in Markdown
 MAX_TAG = 5000  # characters of a tag (MLflow's limit)
-MAX_VALUES = (6000, 500, 250)  # characters of a parameter: MLflow's limit, and the limits of older servers
+# characters of a parameter: MLflow's limit, and the limits of older servers
+MAX_VALUES = (6000, 500, 250)
 
 
 class MlflowSink:
@@ -165,7 +182,8 @@ class MlflowSink:
         self._started = 0  # ms since 1970
 
     def open(self, state: MirrorState, results: str | None) -> MirrorState:
-        """Open the run (see `gsbench.tracking.sinks.Sink`). A deleted run, or one in another tracker, is replaced."""
+        """Open the run (see `gsbench.tracking.sinks.Sink`). A deleted run, or one in another
+        tracker, is replaced."""
         runs, uri = self._trial.folder.runs, str(self.client.tracking_uri)
         if uri == default_uri(runs):
             uri = OWN_DATABASE  # a runs folder may be moved
@@ -175,12 +193,14 @@ class MlflowSink:
             same = f"tags.`{TOKEN_TAG}` = '{state.token}'"
             run = next(iter(self.client.search_runs([experiment_id], same, max_results=1)), None)
         if run is not None and state.complete not in (None, results):
-            self.client.delete_run(run.info.run_id)  # it shows results that are no longer the trial's
+            # it shows results that are no longer the trial's
+            self.client.delete_run(run.info.run_id)
             run = None
         if run is None:
             token = uuid.uuid4().hex
             state = MirrorState(uri=uri, token=token, started=int(time.time() * 1000))
-            # Written before the run is created, so that its token finds it even if the server's answer is lost.
+            # Written before the run is created, so that its token finds it even if the server's
+            # answer is lost.
             write_json(self._trial.folder.path / STATE, state.to_json())
             user = psutil.Process().username()
             tags = self._trial.tags() | {TOKEN_TAG: token, "mlflow.user": user}
@@ -197,7 +217,10 @@ class MlflowSink:
         """Log numbers, which MLflow sends in batches."""
         from mlflow.entities import Metric
 
-        metrics = [Metric(scalar.key, scalar.value, self._time_of(scalar.seconds), scalar.step) for scalar in scalars]
+        metrics = [
+            Metric(scalar.key, scalar.value, self._time_of(scalar.seconds), scalar.step)
+            for scalar in scalars
+        ]
         self.client.log_batch(self.run_id, metrics=metrics)
 
     def complete(self, summary: Summary) -> None:
@@ -213,7 +236,9 @@ class MlflowSink:
             self.client.log_artifact(self.run_id, str(path), folder or None)
         at = self._time_of(summary.seconds)
         for key, picture in summary.pictures.items():
-            self.client.log_image(self.run_id, picture, key=key, step=summary.step, timestamp=at, synchronous=True)
+            self.client.log_image(
+                self.run_id, picture, key=key, step=summary.step, timestamp=at, synchronous=True
+            )
         self.client.set_terminated(self.run_id, "FINISHED")
 
     def stop(self, status: str, reason: str | None) -> None:

@@ -1,4 +1,5 @@
-"""A trial in a tracker's terms, the contract of a tracker, and the trackers TensorBoard and Weights & Biases."""
+"""A trial in a tracker's terms, the contract of a tracker, and the trackers TensorBoard and Weights
+& Biases."""
 
 import os
 import re
@@ -23,7 +24,8 @@ from gsbench.runs.keys import TRAIN, flatten, sha256_of
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import TrialRecord, read_rows
 
-NOT_IN_A_KEY = re.compile(r"[^a-zA-Z0-9_\-. ]")  # characters that MLflow refuses in a picture's name
+# characters that MLflow refuses in a picture's name
+NOT_IN_A_KEY = re.compile(r"[^a-zA-Z0-9_\-. ]")
 Array = NDArray[np.uint8]
 FILES = (layout.CONFIG, layout.RESULTS, layout.INIT_REPORT, layout.PER_VIEW, layout.EVENTS)
 # Trackers sort names and show a chart for each, so only what people look at is sent, results first.
@@ -37,7 +39,14 @@ CURVES: dict[str, dict[str, str]] = {  # by file: key in it -> name in the track
     },
     layout.EVENTS: {
         key: f"train/densify/{key}"
-        for key in ("cloned", "split_gradient", "split_volume", "pruned_opacity", "pruned_size", "blocked_by_cap")
+        for key in (
+            "cloned",
+            "split_gradient",
+            "split_volume",
+            "pruned_opacity",
+            "pruned_size",
+            "blocked_by_cap",
+        )
     },
 }
 
@@ -51,7 +60,8 @@ def picture_key(view: str, kind: str) -> str:
 
 
 def arm_name(densify: str, init: str) -> str:
-    """The name of an arm. What is compared most often comes first, since trackers cut long names at their end."""
+    """The name of an arm. What is compared most often comes first, since trackers cut long names at
+    their end."""
     return f"{densify} · {init}"
 
 
@@ -64,7 +74,8 @@ def eval_name(key: str) -> str:
 
 @dataclass(frozen=True)
 class Scalar:
-    """One number of a trial: its name, its value, the iteration, and the seconds of training until then."""
+    """One number of a trial: its name, its value, the iteration, and the seconds of training until
+    then."""
 
     key: str
     value: float
@@ -74,7 +85,8 @@ class Scalar:
 
 @dataclass(frozen=True)
 class Summary:
-    """Summary of a complete trial: what a tracker shows at its end, in Markdown (``note``) and in numbers."""
+    """Summary of a complete trial: what a tracker shows at its end, in Markdown (``note``) and in
+    numbers."""
 
     note: str
     scalars: Sequence[Scalar]
@@ -107,7 +119,8 @@ class MirrorState(Record):
 class Sink(Protocol):
     """One trial in a tracker. Each method may raise any error of the tracker's client.
 
-    A sink is never closed, since its process ends without clean-up. So each method must send at once what it gets.
+    A sink is never closed, since its process ends without clean-up. So each method must send at
+    once what it gets.
 
     Examples:
         A sink that prints:
@@ -137,20 +150,23 @@ class Sink(Protocol):
     state_file: str  # in the trial's folder, for the state that `open` returns
 
     def open(self, state: MirrorState, results: str | None) -> MirrorState:
-        """Begin a run for the trial, or continue the run that ``state`` names; returns the state to keep.
+        """Begin a run for the trial, or continue the run that ``state`` names; returns the state to
+        keep.
 
-        ``results`` is the hash of the trial's results, None without results. If ``state.complete`` is another hash,
-        the run shows results that are no longer the trial's, and is replaced.
+        ``results`` is the hash of the trial's results, None without results. If ``state.complete``
+        is another hash, the run shows results that are no longer the trial's, and is replaced.
         """
 
     def log(self, scalars: Sequence[Scalar]) -> None:
-        """Log numbers. Some may be repetitions: a process may be killed between sending and noting that."""
+        """Log numbers. Some may be repetitions: a process may be killed between sending and noting
+        that."""
 
     def complete(self, summary: Summary) -> None:
         """Show the results, and that the trial is done."""
 
     def stop(self, status: str, reason: str | None) -> None:
-        """Show that the trial ended without results: ``status`` KILLED, or FAILED for a ``reason``."""
+        """Show that the trial ended without results: ``status`` KILLED, or FAILED for a
+        ``reason``."""
 
 
 @dataclass(frozen=True)
@@ -168,7 +184,10 @@ class TrackedTrial:
     @property
     def label(self) -> str:
         """The run's name: densifier, scene and seed."""
-        return f"{self.values['densify']['name']} · {self.values['scene']['name']} · s{self.values['seed']}"
+        return (
+            f"{self.values['densify']['name']} · {self.values['scene']['name']} · "
+            f"s{self.values['seed']}"
+        )
 
     @property
     def path(self) -> str:
@@ -182,23 +201,39 @@ class TrackedTrial:
 
     def params(self) -> dict[str, str]:
         """The settings that have a value, by their dotted keys. The arm comes first, for charts."""
-        return {"arm": self.arm} | {key: str(value) for key, value in flatten(self.values).items() if str(value)}
+        return {"arm": self.arm} | {
+            key: str(value) for key, value in flatten(self.values).items() if str(value)
+        }
 
     def results_hash(self) -> str | None:
-        """The hash of the results, by which a mirror knows whether it shows them; None without results."""
+        """The hash of the results, by which a mirror knows whether it shows them; None without
+        results."""
         results = self.folder.sound_record()
         return None if results is None else sha256_of(results.to_json())
 
     def curves(self, logged: dict[str, int]) -> Iterator[tuple[str, int, list[Scalar]]]:
-        """Yield for each file of curves with new records: its name, its newest iteration, and the new scalars.
+        """Yield for each file of curves with new records: its name, its newest iteration, and the
+        new scalars.
 
         Records after the iteration ``logged[name]`` are new.
         """
-        building = self.folder.building()  # a training in progress writes to its own folder in the store
+        # a training in progress writes to its own folder in the store
+        building = self.folder.building()
         sources = [Path(building.folder)] if building.stage == TRAIN.name else []
         for name, names in CURVES.items():
-            source = next((folder / name for folder in (*sources, self.folder.path) if (folder / name).exists()), None)
-            records = [] if source is None else [r for r in read_rows(source) if r["step"] > logged.get(name, 0)]
+            source = next(
+                (
+                    folder / name
+                    for folder in (*sources, self.folder.path)
+                    if (folder / name).exists()
+                ),
+                None,
+            )
+            records = (
+                []
+                if source is None
+                else [r for r in read_rows(source) if r["step"] > logged.get(name, 0)]
+            )
             if records:
                 scalars = [
                     Scalar(names[key], float(value), int(record["step"]), _seconds(record))
@@ -209,7 +244,8 @@ class TrackedTrial:
                 yield name, int(records[-1]["step"]), scalars
 
     def summary(self, results: TrialRecord, images: int, with_model: bool) -> Summary:
-        """The summary of the finished trial, with at most ``images`` test views, and the model if ``with_model``."""
+        """The summary of the finished trial, with at most ``images`` test views, and the model if
+        ``with_model``."""
         step, seconds = results.iterations, results.seconds.get("train", results.iterations / 1000)
         numbers = {eval_name(key): value for key, value in results.metrics.items()}
         counts = {
@@ -226,28 +262,44 @@ class TrackedTrial:
             for at, measured in results.metrics_at.items()
             for key, value in measured.metrics.items()
         ]
-        tags = {"protocol": results.protocol, "raster": results.raster, "commit": results.code.commit or "unknown"}
+        tags = {
+            "protocol": results.protocol,
+            "raster": results.raster,
+            "commit": results.code.commit or "unknown",
+        }
         names = (*FILES, *([layout.POINT_CLOUD] if with_model else []))
-        files = [("", self.folder.path / name) for name in names if (self.folder.path / name).exists()]
+        files = [
+            ("", self.folder.path / name) for name in names if (self.folder.path / name).exists()
+        ]
         return Summary(
             note=self._note(results),
-            scalars=scalars + [Scalar(key, float(value), step, seconds) for key, value in numbers.items()],
+            scalars=scalars
+            + [Scalar(key, float(value), step, seconds) for key, value in numbers.items()],
             tags=tags | {f"hash_{key}": value for key, value in results.hashes.items()},
             pictures=self._pictures(images),
-            files=files + [(layout.FIGURES, path) for path in self.folder.pictures(layout.FIGURES)[:images]],
+            files=files
+            + [(layout.FIGURES, path) for path in self.folder.pictures(layout.FIGURES)[:images]],
             step=step,
             seconds=seconds,
         )
 
     def _note(self, results: TrialRecord) -> str:
-        """The results in one line, the folder, and the command that repeats the trial, in Markdown."""
+        """The results in one line, the folder, and the command that repeats the trial, in
+        Markdown."""
         shown = [(find_metric(key), key, value) for key, value in results.metrics.items()]
         texts = [f"{facts.name if facts else key} {value:.4g}" for facts, key, value in shown]
         if results.num_gaussians is not None:
             texts.append(f"{results.num_gaussians:,} Gaussians")
-        lines = [f"{', '.join(texts)} after {results.iterations:,} iterations.", f"Folder: `{self.path}`"]
+        lines = [
+            f"{', '.join(texts)} after {results.iterations:,} iterations.",
+            f"Folder: `{self.path}`",
+        ]
         plan = read_if_sound(self.folder.home / layout.PLAN, _Plan)
-        planned = plan.trials.get(self.folder.path.relative_to(self.folder.home).as_posix()) if plan else None
+        planned = (
+            plan.trials.get(self.folder.path.relative_to(self.folder.home).as_posix())
+            if plan
+            else None
+        )
         if planned:
             lines.append(f"Again: `{shlex.join(['gsbench', *planned.overrides])}`")
         return "\n\n".join(lines)
@@ -290,7 +342,8 @@ def _read_picture(path: Path) -> Array:
 
 
 def _seconds(record: Mapping[str, float]) -> float:
-    """The training time of a record. Without one, a function of its iteration, so that each reading gives the same."""
+    """The training time of a record. Without one, a function of its iteration, so that each reading
+    gives the same."""
     return float(record.get("seconds", record["step"] / 1000))
 
 
@@ -325,7 +378,9 @@ class TensorBoardSink:
     def log(self, scalars: Sequence[Scalar]) -> None:
         """Write numbers, and flush them to the file."""
         for scalar in scalars:
-            self._writer.add_scalar(scalar.key, scalar.value, scalar.step, self._started + scalar.seconds)
+            self._writer.add_scalar(
+                scalar.key, scalar.value, scalar.step, self._started + scalar.seconds
+            )
         self._writer.flush()
 
     def complete(self, summary: Summary) -> None:
@@ -345,7 +400,8 @@ class TensorBoardSink:
 
 # ---- Weights & Biases: ``tracking.uri`` is its server, else WANDB_BASE_URL and WANDB_MODE decide
 
-STEP = "iteration"  # our own axis: W&B's step must only grow, and the two files of curves are read one after the other
+# our own axis: W&B's step must only grow, and the two files of curves are read one after the other
+STEP = "iteration"
 
 
 class WandbSink:
@@ -360,7 +416,8 @@ class WandbSink:
         self._run: Any = None
 
     def open(self, state: MirrorState, results: str | None) -> MirrorState:
-        """Open the run (see `gsbench.tracking.sinks.Sink`). A run with earlier results stays beside the new one."""
+        """Open the run (see `gsbench.tracking.sinks.Sink`). A run with earlier results stays beside
+        the new one."""
         if state.shows(results):
             return state
         if state.complete is not None or state.id is None:
@@ -401,7 +458,9 @@ class WandbSink:
         pictures = {name: wandb.Image(picture) for name, picture in summary.pictures.items()}
         if pictures:
             self._run.log({STEP: summary.step, **pictures})
-        final = {scalar.key: scalar.value for scalar in summary.scalars if scalar.step == summary.step}
+        final = {
+            scalar.key: scalar.value for scalar in summary.scalars if scalar.step == summary.step
+        }
         self._run.summary.update(final)
         self._run.config.update(summary.tags, allow_val_change=True)
         self._run.notes = summary.note

@@ -1,6 +1,7 @@
 """Checkpoints of a training. A kill at any moment leaves a readable one, and damage is detected.
 
-A checkpoint file is the output of ``torch.save`` followed by its sha256; ``torch.load`` reads it as it is.
+A checkpoint file is the output of ``torch.save`` followed by its sha256; ``torch.load`` reads it as
+it is.
 """
 
 import hashlib
@@ -21,7 +22,8 @@ DIGEST_BYTES = hashlib.sha256().digest_size
 
 
 def save_checkpoint(folder: Path, step: int, state: dict[str, Any]) -> None:
-    """Write ``state`` (tensors and plain values) as the checkpoint of ``step``; delete all but the last two."""
+    """Write ``state`` (tensors and plain values) as the checkpoint of ``step``; delete all but the
+    last two."""
     path = folder / f"checkpoint-{step:08d}.pt"
     with atomic(path) as temporary, temporary.open("wb") as stream:
         torch.save(state, stream)
@@ -35,23 +37,28 @@ def save_checkpoint(folder: Path, step: int, state: dict[str, Any]) -> None:
 class CheckpointWriter:
     """Writes checkpoints into ``folder``; after `finish`, all of them are completely on disk.
 
-    With ``background``, `save` copies the state to the CPU, and a thread writes and hashes it while training continues;
-    the next `save` waits for that. This is for models on a GPU. For a model on the CPU, the copy would take longer than
-    the wait.
+    With ``background``, `save` copies the state to the CPU, and a thread writes and hashes it while
+    training continues; the next `save` waits for that. This is for models on a GPU. For a model on
+    the CPU, the copy would take longer than the wait.
     """
 
     def __init__(self, folder: Path, background: bool) -> None:
         self.folder = folder
-        self._executor = ThreadPoolExecutor(1, thread_name_prefix="gsbench-checkpoint") if background else None
+        self._executor = (
+            ThreadPoolExecutor(1, thread_name_prefix="gsbench-checkpoint") if background else None
+        )
         self._pending: Future[None] | None = None
 
     def save(self, step: int, state: dict[str, Any]) -> None:
-        """Save the state of ``step``, perhaps in the background. Raises the error of the previous save if it failed."""
+        """Save the state of ``step``, perhaps in the background. Raises the error of the previous
+        save if it failed."""
         self.finish()
         if self._executor is None:
             save_checkpoint(self.folder, step, state)
         else:
-            self._pending = self._executor.submit(save_checkpoint, self.folder, step, to_host(state))
+            self._pending = self._executor.submit(
+                save_checkpoint, self.folder, step, to_host(state)
+            )
 
     def finish(self) -> None:
         """Wait until the last checkpoint is on disk; raise its error, if it failed."""

@@ -1,7 +1,8 @@
-"""The photometric loss of 3DGS, ``(1 - w) L1 + w (1 - SSIM)`` with w = 0.2: its definition in torch, and the choice of
-the fastest implementation for a device.
+"""The photometric loss of 3DGS, ``(1 - w) L1 + w (1 - SSIM)`` with w = 0.2: its definition in
+torch, and the choice of the fastest implementation for a device.
 
-SSIM is that of `gsbench.eval.ssim`: padded with zeros, the mean over the whole map, as in the reference code of 3DGS.
+SSIM is that of `gsbench.eval.ssim`: padded with zeros, the mean over the whole map, as in the
+reference code of 3DGS.
 """
 
 from collections.abc import Callable
@@ -30,11 +31,14 @@ def torch_photometric_loss(
     return loss, l1.detach(), similarity.detach()
 
 
-def photometric_loss(image: Tensor, target: Tensor, ssim_weight: float = SSIM_WEIGHT) -> tuple[Tensor, Tensor, Tensor]:
-    """The loss, L1 and SSIM of ``image`` [H, W, 3] against ``target`` [H, W, 3] (floating, or uint8 divided by 255).
+def photometric_loss(
+    image: Tensor, target: Tensor, ssim_weight: float = SSIM_WEIGHT
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The loss, L1 and SSIM of ``image`` [H, W, 3] against ``target`` [H, W, 3] (floating, or uint8
+    divided by 255).
 
-    Three scalars; only the loss has a gradient, by ``image``. For many images, a ``PhotometricLoss`` is faster: it has
-    threads and reuses memory.
+    Three scalars; only the loss has a gradient, by ``image``. For many images, a
+    ``PhotometricLoss`` is faster: it has threads and reuses memory.
     """
     return PhotometricLoss(ssim_weight, threads=1)(image, target)
 
@@ -42,8 +46,8 @@ def photometric_loss(image: Tensor, target: Tensor, ssim_weight: float = SSIM_WE
 class PhotometricLoss:
     """``photometric_loss`` as an object that reuses compiled kernels for float32 images.
 
-    On a CPU, kernels run on ``threads`` threads and give the same bits for any number of threads. On a GPU with Triton,
-    they never wait for the device. Other devices and dtypes use torch.
+    On a CPU, kernels run on ``threads`` threads and give the same bits for any number of threads.
+    On a GPU with Triton, they never wait for the device. Other devices and dtypes use torch.
     """
 
     def __init__(self, ssim_weight: float = SSIM_WEIGHT, threads: int | None = None) -> None:
@@ -56,7 +60,8 @@ class PhotometricLoss:
     def __call__(self, image: Tensor, target: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         if image.dim() != 3 or image.shape[-1] != 3 or image.shape != target.shape:
             raise ValueError(
-                f"image {tuple(image.shape)} and target {tuple(target.shape)} must have one shape: [H, W, 3]"
+                f"image {tuple(image.shape)} and target {tuple(target.shape)} must have one "
+                "shape: [H, W, 3]"
             )
         if image.dtype != torch.float32:
             return torch_photometric_loss(image, target, self.ssim_weight)

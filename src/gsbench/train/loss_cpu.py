@@ -1,8 +1,10 @@
-"""The photometric loss compiled for the CPU: one fused forward pass over rows, and a hand-written gradient.
+"""The photometric loss compiled for the CPU: one fused forward pass over rows, and a hand-written
+gradient.
 
-Images stay interleaved [H, W, 3]: a row is 3 W numbers, and horizontal neighbours are 3 numbers apart. So one vector
-holds 16 adjacent numbers of all channels. Each row is filtered horizontally once, into a ring buffer of 11 rows, which
-are then filtered vertically. Statistics of the target are computed again in each step, to need no memory per view.
+Images stay interleaved [H, W, 3]: a row is 3 W numbers, and horizontal neighbours are 3 numbers
+apart. So one vector holds 16 adjacent numbers of all channels. Each row is filtered horizontally
+once, into a ring buffer of 11 rows, which are then filtered vertically. Statistics of the target
+are computed again in each step, to need no memory per view.
 """
 
 from typing import Any
@@ -13,7 +15,17 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from gsbench.eval.ssim import C1, C2, WINDOW_RADIUS, window
-from gsbench.raster.cpu.simd import LANES, absolute, fma, lane_sums, load, load_numbers, select, splat, store
+from gsbench.raster.cpu.simd import (
+    LANES,
+    absolute,
+    fma,
+    lane_sums,
+    load,
+    load_numbers,
+    select,
+    splat,
+    store,
+)
 from gsbench.raster.cpu.workspace import ArenaPool, ShardRunner, TensorPool
 from gsbench.raster.staged import Lifetime
 from gsbench.system.jit import inlined, kernel
@@ -33,7 +45,8 @@ BYTE_MAX = np.float32(255)
 
 @inlined
 def _blur_row(source, start, target, place, numbers):
-    """Filter the padded row at ``source[start:]`` horizontally into ``target[place:]``, without padding."""
+    """Filter the padded row at ``source[start:]`` horizontally into ``target[place:]``, without
+    padding."""
     for i in range(0, numbers, LANES):
         center = start + PAD + i
         total = load(source, center) * WEIGHTS[0]
@@ -45,7 +58,8 @@ def _blur_row(source, start, target, place, numbers):
 
 @inlined
 def _blur_column(ring, first, i, row, stride):
-    """Filter vertically around ``row`` at number ``i``. Rows of the ring start at ``first``, ``stride`` apart."""
+    """Filter vertically around ``row`` at number ``i``. Rows of the ring start at ``first``,
+    ``stride`` apart."""
     total = load(ring, first + row % TAPS * stride + i) * WEIGHTS[0]
     for k in range(1, WINDOW_RADIUS + 1):
         pair = load(ring, first + (row - k + TAPS) % TAPS * stride + i) + load(
@@ -64,14 +78,16 @@ def _sum(vector, scratch):
 
 @inlined
 def _read_row(image, row, numbers, divisor, out):
-    """Read a row of a float32 or uint8 image, divided by ``divisor``, into ``out`` behind its PAD zeros."""
+    """Read a row of a float32 or uint8 image, divided by ``divisor``, into ``out`` behind its PAD
+    zeros."""
     start = row * numbers
     if numbers < LANES:
         for i in range(numbers):
             out[PAD + i] = image[start + i] / divisor
     else:
         for i in range(0, numbers, LANES):
-            place = min(i, numbers - LANES)  # the last vector overlaps the previous one, to end with the row
+            # the last vector overlaps the previous one, to end with the row
+            place = min(i, numbers - LANES)
             store(out, PAD + place, load_numbers(image, start + place) / divisor)
 
 
@@ -90,10 +106,12 @@ def _write_row(line, row, numbers, image):
 
 @kernel
 def similarity_rows(memory, begin, end, height, width, image, target, divisor, derivatives, sums):
-    """Write the sums of SSIM and of |image - target| of the rows ``begin`` to ``end`` to ``sums`` [H, 2].
+    """Write the sums of SSIM and of |image - target| of the rows ``begin`` to ``end`` to ``sums``
+    [H, 2].
 
-    ``derivatives`` [3, H, PAD + 3 W rounded up + PAD], if not empty, gets the derivatives of the sum of SSIM by the
-    blurred image, its blurred square and its blurred product with the target, padded with zeros. ``memory`` is scratch.
+    ``derivatives`` [3, H, PAD + 3 W rounded up + PAD], if not empty, gets the derivatives of the
+    sum of SSIM by the blurred image, its blurred square and its blurred product with the target,
+    padded with zeros. ``memory`` is scratch.
     """
     numbers = width * CHANNELS
     length = (numbers + LANES - 1) // LANES * LANES
@@ -131,7 +149,10 @@ def similarity_rows(memory, begin, end, height, width, image, target, divisor, d
             continue
         similarity = splat(ZERO)
         for i in range(0, numbers, LANES):
-            mean_x, mean_y = _blur_column(ring, 0, i, center, length), _blur_column(ring, part, i, center, length)
+            mean_x, mean_y = (
+                _blur_column(ring, 0, i, center, length),
+                _blur_column(ring, part, i, center, length),
+            )
             square = _blur_column(ring, 2 * part, i, center, length)
             product = _blur_column(ring, 3 * part, i, center, length)
             a1 = fma(mean_x * mean_y, TWO, F_C1)
@@ -147,8 +168,12 @@ def similarity_rows(memory, begin, end, height, width, image, target, divisor, d
                 at = center * padded + PAD + i
                 d_mean = (mean_y * (a2 - a1) - value * mean_x * (b2 - b1)) * inverse * TWO
                 store(derivatives, at, select(inside, d_mean, ZERO))
-                store(derivatives, height * padded + at, select(inside, -value * b1 * inverse, ZERO))
-                store(derivatives, 2 * height * padded + at, select(inside, TWO * a1 * inverse, ZERO))
+                store(
+                    derivatives, height * padded + at, select(inside, -value * b1 * inverse, ZERO)
+                )
+                store(
+                    derivatives, 2 * height * padded + at, select(inside, TWO * a1 * inverse, ZERO)
+                )
         sums[center, 0] = _sum(similarity, scratch)
         if len(derivatives) > 0:
             for m in range(3):
@@ -159,9 +184,21 @@ def similarity_rows(memory, begin, end, height, width, image, target, divisor, d
 
 @kernel
 def gradient_rows(
-    memory, begin, end, height, width, image, target, divisor, derivatives, l1_factor, ssim_factor, gradient
+    memory,
+    begin,
+    end,
+    height,
+    width,
+    image,
+    target,
+    divisor,
+    derivatives,
+    l1_factor,
+    ssim_factor,
+    gradient,
 ):
-    """Compute the rows ``begin`` to ``end`` of ``gradient`` [H * W * 3]. The symmetric blur is its own adjoint."""
+    """Compute the rows ``begin`` to ``end`` of ``gradient`` [H * W * 3]. The symmetric blur is its
+    own adjoint."""
     numbers = width * CHANNELS
     length = (numbers + LANES - 1) // LANES * LANES
     padded = length + 2 * PAD
@@ -205,8 +242,11 @@ class CompiledLoss:
     def __call__(self, image: Tensor, target: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         return _CompiledLossFunction.apply(self, image, target)
 
-    def compute(self, image: Tensor, target: Tensor, differentiate: bool) -> tuple[float, float, Tensor | None]:
-        """Return mean SSIM, mean L1 and, if ``differentiate``, the gradient of the loss by ``image``."""
+    def compute(
+        self, image: Tensor, target: Tensor, differentiate: bool
+    ) -> tuple[float, float, Tensor | None]:
+        """Return mean SSIM, mean L1 and, if ``differentiate``, the gradient of the loss by
+        ``image``."""
         height, width, _ = image.shape
         numbers = image.numel()
         pixels = image.detach().contiguous().numpy().reshape(-1)
@@ -219,7 +259,9 @@ class CompiledLoss:
         holder = Lifetime()
         arena = self._arenas.lease(holder)
         padded = -(-width * CHANNELS // LANES) * LANES + 2 * PAD
-        derivatives = arena.take("derivatives", (3 * height * padded if differentiate else 0,), np.float32)
+        derivatives = arena.take(
+            "derivatives", (3 * height * padded if differentiate else 0,), np.float32
+        )
         memory = arena.take("memory", (SHARDS, MAPS * (TAPS + 1) * padded + LANES), np.float32)
         common = (height, width, pixels, wanted, divisor, derivatives)
 
@@ -232,7 +274,10 @@ class CompiledLoss:
             return total_similarity, total_l1, None
 
         gradient = self._tensors.empty(tuple(image.shape))
-        factors = (np.float32((1 - self.ssim_weight) / numbers), np.float32(self.ssim_weight / numbers))
+        factors = (
+            np.float32((1 - self.ssim_weight) / numbers),
+            np.float32(self.ssim_weight / numbers),
+        )
         flat = gradient.numpy().reshape(-1)
 
         def differentiate_rows(first: int, past: int) -> None:
@@ -246,13 +291,19 @@ class _CompiledLossFunction(torch.autograd.Function):
     """Computes the gradient together with the value; ``backward`` only scales it."""
 
     @staticmethod
-    def forward(ctx: Any, compiled: CompiledLoss, image: Tensor, target: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def forward(
+        ctx: Any, compiled: CompiledLoss, image: Tensor, target: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
         similarity, l1, ctx.gradient = compiled.compute(image, target, ctx.needs_input_grad[1])
         weight = compiled.ssim_weight
         l1_tensor, similarity_tensor = torch.tensor(l1), torch.tensor(similarity)
         ctx.mark_non_differentiable(l1_tensor, similarity_tensor)
         ctx.set_materialize_grads(False)
-        return torch.tensor((1 - weight) * l1 + weight * (1 - similarity)), l1_tensor, similarity_tensor
+        return (
+            torch.tensor((1 - weight) * l1 + weight * (1 - similarity)),
+            l1_tensor,
+            similarity_tensor,
+        )
 
     @staticmethod
     @once_differentiable

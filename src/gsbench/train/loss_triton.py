@@ -1,8 +1,9 @@
 """The photometric loss in Triton kernels. The host never waits for values from the device.
 
-Images stay interleaved [H, W, 3]: a row is 3 W numbers, and horizontal neighbours are 3 numbers apart. A program
-processes a strip of columns from top to bottom, one lane per number of a row. It filters each row horizontally and adds
-it to eleven running vertical sums, of which one is complete at each row.
+Images stay interleaved [H, W, 3]: a row is 3 W numbers, and horizontal neighbours are 3 numbers
+apart. A program processes a strip of columns from top to bottom, one lane per number of a row. It
+filters each row horizontally and adds it to eleven running vertical sums, of which one is complete
+at each row.
 """
 
 from __future__ import annotations
@@ -22,22 +23,24 @@ from gsbench.raster.triton.launch import WorkspacePool, launch_grid
 
 STRIP = 128  # numbers of a row per program
 MIN_ROWS = 8  # rows per program
-# The numbers of programs are chosen for an H100 or H200. A multiprocessor holds four programs at once: it has 65,536
-# registers, and each of the 128 lanes of a program uses at most 128.
+# The numbers of programs are chosen for an H100 or H200. A multiprocessor holds four programs at
+# once: it has 65,536 registers, and each of the 128 lanes of a program uses at most 128.
 MULTIPROCESSORS, PROGRAMS_HELD = 132, 4
 RADIUS = tl.constexpr(WINDOW_RADIUS)
 CHANNELS = tl.constexpr(3)
-W0, W1, W2, W3, W4, W5 = (tl.constexpr(weight) for weight in window()[WINDOW_RADIUS:].tolist())  # from the centre
+# from the centre
+W0, W1, W2, W3, W4, W5 = (tl.constexpr(weight) for weight in window()[WINDOW_RADIUS:].tolist())
 F_C1, F_C2 = tl.constexpr(C1), tl.constexpr(C2)
 
 
 def rows_of_program(height: int, numbers: int) -> int:
     """The number of rows per program, for an image of ``height`` rows of ``numbers``.
 
-    A program filters ``2 * RADIUS`` rows besides its own. So few programs do less work in all, but leave
-    multiprocessors idle. This chooses the number of programs per multiprocessor, all running at once, for which the
-    busiest multiprocessor filters the fewest rows. A single program counts as two, because nothing else runs while it
-    waits for memory. The result depends only on the size of the image, so sums have the same bits on every GPU.
+    A program filters ``2 * RADIUS`` rows besides its own. So few programs do less work in all, but
+    leave multiprocessors idle. This chooses the number of programs per multiprocessor, all running
+    at once, for which the busiest multiprocessor filters the fewest rows. A single program counts
+    as two, because nothing else runs while it waits for memory. The result depends only on the size
+    of the image, so sums have the same bits on every GPU.
     """
     strips = triton.cdiv(numbers, STRIP)
 
@@ -66,7 +69,8 @@ def _zeros(like):
 
 @triton.jit
 def _push(sums, value):
-    """Advance the running sums by one row, whose blurred ``value`` is added. The first sum is then complete."""
+    """Advance the running sums by one row, whose blurred ``value`` is added. The first sum is then
+    complete."""
     return (
         tl.fma(value, W5, sums[1]),
         tl.fma(value, W4, sums[2]),
@@ -93,22 +97,44 @@ def _load(array, row, number, height, numbers, scale):
 def _add(sums, x, y, weight):
     """Add to five weighted sums: of x, y, x^2, y^2 and x y."""
     wx, wy = x * weight, y * weight
-    return (sums[0] + wx, sums[1] + wy, tl.fma(wx, x, sums[2]), tl.fma(wy, y, sums[3]), tl.fma(wx, y, sums[4]))
+    return (
+        sums[0] + wx,
+        sums[1] + wy,
+        tl.fma(wx, x, sums[2]),
+        tl.fma(wy, y, sums[3]),
+        tl.fma(wx, y, sums[4]),
+    )
 
 
 @triton.jit(do_not_specialize=["height", "numbers", "rows"])
 def measure_similarity(
-    image, target, scale, height, numbers, derivatives, sums, rows, DIFFERENTIATE: tl.constexpr, STRIP: tl.constexpr
+    image,
+    target,
+    scale,
+    height,
+    numbers,
+    derivatives,
+    sums,
+    rows,
+    DIFFERENTIATE: tl.constexpr,
+    STRIP: tl.constexpr,
 ):
-    """Write the sums of SSIM and of |image - target scale| over the ``rows`` of this program to ``sums`` [programs, 2].
+    """Write the sums of SSIM and of |image - target scale| over the ``rows`` of this program to
+    ``sums`` [programs, 2].
 
-    If ``DIFFERENTIATE``, ``derivatives`` [3, H, 3 W] gets the derivatives of the sum of SSIM by the blurred image, its
-    blurred square and its blurred product with the target.
+    If ``DIFFERENTIATE``, ``derivatives`` [3, H, 3 W] gets the derivatives of the sum of SSIM by the
+    blurred image, its blurred square and its blurred product with the target.
     """
     number = tl.program_id(0) * STRIP + tl.arange(0, STRIP)  # [STRIP] of a row
     first = tl.program_id(1) * rows
     zero = tl.zeros([STRIP], tl.float32)
-    mean_x, mean_y, square_x, square_y, product = _zeros(zero), _zeros(zero), _zeros(zero), _zeros(zero), _zeros(zero)
+    mean_x, mean_y, square_x, square_y, product = (
+        _zeros(zero),
+        _zeros(zero),
+        _zeros(zero),
+        _zeros(zero),
+        _zeros(zero),
+    )
     total_similarity, total_l1 = zero, zero
     plane = height.to(tl.int64) * numbers
     for row in range(first - RADIUS, tl.minimum(first + rows, height) + RADIUS):
@@ -150,7 +176,8 @@ def measure_similarity(
 
 @triton.jit(do_not_specialize=["programs"])
 def add_up(sums, programs, size, ssim_weight, values, GROUP: tl.constexpr):
-    """Write loss, mean L1 and mean SSIM to ``values`` [3], from ``sums`` [programs, 2] over ``size`` numbers."""
+    """Write loss, mean L1 and mean SSIM to ``values`` [3], from ``sums`` [programs, 2] over
+    ``size`` numbers."""
     similarity, l1 = tl.zeros([GROUP], tl.float32), tl.zeros([GROUP], tl.float32)
     for start in range(0, programs, GROUP):
         program = start + tl.arange(0, GROUP)
@@ -164,7 +191,17 @@ def add_up(sums, programs, size, ssim_weight, values, GROUP: tl.constexpr):
 
 @triton.jit(do_not_specialize=["height", "numbers", "rows"])
 def differentiate(
-    image, target, scale, height, numbers, derivatives, g_loss, ssim_weight, gradient, rows, STRIP: tl.constexpr
+    image,
+    target,
+    scale,
+    height,
+    numbers,
+    derivatives,
+    g_loss,
+    ssim_weight,
+    gradient,
+    rows,
+    STRIP: tl.constexpr,
 ):
     """Compute the ``gradient`` [H, 3 W] by the image. The symmetric blur is its own adjoint."""
     number = tl.program_id(0) * STRIP + tl.arange(0, STRIP)  # [STRIP] of a row
@@ -183,8 +220,14 @@ def differentiate(
                 neighbour = number + side * k * CHANNELS
                 mean += _load(derivatives, row, neighbour, height, numbers, _weight(k))
                 square += _load(derivatives + plane, row, neighbour, height, numbers, _weight(k))
-                product += _load(derivatives + 2 * plane, row, neighbour, height, numbers, _weight(k))
-        d_mean, d_square, d_product = _push(d_mean, mean), _push(d_square, square), _push(d_product, product)
+                product += _load(
+                    derivatives + 2 * plane, row, neighbour, height, numbers, _weight(k)
+                )
+        d_mean, d_square, d_product = (
+            _push(d_mean, mean),
+            _push(d_square, square),
+            _push(d_product, product),
+        )
 
         center = row - RADIUS
         inside = (center >= first) & (number < numbers)
@@ -196,7 +239,8 @@ def differentiate(
 
 
 class TritonLoss:
-    """Calls the kernels with pooled memory; see ``loss.PhotometricLoss``. Same bits on every run on one GPU."""
+    """Calls the kernels with pooled memory; see ``loss.PhotometricLoss``. Same bits on every run on
+    one GPU."""
 
     def __init__(self, ssim_weight: float) -> None:
         self.ssim_weight = ssim_weight
@@ -215,7 +259,9 @@ class _TritonLossFunction(torch.autograd.Function):
     """Connects the kernels with autograd."""
 
     @staticmethod
-    def forward(ctx: Any, loss: TritonLoss, image: Tensor, target: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def forward(
+        ctx: Any, loss: TritonLoss, image: Tensor, target: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
         image = image.contiguous()
         height, numbers = image.shape[0], 3 * image.shape[1]
         differentiated = ctx.needs_input_grad[1]
@@ -225,7 +271,9 @@ class _TritonLossFunction(torch.autograd.Function):
         ctx.holder = Lifetime()
         with torch.cuda.device_of(image):
             memory = loss.pool.lease(ctx.holder, image.device)
-            derivatives = memory.take("derivatives", 3 * image.numel() if differentiated else 0, torch.float32)
+            derivatives = memory.take(
+                "derivatives", 3 * image.numel() if differentiated else 0, torch.float32
+            )
             sums = memory.take("sums", 2 * grid[0] * grid[1], torch.float32)
             values = torch.empty(3, dtype=torch.float32, device=image.device)
             launch_grid(measure_similarity, *grid)(
@@ -240,8 +288,16 @@ class _TritonLossFunction(torch.autograd.Function):
                 DIFFERENTIATE=differentiated,
                 STRIP=STRIP,
             )
-            launch_grid(add_up, 1)(sums, grid[0] * grid[1], float(image.numel()), loss.ssim_weight, values, GROUP=1024)
-        ctx.weight, ctx.scale, ctx.derivatives, ctx.rows, ctx.grid = loss.ssim_weight, scale, derivatives, rows, grid
+            launch_grid(add_up, 1)(
+                sums, grid[0] * grid[1], float(image.numel()), loss.ssim_weight, values, GROUP=1024
+            )
+        ctx.weight, ctx.scale, ctx.derivatives, ctx.rows, ctx.grid = (
+            loss.ssim_weight,
+            scale,
+            derivatives,
+            rows,
+            grid,
+        )
         ctx.save_for_backward(image, target)
         ctx.set_materialize_grads(False)
         total, l1, similarity = values.unbind()

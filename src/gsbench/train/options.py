@@ -8,7 +8,13 @@ from pydantic import NonNegativeInt, PositiveFloat, PositiveInt
 from gsbench.gaussians.paper_values import LearningRates
 from gsbench.settings import MISSING, Fraction, check_settings
 
-WITHOUT_EFFECT_ON_MODEL = ("name", "log_every", "checkpoint_every", "checkpoint_minutes", "volume_histogram")
+WITHOUT_EFFECT_ON_MODEL = (
+    "name",
+    "log_every",
+    "checkpoint_every",
+    "checkpoint_minutes",
+    "volume_histogram",
+)
 
 
 @dataclass
@@ -23,15 +29,18 @@ class TrainConfig(LearningRates):
     densify_interval: PositiveInt = 100
     opacity_reset_interval: PositiveInt = 3000
     mcmc_stop: NonNegativeInt = 25_000  # end of the longer window of 3DGS-MCMC
-    step_after_refine: bool = False  # True: the optimiser steps before a refinement, as in gsplat, so no step is lost
-    resolution_schedule: Literal["none", "pictures", "pictures_and_count"] = (
-        "none"  # DashGaussian: small pictures first
-    )
+    # True: the optimiser steps before a refinement, as in gsplat, so no step is lost
+    step_after_refine: bool = False
+    # DashGaussian: small pictures first
+    resolution_schedule: Literal["none", "pictures", "pictures_and_count"] = "none"
     visible_adam: bool = False  # update visible Gaussians only; a departure from the baseline
-    max_seconds: PositiveFloat | None = None  # time budget; training ends with the first iteration that exceeds it
-    volume_histogram: list[NonNegativeInt] = field(default_factory=lambda: [4000, 8000, 12_000])  # iterations (Fig. 5)
+    # time budget; training ends with the first iteration that exceeds it
+    max_seconds: PositiveFloat | None = None
+    # iterations (Fig. 5)
+    volume_histogram: list[NonNegativeInt] = field(default_factory=lambda: [4000, 8000, 12_000])
     log_every: PositiveInt = 10
-    checkpoint_every: PositiveInt = 1000  # iterations; a killed trial resumes from its last checkpoint
+    # iterations; a killed trial resumes from its last checkpoint
+    checkpoint_every: PositiveInt = 1000
     checkpoint_minutes: PositiveFloat = 10.0  # also so many minutes after the last checkpoint
 
     def __post_init__(self) -> None:

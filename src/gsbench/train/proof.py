@@ -1,9 +1,11 @@
-"""The proof of a rasterizer on a GPU before its first training there: it must agree with the float64 reference.
+"""The proof of a rasterizer on a GPU before its first training there: it must agree with the
+float64 reference.
 
-Kernels are compiled on the user's machine, by its versions of driver, torch and Triton, for its GPU. Tests elsewhere
-say little about that. So the first process that would use an executor on such a combination compares it, in some ten
-seconds, and a stamp below the user's cache folder keeps the result. Executors of the CPU are proven by the tests of
-gsbench and only on request, by ``gsbench doctor --prove``.
+Kernels are compiled on the user's machine, by its versions of driver, torch and Triton, for its
+GPU. Tests elsewhere say little about that. So the first process that would use an executor on such
+a combination compares it, in some ten seconds, and a stamp below the user's cache folder keeps the
+result. Executors of the CPU are proven by the tests of gsbench and only on request, by ``gsbench
+doctor --prove``.
 """
 
 from __future__ import annotations
@@ -42,13 +44,23 @@ from gsbench.train.loss import Loss, PhotometricLoss, torch_photometric_loss
 log = logging.getLogger(__name__)
 
 PACKAGE = Path(__file__).resolve().parents[1]
-# Files and folders whose change calls for a new proof: kernels, what they share, and the proof itself.
-SOURCES = ("raster", "eval/ssim.py", "gaussians/model.py", "gaussians/trainable.py", "train/loss.py",
-           "train/loss_triton.py", "train/proof.py")  # fmt: skip
+# Files and folders whose change calls for a new proof: kernels, what they share, and the proof
+# itself.
+SOURCES = (
+    "raster",
+    "eval/ssim.py",
+    "gaussians/model.py",
+    "gaussians/trainable.py",
+    "train/loss.py",
+    "train/loss_triton.py",
+    "train/proof.py",
+)
 SCENES = (
     Case(33, 49, 50, sh_degree=3),  # tiles of one pixel; Gaussians outside the image
-    Case(48, 37, 120, sh_degree=2, log_scale=-1.0, depth=1.0),  # large ones, and some behind the camera
-    Case(20, 17, 700, sh_degree=1, log_scale=-1.5, logit=-3.0, spread=0.3),  # a block's list has several segments
+    # large ones, and some behind the camera
+    Case(48, 37, 120, sh_degree=2, log_scale=-1.0, depth=1.0),
+    # a block's list has several segments
+    Case(20, 17, 700, sh_degree=1, log_scale=-1.5, logit=-3.0, spread=0.3),
     Case(7, 5, 20, sh_degree=0, log_scale=-3.0),  # smaller than a tile; tiny Gaussians
 )
 STEPS = 10
@@ -57,13 +69,17 @@ TRAINED_TOLERANCE = 2e-3  # of the image after the steps; the CPU's kernels depa
 
 
 def prove(
-    rasterizer: Rasterizer, device: torch.device, scenes: tuple[Case, ...] = SCENES, loss: Loss | None = None
+    rasterizer: Rasterizer,
+    device: torch.device,
+    scenes: tuple[Case, ...] = SCENES,
+    loss: Loss | None = None,
 ) -> RasterProof:
-    """Compare ``rasterizer`` on ``device`` with the reference; some seconds, and the compilation of its kernels.
+    """Compare ``rasterizer`` on ``device`` with the reference; some seconds, and the compilation of
+    its kernels.
 
-    All ``scenes`` are rendered, with gradients; again, for equal bits; and the first is trained for ten steps. An
-    executor that is known to depart where alpha is clamped, and in radii (gsplat), is compared elsewhere. ``loss``
-    is by default that of a training on ``device``.
+    All ``scenes`` are rendered, with gradients; again, for equal bits; and the first is trained for
+    ten steps. An executor that is known to depart where alpha is clamped, and in radii (gsplat), is
+    compared elsewhere. ``loss`` is by default that of a training on ``device``.
     """
     started = time.perf_counter()
     executor = find_executor(rasterizer.name)
@@ -87,12 +103,17 @@ def prove(
     except (torch.OutOfMemoryError, InputError):
         raise
     except Exception as error:  # noqa: BLE001 - whatever a compiler or a driver raises is the result of the proof
-        failures.append(f"{type(error).__name__}: {str(error).strip().splitlines()[0] if str(error).strip() else ''}")
+        failures.append(
+            f"{type(error).__name__}: "
+            f"{str(error).strip().splitlines()[0] if str(error).strip() else ''}"
+        )
     return RasterProof(
         raster=rasterizer.name,
         device=_device_name(device),
         versions=versions_on(device),
-        errors={quantity: off for quantity, off in largest.items() if off == off and off != float("inf")},
+        errors={
+            quantity: off for quantity, off in largest.items() if off == off and off != float("inf")
+        },
         failures=failures,
         seconds=round(time.perf_counter() - started, 1),
     )
@@ -103,46 +124,81 @@ def _render_errors(
 ) -> Iterator[Error]:
     for case in scenes:
         errors = measure(rasterizer, case, str(device))
-        yield from errors if executor.keeps_contract else [e for e in errors if e.quantity != "radius"]
+        yield from (
+            errors if executor.keeps_contract else [e for e in errors if e.quantity != "radius"]
+        )
 
 
-def _repeat_errors(rasterizer: Rasterizer, device: torch.device, scenes: tuple[Case, ...]) -> Iterator[Error]:
+def _repeat_errors(
+    rasterizer: Rasterizer, device: torch.device, scenes: tuple[Case, ...]
+) -> Iterator[Error]:
     first = [_bits(rasterizer, case, str(device)) for case in scenes]
     # Again after the other scenes, so that memory which was used before is seen.
     for case, bits in zip(scenes, first, strict=True):
         again = _bits(rasterizer, case, str(device))
         unequal = [name for name in bits if bits[name] != again[name]]
-        yield Error(str(case), "bits of a second run", float(len(unequal)), 0.5, ", ".join(unequal), " tensors")
+        yield Error(
+            str(case),
+            "bits of a second run",
+            float(len(unequal)),
+            0.5,
+            ", ".join(unequal),
+            " tensors",
+        )
 
 
 def _bits(rasterizer: Rasterizer, case: Case, device: str) -> dict[str, bytes]:
     output, gradients = render_with_gradients(rasterizer, case, torch.float32, device)
     tensors = {"image": output.image, "alpha": output.alpha, "radii": output.radii, **gradients}
     if output.footprint is not None:
-        tensors |= {f"footprint ({name})": values for name, values in vars(output.footprint()).items()}
+        tensors |= {
+            f"footprint ({name})": values for name, values in vars(output.footprint()).items()
+        }
     return {name: tensor.detach().cpu().numpy().tobytes() for name, tensor in tensors.items()}
 
 
-def _training_errors(rasterizer: Rasterizer, device: torch.device, case: Case, loss: Loss) -> Iterator[Error]:
-    """The errors of ten steps with the loss and Adam of the device, in float32, against torch's in float64."""
+def _training_errors(
+    rasterizer: Rasterizer, device: torch.device, case: Case, loss: Loss
+) -> Iterator[Error]:
+    """The errors of ten steps with the loss and Adam of the device, in float32, against torch's in
+    float64."""
     other = dataclasses.replace(case, count=case.count + 1)  # another random scene, to be learnt
     with torch.no_grad():
-        target = ReferenceRasterizer().render(
-            other.gaussians(), case.camera(), case.sh_degree, torch.zeros(3, dtype=torch.float64)
-        ).image.clamp(0, 1)  # fmt: skip
+        target = (
+            ReferenceRasterizer()
+            .render(
+                other.gaussians(),
+                case.camera(),
+                case.sh_degree,
+                torch.zeros(3, dtype=torch.float64),
+            )
+            .image.clamp(0, 1)
+        )
     expected, image = _train(ReferenceRasterizer(), case, target, torch_photometric_loss)
     found, own_image = _train(rasterizer, case, target.to(device, torch.float32), loss)
     for step, (value, reference) in enumerate(zip(found, expected, strict=True), start=1):
         yield Error(
-            str(case), "loss", abs(value / reference - 1), LOSS_TOLERANCE, f"training step {step}", " of itself"
+            str(case),
+            "loss",
+            abs(value / reference - 1),
+            LOSS_TOLERANCE,
+            f"training step {step}",
+            " of itself",
         )
     off = (own_image.double().cpu() - image).abs()
-    yield Error(str(case), "trained image", float(off.max()), TRAINED_TOLERANCE, f"training step {STEPS}")
+    yield Error(
+        str(case), "trained image", float(off.max()), TRAINED_TOLERANCE, f"training step {STEPS}"
+    )
 
 
-def _train(rasterizer: Rasterizer, case: Case, target: Tensor, loss: Loss) -> tuple[list[float], Tensor]:
-    """The losses of ten steps towards ``target`` [H, W, 3], whose device and dtype count, and the last image."""
-    model = TrainableGaussians(case.gaussians().map(lambda tensor: tensor.to(target)), LearningRates(), 1.0)
+def _train(
+    rasterizer: Rasterizer, case: Case, target: Tensor, loss: Loss
+) -> tuple[list[float], Tensor]:
+    """The losses of ten steps towards ``target`` [H, W, 3], whose device and dtype count, and the
+    last image."""
+    model = TrainableGaussians(
+        case.gaussians().map(lambda tensor: tensor.to(target)), LearningRates(), 1.0
+    )
     black = target.new_zeros(3)
     losses = []
     for step in range(1, STEPS + 1):
@@ -156,7 +212,8 @@ def _train(rasterizer: Rasterizer, case: Case, target: Tensor, loss: Loss) -> tu
 
 
 def versions_on(device: torch.device) -> dict[str, str]:
-    """Versions and digests of all that makes the kernels on ``device``: a change of any calls for a new proof."""
+    """Versions and digests of all that makes the kernels on ``device``: a change of any calls for a
+    new proof."""
     digest = hashlib.sha256()
     for source in SOURCES:
         root = PACKAGE / source
@@ -188,17 +245,29 @@ def _device_name(device: torch.device) -> str:
 
 def stamp_folder() -> Path:
     """The folder of the results of proofs, in the user's cache."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")) / "gsbench" / "proofs"
+    return (
+        Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"))
+        / "gsbench"
+        / "proofs"
+    )
 
 
 def stamp_of(raster: str, device: torch.device) -> Path:
     """The file of the last proof of ``raster`` on ``device`` with the versions that are here."""
-    parts = [raster, _device_name(device), *(f"{name} {version}" for name, version in versions_on(device).items())]
-    return stamp_folder() / f"{raster}-{hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:16]}.json"
+    parts = [
+        raster,
+        _device_name(device),
+        *(f"{name} {version}" for name, version in versions_on(device).items()),
+    ]
+    return (
+        stamp_folder()
+        / f"{raster}-{hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:16]}.json"
+    )
 
 
 def prove_apart(raster: str, device: str) -> RasterProof:
-    """`prove` the executor called ``raster`` in a process of its own, where a fault cannot take this one along."""
+    """`prove` the executor called ``raster`` in a process of its own, where a fault cannot take
+    this one along."""
     try:
         return run_isolated(_prove_by_name, raster, device, what=f"the proof of raster={raster}")
     except torch.OutOfMemoryError as error:
@@ -209,7 +278,12 @@ def prove_apart(raster: str, device: str) -> RasterProof:
         place = torch.device(device)
         versions = versions_on(place)
         return RasterProof(
-            raster=raster, device=_device_name(place), versions=versions, errors={}, failures=[str(error)], seconds=0.0
+            raster=raster,
+            device=_device_name(place),
+            versions=versions,
+            errors={},
+            failures=[str(error)],
+            seconds=0.0,
         )
 
 
@@ -219,12 +293,14 @@ def _prove_by_name(raster: str, device: str) -> RasterProof:
 
 
 def known_proof(raster: str, device: torch.device) -> RasterProof | None:
-    """The last proof of ``raster`` on ``device`` with the versions that are here; None if there is none."""
+    """The last proof of ``raster`` on ``device`` with the versions that are here; None if there is
+    none."""
     return read_if_sound(stamp_of(raster, device), RasterProof)
 
 
 def proof_of(raster: str, device: torch.device, again: bool = False) -> RasterProof:
-    """The proof of ``raster`` on ``device``: the one that passed earlier, or a new one. Two processes make it once.
+    """The proof of ``raster`` on ``device``: the one that passed earlier, or a new one. Two
+    processes make it once.
 
     With ``again``, always a new one.
     """
@@ -233,20 +309,30 @@ def proof_of(raster: str, device: torch.device, again: bool = False) -> RasterPr
         known = None if again else known_proof(raster, device)
         if known is not None and known.passed:
             return known
-        log.info("raster=%s: comparing it with the reference on %s, once", raster, _device_name(device))
+        log.info(
+            "raster=%s: comparing it with the reference on %s, once", raster, _device_name(device)
+        )
         proof = prove_apart(raster, str(device))
         try:
             write_json(stamp, proof.to_json())
         except OSError as error:
-            log.warning("raster=%s: the proof cannot be kept, so each process repeats it: %s", raster, error)
+            log.warning(
+                "raster=%s: the proof cannot be kept, so each process repeats it: %s", raster, error
+            )
     if proof.passed:
-        log.info("raster=%s: agrees with the reference on %s (%.0f s)", raster, proof.device, proof.seconds)
+        log.info(
+            "raster=%s: agrees with the reference on %s (%.0f s)",
+            raster,
+            proof.device,
+            proof.seconds,
+        )
     return proof
 
 
 @contextmanager
 def _exclusive(stamp: Path) -> Iterator[None]:
-    """Hold the lock of ``stamp``. Without a folder to write to there is nothing to share, so nothing is locked."""
+    """Hold the lock of ``stamp``. Without a folder to write to there is nothing to share, so
+    nothing is locked."""
     try:
         stamp.parent.mkdir(parents=True, exist_ok=True)
         writable = os.access(stamp.parent, os.W_OK)
@@ -260,7 +346,8 @@ def _exclusive(stamp: Path) -> Iterator[None]:
 
 
 class Proven(NamedTuple):
-    """A rasterizer, its proof (None on a CPU), and a line for each better one that ``raster=auto`` passed over."""
+    """A rasterizer, its proof (None on a CPU), and a line for each better one that ``raster=auto``
+    passed over."""
 
     rasterizer: Rasterizer
     proof: RasterProof | None = None
@@ -283,7 +370,9 @@ def create_proven(name: str, device: torch.device, threads: int | None = None) -
         except InputError as error:  # it cannot run here
             proof, reason = None, str(error)
         if not reason:
-            return Proven(create_rasterizer(executor.name, device, threads), proof, tuple(passed_over))
+            return Proven(
+                create_rasterizer(executor.name, device, threads), proof, tuple(passed_over)
+            )
         passed_over.append(f"raster={executor.name} is not used: {reason}")
         if name == AUTO:
             log.warning("%s", passed_over[-1])
@@ -294,6 +383,7 @@ def _describe(proof: RasterProof, stamp: Path) -> str:
     more = len(proof.failures) - 1
     versions = ", ".join(f"{name} {version}" for name, version in proof.versions.items())
     return (
-        f"it departs from the reference on {proof.device}: {proof.failures[0]}{f' (and {more} more)' if more else ''}; "
+        f"it departs from the reference on {proof.device}: "
+        f"{proof.failures[0]}{f' (and {more} more)' if more else ''}; "
         f"{versions}; please report it with {stamp}"
     )

@@ -1,4 +1,5 @@
-"""Training on small pictures first, with as many Gaussians as they can show (DashGaussian, arXiv 2503.18402)."""
+"""Training on small pictures first, with as many Gaussians as they can show (DashGaussian, arXiv
+2503.18402)."""
 
 import math
 from collections.abc import Sequence
@@ -23,14 +24,15 @@ NUM_POINTS = 32  # of the schedule, equally spaced in the spectrum that they sho
 
 @dataclass(frozen=True)
 class ScaleSchedule:
-    """A schedule: from iteration ``begins[i]`` the sides of pictures are divided by ``scales[i]``, which falls to 1."""
+    """A schedule: from iteration ``begins[i]`` the sides of pictures are divided by ``scales[i]``,
+    which falls to 1."""
 
     begins: tuple[int, ...]
     scales: tuple[float, ...]
 
     def at(self, step: int) -> int:
-        """The whole number by which iteration ``step`` divides sides; between two points, the area of pictures grows
-        linearly."""
+        """The whole number by which iteration ``step`` divides sides; between two points, the area
+        of pictures grows linearly."""
         area = np.interp(step, self.begins, [scale**-2 for scale in self.scales])
         return int(area**-0.5 + 1e-9)
 
@@ -42,46 +44,74 @@ class ScaleSchedule:
 
 
 def scale_schedule(images: Sequence[NDArray[np.uint8]], until: int) -> ScaleSchedule:
-    """The schedule for training on ``images`` [H, W, 3] from iteration 0 to ``until`` (arXiv 2503.18402).
+    """The schedule for training on ``images`` [H, W, 3] from iteration 0 to ``until`` (arXiv
+    2503.18402).
 
-    A picture reduced to a fraction of its size keeps the central window of that fraction of its spectrum; the energy of
-    a size is the sum of the moduli of the Fourier transform over this window. The first size has at least a quarter of
-    the energy of every picture, but divides sides by at most 8. The points of the schedule are equally spaced in the
-    energy of the mean picture. Their iterations are proportional to the logarithm of energy / first energy.
+    A picture reduced to a fraction of its size keeps the central window of that fraction of its
+    spectrum; the energy of a size is the sum of the moduli of the Fourier transform over this
+    window. The first size has at least a quarter of the energy of every picture, but divides sides
+    by at most 8. The points of the schedule are equally spaced in the energy of the mean picture.
+    Their iterations are proportional to the logarithm of energy / first energy.
     """
     sides = {side for image in images for side in image.shape[:2]}
     # From 0 to 1, the fractions at which a central window over a spectrum gains pixels.
-    fractions = np.unique([0.0, 1.0, *(2 * k / side for side in sides for k in range(side // 2 + 1))])  # [F]
+    fractions = np.unique(
+        [0.0, 1.0, *(2 * k / side for side in sides for k in range(side // 2 + 1))]
+    )  # [F]
     curves = np.stack([_window_energies(image, fractions) for image in images])  # [V, F]
     if not (curves[:, -1] > 0).all():  # a black picture has no energy at any size
         return ScaleSchedule((0,), (1.0,))
-    largest = min(MAX_SCALE, *(1 / _first_reaching(fractions, curve, FIRST_SHARE * curve[-1]) for curve in curves))
+    largest = min(
+        MAX_SCALE,
+        *(1 / _first_reaching(fractions, curve, FIRST_SHARE * curve[-1]) for curve in curves),
+    )
     mean = curves.mean(0)
     first, whole = float(mean[fractions <= 1 / largest + 1e-12][-1]), float(mean[-1])
     energies = np.linspace(first, whole, NUM_POINTS)
-    scales = [largest, *(1 / _first_reaching(fractions, mean, energy) for energy in energies[1:-1]), 1.0]
-    begins = [int(until * math.log(e / first) / math.log(whole / first)) if whole > first else 0 for e in energies]
+    scales = [
+        largest,
+        *(1 / _first_reaching(fractions, mean, energy) for energy in energies[1:-1]),
+        1.0,
+    ]
+    begins = [
+        int(until * math.log(e / first) / math.log(whole / first)) if whole > first else 0
+        for e in energies
+    ]
     begins[-1] = until
-    points = dict(zip(begins, map(float, scales), strict=True))  # of several points at one iteration, the last
+    # of several points at one iteration, the last
+    points = dict(zip(begins, map(float, scales), strict=True))
     return ScaleSchedule(tuple(points), tuple(points.values()))
 
 
-def _window_energies(image: NDArray[np.uint8], fractions: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The energy of an image's spectrum within central windows of the sizes ``fractions`` [F], [F]; the last window is
-    the whole spectrum."""
-    spectrum = np.fft.fftshift(np.abs(np.fft.fft2(image / 255.0, axes=(0, 1))), axes=(0, 1)).sum(-1)  # [H, W]
+def _window_energies(
+    image: NDArray[np.uint8], fractions: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """The energy of an image's spectrum within central windows of the sizes ``fractions`` [F], [F];
+    the last window is the whole spectrum."""
+    spectrum = np.fft.fftshift(np.abs(np.fft.fft2(image / 255.0, axes=(0, 1))), axes=(0, 1)).sum(
+        -1
+    )  # [H, W]
     height, width = spectrum.shape
     sums = np.zeros((height + 1, width + 1))  # summed-area table
     sums[1:, 1:] = spectrum.cumsum(0).cumsum(1)
     row, column = height // 2, width // 2  # of frequency zero
-    half_height, half_width = ((side * fractions / 2 + 1e-9).astype(int) for side in (height, width))  # [F] px
-    top, bottom, left, right = row - half_height, row + half_height, column - half_width, column + half_width
+    half_height, half_width = (
+        (side * fractions / 2 + 1e-9).astype(int) for side in (height, width)
+    )  # [F] px
+    top, bottom, left, right = (
+        row - half_height,
+        row + half_height,
+        column - half_width,
+        column + half_width,
+    )
     energies = sums[bottom, right] - sums[top, right] - sums[bottom, left] + sums[top, left]
     energies[-1] = sums[-1, -1]
     return energies
 
 
-def _first_reaching(fractions: NDArray[np.float64], curve: NDArray[np.float64], value: float) -> float:
+def _first_reaching(
+    fractions: NDArray[np.float64], curve: NDArray[np.float64], value: float
+) -> float:
     """The least of ``fractions`` at which a rising ``curve`` [F] reaches ``value``."""
     return float(fractions[np.argmax(curve >= value * (1 - 1e-12))])
 
@@ -96,13 +126,15 @@ MAX_GROWTH = 0.2  # of the count, in one round
 class Resolution:
     """The size of the pictures at each iteration, and the limit on the count that goes with it.
 
-    Sizes depend only on the pictures and on the densification window of ``options``; they change after rounds.
+    Sizes depend only on the pictures and on the densification window of ``options``; they change
+    after rounds.
     """
 
     def __init__(self, options: TrainConfig, views: Sequence[View], initial: int) -> None:
         self.options, self.initial = options, initial
         self.schedule = scale_schedule([view.image for view in views], options.densify_stop)
-        self.momentum = FIRST_MOMENTUM * initial  # Gaussians beyond ``initial`` that pictures of full size may have
+        # Gaussians beyond ``initial`` that pictures of full size may have
+        self.momentum = FIRST_MOMENTUM * initial
 
     def scale(self, step: int) -> int:
         """The number by which the sides of pictures are divided at iteration ``step``."""
@@ -113,16 +145,17 @@ class Resolution:
         return self.schedule.at(last_round if last_round > options.densify_start else 0)
 
     def position_step(self, step: int) -> float:
-        """The iteration of the means' learning-rate schedule to use at iteration ``step``: the schedule starts when the
-        sides are divided by less than two."""
+        """The iteration of the means' learning-rate schedule to use at iteration ``step``: the
+        schedule starts when the sides are divided by less than two."""
         end, wait = self.options.position_steps, self.schedule.full_from
         return end * max(0, step - wait) / max(end - wait, 1)
 
     def limit(self, refinement: Refinement, most: int | None) -> int:
         """The limit on the count after a round: n0 + (n - n0) / s^(2 - x), and n in the last round.
 
-        n0 is the initial count, n the limit ``most`` for pictures of full size (None: n0 plus the momentum), s the
-        number that divides the sides, x the progress of the window. A round adds at most a fifth of the count.
+        n0 is the initial count, n the limit ``most`` for pictures of full size (None: n0 plus the
+        momentum), s the number that divides the sides, x the progress of the window. A round adds
+        at most a fifth of the count.
         """
         options, step = self.options, refinement.step
         added = self.momentum if most is None else most - self.initial
@@ -131,15 +164,21 @@ class Resolution:
         return min(self.initial + added, int((1 + MAX_GROWTH) * refinement.event.before))
 
     def observe(self, event: RefineEvent) -> None:
-        """Update the momentum by the number of candidates of a round: those that grew and those that were refused."""
+        """Update the momentum by the number of candidates of a round: those that grew and those
+        that were refused."""
         candidates = sum(getattr(event, name) for name in RefineEvent.GROWN) + event.blocked_by_cap
-        self.momentum = max(self.momentum, int(KEPT_MOMENTUM * self.momentum + min(MAX_CANDIDATES, candidates)))
+        self.momentum = max(
+            self.momentum, int(KEPT_MOMENTUM * self.momentum + min(MAX_CANDIDATES, candidates))
+        )
 
 
 class ScaledViews:
-    """The cameras and images of the training views, reduced. The full size and the last other size are cached."""
+    """The cameras and images of the training views, reduced. The full size and the last other size
+    are cached."""
 
-    def __init__(self, views: Sequence[View], targets: Targets, device: torch.device, budget: int | None) -> None:
+    def __init__(
+        self, views: Sequence[View], targets: Targets, device: torch.device, budget: int | None
+    ) -> None:
         self._full, self._device, self._budget = views, device, budget
         self._targets = {1: targets}
         self._cameras: dict[int, list[Camera]] = {1: [view.camera for view in views]}
@@ -154,10 +193,13 @@ class ScaledViews:
 
 
 def _reduced(view: View, scale: int) -> View:
-    """``view`` with sides divided by ``scale``, by the authors' filter (`scene.images.resize_image` has another)."""
+    """``view`` with sides divided by ``scale``, by the authors' filter (`scene.images.resize_image`
+    has another)."""
     width, height = max(1, view.camera.width // scale), max(1, view.camera.height // scale)
     image = torch.from_numpy(view.image).permute(2, 0, 1).unsqueeze(0).float()  # [1, 3, H, W]
     small = torch.nn.functional.interpolate(image, (height, width), mode="bilinear", antialias=True)
-    pixels = small.round().to(torch.uint8).squeeze(0).permute(1, 2, 0).contiguous().numpy()  # [height, width, 3]
+    pixels = (
+        small.round().to(torch.uint8).squeeze(0).permute(1, 2, 0).contiguous().numpy()
+    )  # [height, width, 3]
     mask = None if view.mask is None else resize_mask(view.mask, width, height)
     return replace(view, camera=view.camera.resized(width, height), image=pixels, mask=mask)

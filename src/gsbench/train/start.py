@@ -1,7 +1,9 @@
-"""Checks of what a training starts from: can its views show the initial points, and do the colours agree?
+"""Checks of what a training starts from: can its views show the initial points, and do the colours
+agree?
 
-A cloud in other coordinates, a point far outside, or a camera far from the others still gives a number. Each of these
-is an error or a warning here, before the first iteration. The measured facts are kept with the results.
+A cloud in other coordinates, a point far outside, or a camera far from the others still gives a
+number. Each of these is an error or a warning here, before the first iteration. The measured facts
+are kept with the results.
 """
 
 from __future__ import annotations
@@ -27,8 +29,8 @@ MAX_POINTS = 20_000  # measured, evenly spaced in the cloud's order: the check t
 # Lengths are in sizes of the ring of cameras (`camera_size`).
 FAR = 1e4  # no photograph tells the depth of a point so far away
 MAX_DISTANCE = 1e7  # squares of such lengths leave the range in which float32 can train
-# Limits of the warnings. Clouds by structure from motion have .97 or more in view and an agreement of .6 to .9; one of
-# another scene or with turned axes has an agreement of -.1 to .2.
+# Limits of the warnings. Clouds by structure from motion have .97 or more in view and an agreement
+# of .6 to .9; one of another scene or with turned axes has an agreement of -.1 to .2.
 MIN_SEEN = 0.1
 MIN_AGREEMENT = 0.25
 MAX_IDENTICAL = 0.5
@@ -48,29 +50,34 @@ def check_start(
     random_points: bool = False,
     normalization: Normalization = IDENTITY,
 ) -> InitialCloud:
-    """Measure the initial ``points`` [P, 3] with ``colors`` [P, 3] against the training views; warn below the limits.
+    """Measure the initial ``points`` [P, 3] with ``colors`` [P, 3] against the training views; warn
+    below the limits.
 
-    Positions are those of the training; messages undo ``normalization``. ``random_points`` says that points and colours
-    were drawn at random, so they need not fit the photographs.
+    Positions are those of the training; messages undo ``normalization``. ``random_points`` says
+    that points and colours were drawn at random, so they need not fit the photographs.
 
     Raises InputError for a start from which nothing can be learnt.
     """
     if scene.extent == 0:
         raise InputError(
-            f"scene {scene.name}: all training cameras stand at one place, so no depth can be learnt: take photographs "
+            f"scene {scene.name}: all training cameras stand at one place, so no depth can be "
+            "learnt: take photographs "
             "from several places"
         )
     warnings = far_cameras(scene) + odd_lenses(scene)
     _warn(scene, warnings)  # before the errors below, which they may explain
     middle, from_middle = camera_distances(scene)
-    # A camera far off sets the extent, but not the median distance. That is 0 if most cameras stand at one place.
+    # A camera far off sets the extent, but not the median distance. That is 0 if most cameras stand
+    # at one place.
     size = float(np.median(from_middle)) or scene.extent
     distances = np.linalg.norm(points - middle, axis=1) / size  # [P]
     farthest = int(distances.argmax())
     if not distances[farthest] <= MAX_DISTANCE:
         raise InputError(
-            f"initial point {farthest} of {len(points):,} is {distances[farthest]:.3g} times as far from the cameras "
-            f"as they are from each other, at {_place(points[farthest], normalization)}: remove it from the cloud"
+            f"initial point {farthest} of {len(points):,} is {distances[farthest]:.3g} times as "
+            "far from the cameras "
+            f"as they are from each other, at {_place(points[farthest], normalization)}: remove "
+            "it from the cloud"
         )
     identical = _identical_share(points)
     if identical == 1.0:
@@ -80,7 +87,8 @@ def check_start(
     seen_by, shown = _views_of(points[chosen], scene.train)
     if not seen_by.any():
         raise InputError(
-            "no training view has one of the initial points in view: the cloud lies in other coordinates than the "
+            "no training view has one of the initial points in view: the cloud lies in other "
+            "coordinates than the "
             "cameras; bring it into theirs"
         )
     facts = InitialCloud(
@@ -94,7 +102,9 @@ def check_start(
     doubts = _doubts(facts, random_points)
     if not random_points and len(colors) > 1 and colors.std(axis=0).max() < MIN_COLOR_SPREAD:
         shade = ", ".join(str(level) for level in colors[0])
-        doubts.append(f"all initial points have the colour ({shade}): export the cloud with its colours")
+        doubts.append(
+            f"all initial points have the colour ({shade}): export the cloud with its colours"
+        )
     _warn(scene, doubts)
     return replace(facts, warnings=warnings + doubts)
 
@@ -111,14 +121,23 @@ def _doubts(facts: InitialCloud, random_points: bool) -> list[str]:
         far = counted(facts.far, "initial point")
         lines.append(f"{far} more than {FAR:,.0f} times as far off as the cameras: clean the cloud")
     if facts.identical > MAX_IDENTICAL:
-        lines.append(f"{facts.identical:.0%} of the initial points share their place with another: thin the cloud")
+        lines.append(
+            f"{facts.identical:.0%} of the initial points share their place with another: thin "
+            "the cloud"
+        )
     if random_points:
         return lines
     elsewhere = "the cloud may lie in other coordinates, or have another scale, than the cameras"
     if facts.seen < MIN_SEEN:
-        lines.append(f"only {facts.seen:.1%} of the initial points are in view of two training views: {elsewhere}")
+        lines.append(
+            f"only {facts.seen:.1%} of the initial points are in view of two training views: "
+            f"{elsewhere}"
+        )
     if facts.spread < MIN_SPREAD:
-        lines.append(f"half of the initial points lie within {facts.spread:.2g} of the cameras' distances: {elsewhere}")
+        lines.append(
+            f"half of the initial points lie within {facts.spread:.2g} of the cameras' distances: "
+            f"{elsewhere}"
+        )
     if facts.color_agreement is not None and facts.color_agreement < MIN_AGREEMENT:
         lines.append(
             "the colours of the initial points hardly agree with the photographs (agreement "
@@ -128,14 +147,17 @@ def _doubts(facts: InitialCloud, random_points: bool) -> list[str]:
 
 
 def far_cameras(scene: Scene) -> list[str]:
-    """A line for each training camera far from the others: it sets the scene extent, and with it all rates and sizes.
+    """A line for each training camera far from the others: it sets the scene extent, and with it
+    all rates and sizes.
 
-    3DGS takes the extent from the farthest camera. Global structure from motion sometimes leaves such a camera.
+    3DGS takes the extent from the farthest camera. Global structure from motion sometimes leaves
+    such a camera.
     """
     _, distances = camera_distances(scene)
     typical = float(np.median(distances))
     return [
-        f"the camera of {view.name} is {distance / typical:,.0f} times as far from the others as they usually are, and "
+        f"the camera of {view.name} is {distance / typical:,.0f} times as far from the others as "
+        "they usually are, and "
         f"sets the scene extent to {scene.extent:.4g}: check its pose, or leave the image out"
         for view, distance in zip(scene.train, distances, strict=True)
         if distance > FAR_CAMERA * typical > 0
@@ -143,7 +165,8 @@ def far_cameras(scene: Scene) -> list[str]:
 
 
 def odd_lenses(scene: Scene) -> list[str]:
-    """A line for each way in which intrinsics differ from those of common lenses, such as values in other units."""
+    """A line for each way in which intrinsics differ from those of common lenses, such as values in
+    other units."""
     names: dict[str, list[str]] = defaultdict(list)
     lines: dict[str, str] = {}
     for view in scene.train:
@@ -159,13 +182,19 @@ def _odd_about(camera: Camera) -> dict[str, str]:
     field = math.degrees(2 * math.atan(width / (2 * camera.fx)))
     odd = {}
     if not MIN_FIELD_OF_VIEW < field < MAX_FIELD_OF_VIEW:
-        odd["field"] = f"a focal length of {camera.fx:.4g} px for a width of {width} px: check its unit"
+        odd["field"] = (
+            f"a focal length of {camera.fx:.4g} px for a width of {width} px: check its unit"
+        )
     if not 1 / MAX_PIXEL_RATIO < camera.fy / camera.fx < MAX_PIXEL_RATIO:
-        odd["ratio"] = f"focal lengths of {camera.fx:.4g} and {camera.fy:.4g} px, but pixels are square: check both"
+        odd["ratio"] = (
+            f"focal lengths of {camera.fx:.4g} and {camera.fy:.4g} px, but pixels are square: "
+            "check both"
+        )
     least, most = CENTRAL
     if not (least < camera.cx / width < most and least < camera.cy / height < most):
         odd["center"] = (
-            f"its principal point at ({camera.cx:.4g}, {camera.cy:.4g}) of {width}x{height} px, far from the middle: "
+            f"its principal point at ({camera.cx:.4g}, {camera.cy:.4g}) of {width}x{height} px, "
+            "far from the middle: "
             "check its unit, unless the photographs were cropped"
         )
     return odd
@@ -190,11 +219,14 @@ def _identical_share(points: Array) -> float:
     return float(counts[counts > 1].sum() / len(points))
 
 
-def _views_of(points: Array, views: tuple[View, ...]) -> tuple[NDArray[np.int64], NDArray[np.int16]]:
-    """The number of views that have each point in view, [P], and its colour in the nearest of these, [P, 3], else -1.
+def _views_of(
+    points: Array, views: tuple[View, ...]
+) -> tuple[NDArray[np.int64], NDArray[np.int16]]:
+    """The number of views that have each point in view, [P], and its colour in the nearest of
+    these, [P, 3], else -1.
 
-    A point is in view if it lies beyond the near plane and within the image. Occlusion is ignored; the nearest view is
-    the least likely to be occluded. Pixels that a mask ignores have no colour.
+    A point is in view if it lies beyond the near plane and within the image. Occlusion is ignored;
+    the nearest view is the least likely to be occluded. Pixels that a mask ignores have no colour.
     """
     seen_by = np.zeros(len(points), dtype=np.int64)
     shown = np.full((len(points), 3), -1, dtype=np.int16)
@@ -206,7 +238,11 @@ def _views_of(points: Array, views: tuple[View, ...]) -> tuple[NDArray[np.int64]
         x, y, z = local[ahead].T
         column, row = np.floor([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy])
         inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-        seen, column, row = ahead[inside], column[inside].astype(np.int64), row[inside].astype(np.int64)
+        seen, column, row = (
+            ahead[inside],
+            column[inside].astype(np.int64),
+            row[inside].astype(np.int64),
+        )
         seen_by[seen] += 1
         distance = np.linalg.norm(local[seen], axis=1)
         is_nearer = distance < nearest[seen]
@@ -218,10 +254,12 @@ def _views_of(points: Array, views: tuple[View, ...]) -> tuple[NDArray[np.int64]
 
 
 def _agreement(colors: NDArray[np.uint8], shown: NDArray[np.int16]) -> float | None:
-    """Compare the points' ``colors`` [P, 3] with those ``shown`` in the photographs [P, 3], -1 where there is none.
+    """Compare the points' ``colors`` [P, 3] with those ``shown`` in the photographs [P, 3], -1
+    where there is none.
 
-    1 minus the mean difference over the mean difference to the colours shown for all points: 1 is equal, 0 is chance.
-    None if the points or the photographs have one colour, or fewer than two points are shown.
+    1 minus the mean difference over the mean difference to the colours shown for all points: 1 is
+    equal, 0 is chance. None if the points or the photographs have one colour, or fewer than two
+    points are shown.
     """
     is_shown = shown[:, 0] >= 0
     own, photograph = colors[is_shown].astype(np.int64), shown[is_shown].astype(np.int64)  # [S, 3]
@@ -229,8 +267,11 @@ def _agreement(colors: NDArray[np.uint8], shown: NDArray[np.int16]) -> float | N
         return None
     levels = np.arange(256)
     apart = np.abs(levels[:, None] - levels)  # [256, 256]
-    chance = 0.0  # the mean over all pairs of a point and a shown colour, by histograms of the channels
+    # the mean over all pairs of a point and a shown colour, by histograms of the channels
+    chance = 0.0
     for channel in range(3):
-        counts, counts_shown = (np.bincount(x[:, channel], minlength=256) / len(own) for x in (own, photograph))
+        counts, counts_shown = (
+            np.bincount(x[:, channel], minlength=256) / len(own) for x in (own, photograph)
+        )
         chance += counts @ apart @ counts_shown / 3
     return float(1 - np.abs(own - photograph).mean() / chance)

@@ -67,7 +67,8 @@ class LossLog:
             self._take()
 
     def wait(self) -> dict[str, float]:
-        """Wait for all losses; return ``step``, ``loss``, ``l1`` and ``ssim`` of the latest iteration.
+        """Wait for all losses; return ``step``, ``loss``, ``l1`` and ``ssim`` of the latest
+        iteration.
 
         Raises FloatingPointError, which names the first iteration whose total was not finite.
         """
@@ -80,7 +81,11 @@ class LossLog:
         loss, l1, ssim, total = readback.values().tolist()
         if not math.isfinite(total):
             raise FloatingPointError(f"the loss became {total} at iteration {step}")
-        self.smoothed = loss if math.isnan(self.smoothed) else SMOOTHING * self.smoothed + (1 - SMOOTHING) * loss
+        self.smoothed = (
+            loss
+            if math.isnan(self.smoothed)
+            else SMOOTHING * self.smoothed + (1 - SMOOTHING) * loss
+        )
         self._latest = {"step": step, "loss": loss, "l1": l1, "ssim": ssim}
 
 
@@ -97,10 +102,11 @@ class Status:
 class Trainer:
     """Trains Gaussians on the training views of a scene.
 
-    All random numbers come from generators seeded by ``seed``. ``run`` writes metrics, events and checkpoints into a
-    folder and resumes from the newest checkpoint there. On the CPU, a resumed run gives the same bits as an
-    uninterrupted one. A signal to stop (see `gsbench.system.stopping`) ends the run after the current iteration, with
-    a checkpoint. At the iterations ``snapshot_at`` the model is saved, too (see `snapshot_file`).
+    All random numbers come from generators seeded by ``seed``. ``run`` writes metrics, events and
+    checkpoints into a folder and resumes from the newest checkpoint there. On the CPU, a resumed
+    run gives the same bits as an uninterrupted one. A signal to stop (see
+    `gsbench.system.stopping`) ends the run after the current iteration, with a checkpoint. At the
+    iterations ``snapshot_at`` the model is saved, too (see `snapshot_file`).
     """
 
     def __init__(
@@ -113,11 +119,18 @@ class Trainer:
         seed: int,
         snapshot_at: Collection[int] = (),
     ) -> None:
-        self.scene, self.densifier, self.rasterizer, self.options = scene, densifier, rasterizer, options
+        self.scene, self.densifier, self.rasterizer, self.options = (
+            scene,
+            densifier,
+            rasterizer,
+            options,
+        )
         self.snapshot_at = frozenset(snapshot_at)
         self.device = initial.means.device
         initial = densifier.prepare(initial)
-        self.background = torch.tensor(list(options.background), dtype=torch.float32, device=self.device)  # [3]
+        self.background = torch.tensor(
+            list(options.background), dtype=torch.float32, device=self.device
+        )  # [3]
         self.gaussians = TrainableGaussians(initial, options, scene.extent)
         self.loss = PhotometricLoss(options.ssim_weight, torch.get_num_threads())
         self.rngs = generators(seed)
@@ -129,7 +142,12 @@ class Trainer:
         image_budget = None if free is None else int(SHARE_FOR_IMAGES * free)
         self.targets = Targets(scene.train, self.device, image_budget)
         views = SceneViews(
-            scene.train, self.targets, rasterizer, self.background, self.loss, partial(sh_degree_at, options)
+            scene.train,
+            self.targets,
+            rasterizer,
+            self.background,
+            self.loss,
+            partial(sh_degree_at, options),
         )
         self.scaled_views = ScaledViews(scene.train, self.targets, self.device, image_budget)
         scheduled = options.resolution_schedule != "none"
@@ -140,8 +158,11 @@ class Trainer:
         self.context = DensifyContext(scene.extent, is_white, self.device, views, limit)
         densifier.begin(initial, self.context)
 
-    def run(self, folder: Path, on_status: Callable[[Status], None] = lambda status: None) -> Gaussians:
-        """Train to the last iteration or the end of the time budget; return the Gaussians, detached."""
+    def run(
+        self, folder: Path, on_status: Callable[[Status], None] = lambda status: None
+    ) -> Gaussians:
+        """Train to the last iteration or the end of the time budget; return the Gaussians,
+        detached."""
         self._resume(folder)
         if self.snapshot_at:
             (folder / snapshot_file(0)).parent.mkdir(exist_ok=True)
@@ -153,13 +174,19 @@ class Trainer:
             writer.close()
         if not isinstance(self.densifier, NoDensifier) and (folder / EVENTS).stat().st_size == 0:
             log.warning(
-                "not one refinement was due in %d iterations: the densifier changed nothing (see train.densify_start, "
-                "now %d)", self.step, self.options.densify_start,
-            )  # fmt: skip
+                "not one refinement was due in %d iterations: the densifier changed nothing (see "
+                "train.densify_start, "
+                "now %d)",
+                self.step,
+                self.options.densify_start,
+            )
         return self.gaussians.values.detach()
 
-    def _loop(self, folder: Path, writer: CheckpointWriter, on_status: Callable[[Status], None]) -> None:
-        """Iterate until the end, a signal to stop or the end of the time budget; write metrics, events, checkpoints."""
+    def _loop(
+        self, folder: Path, writer: CheckpointWriter, on_status: Callable[[Status], None]
+    ) -> None:
+        """Iterate until the end, a signal to stop or the end of the time budget; write metrics,
+        events, checkpoints."""
         options = self.options
         first_step, started, earlier_seconds = self.step, time.perf_counter(), self.seconds
         last_checkpoint = time.monotonic()
@@ -168,13 +195,18 @@ class Trainer:
                 counts = {"num_gaussians": len(self.gaussians)}
                 event = self.iterate(folder)
                 self.seconds = earlier_seconds + time.perf_counter() - started
-                out_of_time = options.max_seconds is not None and self.seconds >= options.max_seconds
+                out_of_time = (
+                    options.max_seconds is not None and self.seconds >= options.max_seconds
+                )
                 last = self.step == options.iterations or out_of_time
                 if event is not None:
                     append(events, event.as_dict())
                 if self.step in options.volume_histogram:
                     with (folder / HISTOGRAMS).open("a") as stream:
-                        append(stream, volume_histogram(self.step, self.gaussians.values.log_scales.detach()))
+                        append(
+                            stream,
+                            volume_histogram(self.step, self.gaussians.values.log_scales.detach()),
+                        )
                 if self.step % options.log_every == 0 or last:
                     record = self.losses.wait() | counts | {"sh_degree": self.sh_degree}
                     if self.resolution is not None:
@@ -185,7 +217,10 @@ class Trainer:
                     append(metrics, record | {"seconds": round(self.seconds, 3)})
                     on_status(Status(self.step, self.losses.smoothed, len(self.gaussians), rate))
                 minutes = (time.monotonic() - last_checkpoint) / 60
-                due = self.step % options.checkpoint_every == 0 or minutes >= options.checkpoint_minutes
+                due = (
+                    self.step % options.checkpoint_every == 0
+                    or minutes >= options.checkpoint_minutes
+                )
                 stop = requested()
                 if stop or (due and not last):
                     writer.save(self.step, self._state())
@@ -197,14 +232,17 @@ class Trainer:
                     break
 
     def iterate(self, folder: Path) -> RefineEvent | None:
-        """Run one iteration in 3DGS's order: rates, SH degree, render, backward, statistics, refinement, Adam.
+        """Run one iteration in 3DGS's order: rates, SH degree, render, backward, statistics,
+        refinement, Adam.
 
-        Its losses reach ``losses``, on a GPU with a delay. Snapshots are written below ``folder``. Raises TrainingError
-        if a parameter is out of range or no Gaussian is left.
+        Its losses reach ``losses``, on a GPU with a delay. Snapshots are written below ``folder``.
+        Raises TrainingError if a parameter is out of range or no Gaussian is left.
         """
         self.step += 1
         step, options = self.step, self.options
-        self.gaussians.set_step(step if self.resolution is None else self.resolution.position_step(step))
+        self.gaussians.set_step(
+            step if self.resolution is None else self.resolution.position_step(step)
+        )
         index = self.order.next()
         _, targets = self.scaled_views.at(self.scale)
         target = targets.get(index)
@@ -212,12 +250,15 @@ class Trainer:
             render = self.render(index)
         except ValueError as error:  # the rasterizer rejects a parameter that is out of range
             raise TrainingError(f"iteration {step}: {error}; {_last_state(folder)}") from error
-        loss, l1, ssim = self.loss(replace_ignored(render.image, target, targets.mask(index)), target)
+        loss, l1, ssim = self.loss(
+            replace_ignored(render.image, target, targets.mask(index)), target
+        )
         regularizer = self.densifier.regularizer(self.gaussians.values)
         total = loss if regularizer is None else loss + regularizer
         self.losses.add(step, loss, l1, ssim, total)
         total.backward()
-        if step == options.iterations:  # as in 3DGS, which saves its model before it refines and steps
+        # as in 3DGS, which saves its model before it refines and steps
+        if step == options.iterations:
             return None
         if step in self.snapshot_at:
             write_ply(self.gaussians.values, folder / snapshot_file(step))
@@ -232,7 +273,8 @@ class Trainer:
         self.densifier.after_step(step, self.gaussians, self.rngs["densify"])
         if len(self.gaussians) == 0:
             raise TrainingError(
-                f"no Gaussian was left after iteration {step}: pruning thresholds or a decay are too high"
+                f"no Gaussian was left after iteration {step}: pruning thresholds or a decay are "
+                "too high"
             )
         return event
 
@@ -240,7 +282,9 @@ class Trainer:
         """Render the training view ``index`` as in the present iteration, with gradients."""
         camera = self.scaled_views.at(self.scale)[0][index]
         # Passed only if needed: a user's rasterizer may not have this argument.
-        extra: dict[str, Any] = {"splitting_matrix": True} if self.densifier.needs_splitting_matrix else {}
+        extra: dict[str, Any] = (
+            {"splitting_matrix": True} if self.densifier.needs_splitting_matrix else {}
+        )
         return self.rasterizer.render(
             self.gaussians.values,
             camera,
@@ -252,15 +296,18 @@ class Trainer:
 
     @contextmanager
     def _explained(self, folder: Path) -> Iterator[None]:
-        """Raise TrainingError, with the last good state, if the loss is not finite or the device's memory is full."""
+        """Raise TrainingError, with the last good state, if the loss is not finite or the device's
+        memory is full."""
         try:
             yield
         except FloatingPointError as error:
             raise TrainingError(f"{error}; {_last_state(folder)}") from error
         except torch.OutOfMemoryError as error:
             raise TrainingError(
-                f"iteration {self.step}: {self.device} has no memory left at {len(self.gaussians):,} Gaussians; "
-                f"{_last_state(folder)}; lower densify.max_gaussians, scene.max_size or the number of trials at once "
+                f"iteration {self.step}: {self.device} has no memory left at "
+                f"{len(self.gaussians):,} Gaussians; "
+                f"{_last_state(folder)}; lower densify.max_gaussians, scene.max_size or the "
+                "number of trials at once "
                 "(launch.parallel), or end other programs on that device"
             ) from error
 
@@ -274,7 +321,9 @@ class Trainer:
         return 1 if self.resolution is None else self.resolution.scale(self.step)
 
     def _optimize(self, visible: Tensor) -> None:
-        self.gaussians.optimizer_step(self.sh_degree, visible if self.options.visible_adam else None)
+        self.gaussians.optimizer_step(
+            self.sh_degree, visible if self.options.visible_adam else None
+        )
 
     def _state(self) -> dict[str, Any]:
         self.losses.wait()  # raises if a loss was not finite: such a state must not be saved
@@ -292,7 +341,11 @@ class Trainer:
     def _resume(self, folder: Path) -> None:
         state = load_checkpoint(folder)
         if state is not None:
-            self.step, self.seconds, self.losses.smoothed = state["step"], state["seconds"], state["smoothed_loss"]
+            self.step, self.seconds, self.losses.smoothed = (
+                state["step"],
+                state["seconds"],
+                state["smoothed_loss"],
+            )
             self.gaussians = TrainableGaussians.load(
                 state["gaussians"], self.gaussians.rates, self.gaussians.spatial_scale, self.device
             )
@@ -312,7 +365,8 @@ def _last_state(folder: Path) -> str:
 
 
 def snapshot_file(step: int) -> str:
-    """The path, below a training's folder, of the model at iteration ``step``, before it refines (as 3DGS saves it)."""
+    """The path, below a training's folder, of the model at iteration ``step``, before it refines
+    (as 3DGS saves it)."""
     return f"snapshots/iteration_{step}.ply"
 
 
@@ -325,7 +379,8 @@ LOG_VOLUME_BINS = np.linspace(-18, 3, 85)  # log10 of world units^3, in steps of
 
 
 def volume_histogram(step: int, log_scales: Tensor) -> dict[str, Any]:
-    """The record of iteration ``step`` with a histogram of volumes, for Gaussians with ``log_scales`` [N, 3]."""
+    """The record of iteration ``step`` with a histogram of volumes, for Gaussians with
+    ``log_scales`` [N, 3]."""
     volumes = (log_volume(log_scales) / math.log(10)).cpu().numpy()
     clipped = np.clip(volumes, LOG_VOLUME_BINS[0], LOG_VOLUME_BINS[-1])
     counts, edges = np.histogram(clipped, LOG_VOLUME_BINS)
@@ -339,9 +394,11 @@ def append(stream: TextIO, record: dict[str, Any]) -> None:
 
 
 def drop_after(path: Path, step: int) -> None:
-    """Remove records later than ``step`` and an incomplete last line from a JSON-lines file, if the file exists.
+    """Remove records later than ``step`` and an incomplete last line from a JSON-lines file, if the
+    file exists.
 
-    A resumed training writes the removed records again. A kill leaves the old or the new file, never a part of one.
+    A resumed training writes the removed records again. A kill leaves the old or the new file,
+    never a part of one.
     """
     if path.exists():
         write_text(path, "".join(f"{line}\n" for line, at in whole_lines(path) if at <= step))

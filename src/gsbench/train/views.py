@@ -1,4 +1,5 @@
-"""The training views: their random order, their images on the device, and renders of them for densifiers."""
+"""The training views: their random order, their images on the device, and renders of them for
+densifiers."""
 
 import logging
 from collections.abc import Callable, Sequence
@@ -16,15 +17,21 @@ from gsbench.scene.types import View
 from gsbench.train.loss import PhotometricLoss
 from gsbench.words import readable_bytes
 
-STREAMS = ("cameras", "densify")  # every random number of a training comes from one of these streams
+# every random number of a training comes from one of these streams
+STREAMS = ("cameras", "densify")
 
 
 def generators(seed: int) -> dict[str, torch.Generator]:
     """A CPU generator for each of `STREAMS`. Streams, also of different seeds, are independent."""
-    states = [np.random.SeedSequence([seed, stream]).generate_state(1, np.uint64)[0] for stream in range(len(STREAMS))]
+    states = [
+        np.random.SeedSequence([seed, stream]).generate_state(1, np.uint64)[0]
+        for stream in range(len(STREAMS))
+    ]
     # 63 bits: torch takes seeds below 2^63.
     seeds = zip(STREAMS, states, strict=True)
-    return {name: torch.Generator().manual_seed(int(state >> np.uint64(1))) for name, state in seeds}
+    return {
+        name: torch.Generator().manual_seed(int(state >> np.uint64(1))) for name, state in seeds
+    }
 
 
 class CameraOrder:
@@ -47,14 +54,18 @@ log = logging.getLogger(__name__)
 class Targets:
     """The images of ``views`` on ``device``, [H, W, 3] uint8 each.
 
-    If all images fit into ``budget`` bytes (None: no limit), they stay on the device; otherwise `get` copies each. On a
-    CPU they share memory with the views. Masks, which need a third of the memory, always stay on the device.
+    If all images fit into ``budget`` bytes (None: no limit), they stay on the device; otherwise
+    `get` copies each. On a CPU they share memory with the views. Masks, which need a third of the
+    memory, always stay on the device.
     """
 
-    def __init__(self, views: Sequence[View], device: torch.device, budget: int | None = None) -> None:
+    def __init__(
+        self, views: Sequence[View], device: torch.device, budget: int | None = None
+    ) -> None:
         self._images = [torch.from_numpy(view.image) for view in views]
         self._masks = [
-            None if view.mask is None else torch.from_numpy(view.mask).to(device)[..., None] for view in views
+            None if view.mask is None else torch.from_numpy(view.mask).to(device)[..., None]
+            for view in views
         ]
         self._device = device
         self.bytes = sum(image.numel() for image in self._images)
@@ -63,16 +74,21 @@ class Targets:
             self._images = [image.to(device) for image in self._images]
         else:
             log.info(
-                "the %d training images (%s) leave too little memory on %s: each is copied when it is needed",
-                len(self._images), readable_bytes(self.bytes), device,
-            )  # fmt: skip
+                "the %d training images (%s) leave too little memory on %s: each is copied when "
+                "it is needed",
+                len(self._images),
+                readable_bytes(self.bytes),
+                device,
+            )
 
     def mask(self, index: int) -> Tensor | None:
-        """The mask of view ``index``, True where a pixel counts, [H, W, 1] on the device; None if all pixels count."""
+        """The mask of view ``index``, True where a pixel counts, [H, W, 1] on the device; None if
+        all pixels count."""
         return self._masks[index]
 
     def get(self, index: int) -> Tensor:
-        """The image of view ``index``, perhaps still being copied: use it only in work queued after this call."""
+        """The image of view ``index``, perhaps still being copied: use it only in work queued after
+        this call."""
         image = self._images[index]
         if self.resident or self._device.type != "cuda":
             return image
@@ -82,9 +98,11 @@ class Targets:
 
 @dataclass(frozen=True)
 class SceneViews:
-    """Training views for densifiers, rendered and measured as in training (`gsbench.densify.scores.TrainingViews`).
+    """Training views for densifiers, rendered and measured as in training
+    (`gsbench.densify.scores.TrainingViews`).
 
-    Pixels that a mask ignores are replaced by those of the photograph, so that they have no error and no gradient.
+    Pixels that a mask ignores are replaced by those of the photograph, so that they have no error
+    and no gradient.
     """
 
     views: Sequence[View]

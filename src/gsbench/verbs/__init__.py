@@ -1,4 +1,5 @@
-"""The verbs of the command line: functions ``VERB(argv, runs) -> exit code``, where ``runs`` is the runs folder."""
+"""The verbs of the command line: functions ``VERB(argv, runs) -> exit code``, where ``runs`` is the
+runs folder."""
 
 import importlib
 from collections.abc import Callable
@@ -6,16 +7,28 @@ from pathlib import Path
 
 VERBS = {  # their modules, with their purposes as `gsbench --help` lists them
     "fetch": ("fetch", "download public scenes: Mip-NeRF 360, Tanks and Temples, Deep Blending"),
-    "evaluate": ("exchange", "measure renders of any program; --as enters them beside an experiment's arms"),
+    "evaluate": (
+        "exchange",
+        "measure renders of any program; --as enters them beside an experiment's arms",
+    ),
     "tables": ("results", "Markdown, CSV, LaTeX or HTML tables of an experiment"),
     "report": ("results", "one HTML file with the evidence of an experiment"),
-    "check": ("claims", "test the claims of a paper, written in a file: supported, refuted or undecided"),
+    "check": (
+        "claims",
+        "test the claims of a paper, written in a file: supported, refuted or undecided",
+    ),
     "gate": ("versions", "for continuous integration: is this version worse than a trusted one?"),
     "bisect": ("versions", "which commit of a trainer made its results worse?"),
     "plan": ("claims", "how many scenes and seeds you need to see a difference"),
-    "ablate": ("claims", "which part of a densifier makes its gain: train all combinations of its switches"),
+    "ablate": (
+        "claims",
+        "which part of a densifier makes its gain: train all combinations of its switches",
+    ),
     "pool": ("exchange", "one answer from many archives of results (export --results)"),
-    "vote": ("vote", "ask people: a blind comparison page (make), and the verdict of their votes (judge)"),
+    "vote": (
+        "vote",
+        "ask people: a blind comparison page (make), and the verdict of their votes (judge)",
+    ),
     "site": ("exchange", "a static site from archives: tables that sort, verdicts, reports"),
     "explain": ("results", "the trials, settings and code behind a number of a table"),
     "status": ("trials", "the state of every trial: done, running, failed, missing"),
@@ -23,7 +36,10 @@ VERBS = {  # their modules, with their purposes as `gsbench --help` lists them
     "bench": ("machine", "time rasterizers and the training step"),
     "sync": ("trials", "send to MLflow the trials that it lacks"),
     "ui": ("servers", "compare the arms of an experiment in MLflow, in the browser"),
-    "export": ("exchange", "copy a trained model, an initial cloud or an experiment's results for others"),
+    "export": (
+        "exchange",
+        "copy a trained model, an initial cloud or an experiment's results for others",
+    ),
     "view": ("servers", "look at trained models in the browser: one, or two side by side"),
     "doctor": ("machine", "check this machine and say what is missing"),
 }
@@ -32,5 +48,7 @@ VERBS = {  # their modules, with their purposes as `gsbench --help` lists them
 def load_verb(name: str) -> Callable[[list[str], Path], int]:
     """The function of a verb; its module is imported only now."""
     module, _ = VERBS[name]
-    function: Callable[[list[str], Path], int] = getattr(importlib.import_module(f"gsbench.verbs.{module}"), name)
+    function: Callable[[list[str], Path], int] = getattr(
+        importlib.import_module(f"gsbench.verbs.{module}"), name
+    )
     return function

@@ -12,7 +12,8 @@ MAX_PORT = 65535
 
 
 class ArgumentParser(argparse.ArgumentParser):
-    """An argparse parser that raises InputError for what it does not understand; ``--help`` prints and exits.
+    """An argparse parser that raises InputError for what it does not understand; ``--help`` prints
+    and exits.
 
     ``gsbench VERB --help`` prints the verb's purpose, and ``more``.
     """
@@ -24,13 +25,20 @@ class ArgumentParser(argparse.ArgumentParser):
         super().__init__(prog=f"gsbench {verb}".strip(), description=description, **options)
 
     def parse_args(self, args: Any = None, namespace: Any = None) -> Any:
-        # Settings may stand anywhere on the line, and permissions also before the first positional word.
+        # Settings may stand anywhere on the line, and permissions also before the first positional
+        # word.
         words = sorted(args or [], key=lambda word: word.lstrip("+").startswith("allow_targets="))
         parsed, unknown = self.parse_known_intermixed_args(words, namespace)
         if unknown:
             options = [option for action in self._actions for option in action.option_strings]
-            hints = (did_you_mean(word.partition("=")[0], options) for word in unknown if word.startswith("--"))
-            self.error(f"unrecognized arguments: {' '.join(unknown)}{next(filter(None, hints), '')}")
+            hints = (
+                did_you_mean(word.partition("=")[0], options)
+                for word in unknown
+                if word.startswith("--")
+            )
+            self.error(
+                f"unrecognized arguments: {' '.join(unknown)}{next(filter(None, hints), '')}"
+            )
         return parsed
 
     def error(self, message: str) -> NoReturn:
@@ -54,15 +62,24 @@ def path(text: str) -> Path:
 
 def add_question(parser: argparse.ArgumentParser) -> None:
     """Add the arguments that say what is trained, and which metric decides."""
-    parser.add_argument("settings", nargs="*", metavar="KEY=VALUE", help="of the trials, as of a sweep; no seeds")
-    parser.add_argument("--metric", default="psnr", help="decides: psnr (the default), lpips_squeeze, gaussians, …")
-    parser.add_argument("--least", help="the least difference that matters, as 0.1 or 10%%; default: the metric's")
+    parser.add_argument(
+        "settings", nargs="*", metavar="KEY=VALUE", help="of the trials, as of a sweep; no seeds"
+    )
+    parser.add_argument(
+        "--metric", default="psnr", help="decides: psnr (the default), lpips_squeeze, gaussians, …"
+    )
+    parser.add_argument(
+        "--least", help="the least difference that matters, as 0.1 or 10%%; default: the metric's"
+    )
 
 
 def add_where(parser: argparse.ArgumentParser) -> None:
-    """Add ``--where KEY=VALUE``, whose values `gsbench.analysis.cells.select_trials` takes as a dict."""
+    """Add ``--where KEY=VALUE``, whose values `gsbench.analysis.cells.select_trials` takes as a
+    dict."""
     text = "only such trials (repeatable)"
-    parser.add_argument("--where", type=_condition, action="append", default=[], metavar="KEY=VALUE", help=text)
+    parser.add_argument(
+        "--where", type=_condition, action="append", default=[], metavar="KEY=VALUE", help=text
+    )
 
 
 def _condition(text: str) -> tuple[str, str]:

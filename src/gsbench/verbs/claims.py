@@ -1,4 +1,5 @@
-"""Verbs that answer whether an idea helps: ``gsbench check``, ``plan`` and ``ablate`` (docs/claims.md)."""
+"""Verbs that answer whether an idea helps: ``gsbench check``, ``plan`` and ``ablate``
+(docs/claims.md)."""
 
 import argparse
 import math
@@ -38,8 +39,12 @@ DEFAULT_METRIC = "psnr"
 
 def check(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: 0 for any verdicts; raises InputError for bad input."""
-    parser = ArgumentParser("check", "It runs trials until each claim is decided, and writes a page (docs/claims.md).")
-    parser.add_argument("claims", type=path, help="a YAML file, such as conf/claims/volumetric.yaml")
+    parser = ArgumentParser(
+        "check", "It runs trials until each claim is decided, and writes a page (docs/claims.md)."
+    )
+    parser.add_argument(
+        "claims", type=path, help="a YAML file, such as conf/claims/volumetric.yaml"
+    )
     parser.add_argument(
         "permissions",
         nargs="*",
@@ -47,23 +52,32 @@ def check(argv: Sequence[str], runs: Path) -> int:
         metavar="allow_targets=[MINE]",
         help="what the claims' arms may run beside gsbench; a file of claims cannot allow it",
     )
-    parser.add_argument("--dry-run", action="store_true", help="show trials, time and what is not testable here")
+    parser.add_argument(
+        "--dry-run", action="store_true", help="show trials, time and what is not testable here"
+    )
     parser.add_argument(
         "--from",
         dest="archive",
         type=path,
         metavar="ARCHIVE",
-        help="make the verdicts again from what gsbench export --results wrote; runs nothing, needs no photographs",
+        help="make the verdicts again from what gsbench export --results wrote; runs nothing, "
+        "needs no photographs",
     )
-    parser.add_argument("--out", type=path, metavar="PAGE", help="with --from: write the whole page, a .html file")
+    parser.add_argument(
+        "--out", type=path, metavar="PAGE", help="with --from: write the whole page, a .html file"
+    )
     options = parser.parse_args(argv)
     file = read_claims(options.claims)
     if options.archive is not None:
         if options.dry_run:
-            raise InputError("check --from runs nothing, so no other option than --out goes with it")
+            raise InputError(
+                "check --from runs nothing, so no other option than --out goes with it"
+            )
         return _recheck(file, options.archive, options.out)
     if options.out is not None:
-        raise InputError(f"--out goes with --from; what is run here writes {HTML} beside its trials")
+        raise InputError(
+            f"--out goes with --from; what is run here writes {HTML} beside its trials"
+        )
     check = prepare(file, runs, missing_folders, _permissions(options.permissions))
     if options.dry_run:
         print("\n".join(describe(check)))
@@ -73,7 +87,8 @@ def check(argv: Sequence[str], runs: Path) -> int:
 
 
 def _recheck(file: ClaimsFile, archive: Path, out: Path | None) -> int:
-    """Print the verdicts by the archive's trials, and write their page to ``out`` if given; returns 0.
+    """Print the verdicts by the archive's trials, and write their page to ``out`` if given; returns
+    0.
 
     Raises InputError for an ``out`` of another format.
     """
@@ -95,22 +110,34 @@ def _permissions(words: Sequence[str]) -> Sequence[str]:
     """The words after the file. Raises InputError for words that are no permissions."""
     for word in words:
         if word.split("=")[0] != PERMISSIONS:
-            raise InputError(f"{word}: settings of a check are in its file of claims; here only {PERMISSIONS}=[…]")
+            raise InputError(
+                f"{word}: settings of a check are in its file of claims; here only "
+                f"{PERMISSIONS}=[…]"
+            )
     return words
 
 
 def describe(check: Check) -> list[str]:
-    """The lines of a dry run: each claim with its question or why it is not testable, the trials, and the time."""
+    """The lines of a dry run: each claim with its question or why it is not testable, the trials,
+    and the time."""
     file, declaration = check.file, check.declaration
     questions = {question.name: question for question in declaration.questions}
     lines = [f"{file.paper}: {counted(len(questions), 'claim')} to be tested"]
     for claim in file.claims:
         missing = declaration.missing.get(claim.id, [])
         if claim.id not in questions:
-            lines.append(f"not testable here  {claim.id}: {claim.not_testable or '; '.join(missing)}")
+            lines.append(
+                f"not testable here  {claim.id}: {claim.not_testable or '; '.join(missing)}"
+            )
             continue
-        what = f"{claim.metric} of {claim.arm} against {claim.baseline}: {claim.direction}, by {claim.effect} at least"
-        scenes, looks = ", ".join(questions[claim.id].scenes), ", ".join(map(str, declaration.looks))
+        what = (
+            f"{claim.metric} of {claim.arm} against {claim.baseline}: {claim.direction}, by "
+            f"{claim.effect} at least"
+        )
+        scenes, looks = (
+            ", ".join(questions[claim.id].scenes),
+            ", ".join(map(str, declaration.looks)),
+        )
         lines.append(f"to be tested       {claim.id}: {what}; on {scenes}; looks at {looks} seeds")
         lines += [f"                   without {reason}" for reason in missing]
     if not questions:
@@ -131,7 +158,9 @@ def _run(check: Check) -> None:
     check = replace(check, declaration=declare_questions(check.home, check.declaration))
 
     def run(planned: Sequence[KeyAndSeed]) -> None:
-        unfinished = [trial for trial in check.to_run(planned) if trial.files.why_not_done(trial.values)]
+        unfinished = [
+            trial for trial in check.to_run(planned) if trial.files.why_not_done(trial.values)
+        ]
         if unfinished:
             run_batch(unfinished)
 
@@ -147,27 +176,42 @@ def plan(argv: Sequence[str], runs: Path) -> int:
     """Run the verb; raises InputError for bad input."""
     parser = ArgumentParser("plan", "An estimate from an experiment's trials, for 80 % power.")
     parser.add_argument("experiment")
-    parser.add_argument("--metric", default="psnr", help="such as psnr (the default), ssim, lpips_squeeze")
     parser.add_argument(
-        "--difference", type=_above_zero, help="to be seen; default: what papers count as an improvement"
+        "--metric", default="psnr", help="such as psnr (the default), ssim, lpips_squeeze"
     )
-    parser.add_argument("--baseline", default=BASELINE, help=f"the densifier to compare with ({BASELINE})")
+    parser.add_argument(
+        "--difference",
+        type=_above_zero,
+        help="to be seen; default: what papers count as an improvement",
+    )
+    parser.add_argument(
+        "--baseline", default=BASELINE, help=f"the densifier to compare with ({BASELINE})"
+    )
     options = parser.parse_args(argv)
     trials = with_variants(load_experiment(runs, options.experiment).trials)
     metric = quantity(options.metric, trials)
     if metric.cost:
-        raise InputError(f"--metric {options.metric}: only metrics can be planned for, not counts and times")
+        raise InputError(
+            f"--metric {options.metric}: only metrics can be planned for, not counts and times"
+        )
     difference = options.difference or metric.worthwhile
     if difference is None:
-        raise InputError(f"--difference is needed: {metric.name} has no usual least difference that matters")
+        raise InputError(
+            f"--difference is needed: {metric.name} has no usual least difference that matters"
+        )
     pairs = choose_pairs(sorted({trial.arm for trial in trials}), options.baseline)
     if not pairs:
-        raise InputError(f"{options.experiment} has one arm, and planning needs pairs of trials of two")
+        raise InputError(
+            f"{options.experiment} has one arm, and planning needs pairs of trials of two"
+        )
     for baseline, arm in pairs:
         compared = [trial for trial in trials if trial.arm in (baseline, arm)]
         paired = pair(compared, Question(metric=metric.key, baseline=baseline, arm=arm))
         if not paired.rows:
-            raise InputError(f"no trials of {baseline} and {arm} can be paired in {metric.name}: {paired.left_out[0]}")
+            raise InputError(
+                f"no trials of {baseline} and {arm} can be paired in {metric.name}: "
+                f"{paired.left_out[0]}"
+            )
         components = estimate_components([row.arm - row.baseline for row in paired.rows])
         print("\n".join([f"{arm} against {baseline}", *_lines(components, metric, difference)]))
     return 0
@@ -175,9 +219,12 @@ def plan(argv: Sequence[str], runs: Path) -> int:
 
 def _lines(components: Components, metric: Quantity, difference: float) -> list[str]:
     digits = f".{metric.decimals + 1}f"
-    between = "" if components.between is None else f", between scenes by {components.between:{digits}}"
+    between = (
+        "" if components.between is None else f", between scenes by {components.between:{digits}}"
+    )
     lines = [
-        f"  differences in {metric.name} vary between seeds by {components.within:{digits}}{between} "
+        f"  differences in {metric.name} vary between seeds by "
+        f"{components.within:{digits}}{between} "
         f"(from {counted(components.trials, 'pair')} on {counted(components.scenes, 'scene')})"
     ]
     for like_these in (False, True):
@@ -187,9 +234,13 @@ def _lines(components: Components, metric: Quantity, difference: float) -> list[
             continue
         designs = designs_needed(difference, components, like_these)
         designs.sort(key=lambda design: (design.trials, design.scenes))
-        texts = [f"{design.scenes} × {design.seeds} ({design.trials} trials)" for design in designs[:MAX_DESIGNS]]
+        texts = [
+            f"{design.scenes} × {design.seeds} ({design.trials} trials)"
+            for design in designs[:MAX_DESIGNS]
+        ]
         lines.append(
-            f"  to see {difference:g} on {group}, scenes × seeds: {', '.join(texts) or 'none that can be run'}"
+            f"  to see {difference:g} on {group}, scenes × seeds: "
+            f"{', '.join(texts) or 'none that can be run'}"
         )
     return lines
 
@@ -205,7 +256,8 @@ def _above_zero(text: str) -> float:
 
 
 def ablate(argv: Sequence[str], runs: Path) -> int:
-    """Run the verb: the exit code says, as a sweep's does, whether a trial failed; raises InputError for bad input."""
+    """Run the verb: the exit code says, as a sweep's does, whether a trial failed; raises
+    InputError for bad input."""
     from gsbench.pipeline.parts import Parts  # here, for a quick answer to --help
 
     options = _ablate_parser().parse_args(argv)
@@ -236,21 +288,43 @@ def ablate(argv: Sequence[str], runs: Path) -> int:
     home = trials[0].files.home
     code = run_trials(trials)
     if code == 0:
-        keys = {run: {t.values["scene"]["name"]: t.files.key for t in group} for run, group in by_run.items()}
+        keys = {
+            run: {t.values["scene"]["name"]: t.files.key for t in group}
+            for run, group in by_run.items()
+        }
         metric = options.metric or trials[0].values["eval"].get("primary") or DEFAULT_METRIC
-        print("\n".join(ablation.markdown_table(ablation.judge_runs(read_experiment(home).trials, keys, metric))))
+        print(
+            "\n".join(
+                ablation.markdown_table(
+                    ablation.judge_runs(read_experiment(home).trials, keys, metric)
+                )
+            )
+        )
         print(f"all metrics and pictures: gsbench report {home.name}")
     return code
 
 
 def _ablate_parser() -> ArgumentParser:
-    parser = ArgumentParser("ablate", "Each is judged against the densifier with all of them on (docs/claims.md).")
-    parser.add_argument(
-        "settings", nargs="*", metavar="KEY=VALUE", help="as of a sweep: densify=volumetric seed=0,1,2 …"
+    parser = ArgumentParser(
+        "ablate", "Each is judged against the densifier with all of them on (docs/claims.md)."
     )
-    parser.add_argument("--switches", type=names, default=(), metavar="A,B", help="only these; default: all declared")
+    parser.add_argument(
+        "settings",
+        nargs="*",
+        metavar="KEY=VALUE",
+        help="as of a sweep: densify=volumetric seed=0,1,2 …",
+    )
+    parser.add_argument(
+        "--switches",
+        type=names,
+        default=(),
+        metavar="A,B",
+        help="only these; default: all declared",
+    )
     parser.add_argument("--metric", help="printed; default: eval.primary, else psnr")
-    parser.add_argument("--dry-run", action="store_true", help="list the trials and their state; run nothing")
+    parser.add_argument(
+        "--dry-run", action="store_true", help="list the trials and their state; run nothing"
+    )
     return parser
 
 
@@ -264,8 +338,13 @@ def _trials(words: Sequence[str]) -> list[Trial]:
 def _only_densifier(trials: Sequence[Trial]) -> str:
     arms = {(trial.values["init"]["name"], trial.values["densify"]["name"]) for trial in trials}
     if len(arms) > 1 or len({trial.files.home for trial in trials}) > 1:
-        raise InputError("ablate takes one initialiser and one densifier apart: only scene and seed may list values")
-    if len({(trial.values["scene"]["name"], trial.values["seed"]) for trial in trials}) < len(trials):
+        raise InputError(
+            "ablate takes one initialiser and one densifier apart: only scene and seed may list "
+            "values"
+        )
+    if len({(trial.values["scene"]["name"], trial.values["seed"]) for trial in trials}) < len(
+        trials
+    ):
         raise InputError("ablate: only scene and seed may list values")
     return str(trials[0].values["densify"]["name"])
 
@@ -273,7 +352,10 @@ def _only_densifier(trials: Sequence[Trial]) -> str:
 def _words(settings: dict[str, Any], first: Trial) -> list[str]:
     """The words that give the densifier these settings; a key that it lacks needs Hydra's plus."""
     densify = first.values["densify"]
-    return [f"{'' if key in densify else '+'}densify.{key}={value_text(value)}" for key, value in settings.items()]
+    return [
+        f"{'' if key in densify else '+'}densify.{key}={value_text(value)}"
+        for key, value in settings.items()
+    ]
 
 
 def _default_name(words: Sequence[str]) -> str:
@@ -287,4 +369,7 @@ def _check_different(by_run: dict[frozenset[str], list[Trial]]) -> None:
     for run, group in by_run.items():
         earlier = seen.setdefault(group[0].folder, run)
         if earlier != run:
-            raise InputError(f"switching {', '.join(sorted(earlier ^ run))} changes no setting: give another VALUE")
+            raise InputError(
+                f"switching {', '.join(sorted(earlier ^ run))} changes no setting: give another "
+                "VALUE"
+            )

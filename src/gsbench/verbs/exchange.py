@@ -1,4 +1,5 @@
-"""Verbs for what goes to others or comes from them: ``gsbench evaluate``, ``export``, ``pool`` and ``site``."""
+"""Verbs for what goes to others or comes from them: ``gsbench evaluate``, ``export``, ``pool`` and
+``site``."""
 
 import logging
 import shutil
@@ -39,23 +40,41 @@ def evaluate(argv: Sequence[str], runs: Path) -> int:
 def _evaluate_parser() -> ArgumentParser:
     parser = ArgumentParser("evaluate", "Names are matched, never guessed. Sizes must be equal.")
     parser.add_argument(
-        "renders", metavar="RENDERS", help="folder of pictures, or predictions of nerfbaselines (.zip, .tar.gz)"
+        "renders",
+        metavar="RENDERS",
+        help="folder of pictures, or predictions of nerfbaselines (.zip, .tar.gz)",
     )
-    parser.add_argument("settings", nargs="*", metavar="KEY=VALUE", help="settings of the scene, and eval.…")
+    parser.add_argument(
+        "settings", nargs="*", metavar="KEY=VALUE", help="settings of the scene, and eval.…"
+    )
     parser.add_argument(
         "--truth",
         metavar="PLACE",
         help="the photographs: a folder, a trial (folder or EXPERIMENT:SCENE:"
-        "DENSIFY), or a scene's name, whose test views are taken as a trial sees them; not needed for predictions",
+        "DENSIFY), or a scene's name, whose test views are taken as a trial sees them; not needed "
+        "for predictions",
     )
-    parser.add_argument("--protocol", choices=list(PROTOCOLS), help="default: that of the trial, or paper")
-    parser.add_argument("--by-order", action="store_true", help="match sorted pictures with sorted photographs")
     parser.add_argument(
-        "--as", dest="place", metavar="EXPERIMENT:ARM", help="enter them as a trial; ARM: a name or INIT-NAME"
+        "--protocol", choices=list(PROTOCOLS), help="default: that of the trial, or paper"
     )
-    parser.add_argument("--seed", type=int, default=0, help="which repetition of the arm they are (0)")
-    parser.add_argument("--scene", metavar="NAME", help="with --as, where PLACE is a folder: what to call the scene")
-    parser.add_argument("--json", action="store_true", help="print a JSON object instead of a table")
+    parser.add_argument(
+        "--by-order", action="store_true", help="match sorted pictures with sorted photographs"
+    )
+    parser.add_argument(
+        "--as",
+        dest="place",
+        metavar="EXPERIMENT:ARM",
+        help="enter them as a trial; ARM: a name or INIT-NAME",
+    )
+    parser.add_argument(
+        "--seed", type=int, default=0, help="which repetition of the arm they are (0)"
+    )
+    parser.add_argument(
+        "--scene", metavar="NAME", help="with --as, where PLACE is a folder: what to call the scene"
+    )
+    parser.add_argument(
+        "--json", action="store_true", help="print a JSON object instead of a table"
+    )
     return parser
 
 
@@ -63,20 +82,36 @@ def export(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: 0 if the file, or folder, was written."""
     parser = ArgumentParser(
         "export",
-        "A .html file is a page with the model and the test cameras, made by npx (docs/other_models.md). `gsbench "
-        "export init TRIAL --out DIR` copies the COLMAP model that the trial started from. `gsbench export --results "
-        "EXPERIMENT` writes results, configurations and hashes as one small archive, without pixels unless --pictures "
+        "A .html file is a page with the model and the test cameras, made by npx "
+        "(docs/other_models.md). `gsbench "
+        "export init TRIAL --out DIR` copies the COLMAP model that the trial started from. "
+        "`gsbench export --results "
+        "EXPERIMENT` writes results, configurations and hashes as one small archive, without "
+        "pixels unless --pictures "
         "is given.",
     )
-    parser.add_argument("--results", metavar="EXPERIMENT", help="the archive of its results (default: EXPERIMENT.zip)")
-    parser.add_argument("trial", nargs="*", metavar="TRIAL", help=f"{ADDRESS}; after the word init: its initial model")
+    parser.add_argument(
+        "--results",
+        metavar="EXPERIMENT",
+        help="the archive of its results (default: EXPERIMENT.zip)",
+    )
+    parser.add_argument(
+        "trial",
+        nargs="*",
+        metavar="TRIAL",
+        help=f"{ADDRESS}; after the word init: its initial model",
+    )
     parser.add_argument(
         "--out",
         type=path,
         metavar="PATH",
         help="the .ply or .html file to write, for init the folder; a TRIAL needs it",
     )
-    parser.add_argument("--pictures", action="store_true", help="with --results: the pictures of the test views, too")
+    parser.add_argument(
+        "--pictures",
+        action="store_true",
+        help="with --results: the pictures of the test views, too",
+    )
     options = parser.parse_args(argv)
     if options.results is not None:
         if options.trial:
@@ -85,12 +120,18 @@ def export(argv: Sequence[str], runs: Path) -> int:
     if options.pictures:
         raise InputError("--pictures goes with --results")
     if not options.trial or options.out is None:
-        raise InputError("export needs a TRIAL and --out PATH, or --results EXPERIMENT (see gsbench export --help)")
+        raise InputError(
+            "export needs a TRIAL and --out PATH, or --results EXPERIMENT (see gsbench export "
+            "--help)"
+        )
     from gsbench.view.trials import find_trial, model_file
 
     is_init = len(options.trial) == 2 and options.trial[0] == "init"
     if len(options.trial) > 1 and not is_init:
-        raise InputError(f"one TRIAL is exported, not {len(options.trial)}; for an initial model: export init TRIAL")
+        raise InputError(
+            f"one TRIAL is exported, not {len(options.trial)}; for an initial model: export init "
+            "TRIAL"
+        )
     trial = find_trial(options.trial[-1], runs)
     out = options.out
     is_page = not is_init and out.suffix.lower() == PAGE
@@ -118,7 +159,9 @@ def export_results(name: str, runs: Path, out: Path | None, pictures: bool = Fal
     from gsbench.claims.archive import write_archive
 
     if not is_folder_name(name):
-        raise InputError(f"{name!r} is not the name of an experiment: give that of its folder below {runs}")
+        raise InputError(
+            f"{name!r} is not the name of an experiment: give that of its folder below {runs}"
+        )
     file = Path(f"{name}.zip") if out is None else out
     if file.is_dir():
         file = file / f"{name}.zip"
@@ -134,21 +177,26 @@ def check_form(out: Path) -> None:
     """Raise InputError unless the name of the file is that of a 3DGS PLY."""
     if not out.name.lower().endswith(".ply") or out.name.lower().endswith(".compressed.ply"):
         raise InputError(
-            f"--out {out}: name a file that ends in .ply, the 3DGS form, which every viewer and trainer reads, or in "
+            f"--out {out}: name a file that ends in .ply, the 3DGS form, which every viewer and "
+            "trainer reads, or in "
             ".html, a page for browsers (docs/other_models.md says what makes other forms)"
         )
 
 
 def export_init(entry: Path, out: Path, normalization: Normalization) -> None:
-    """Copy the COLMAP model of the stage result ``entry`` to `MODEL_FOLDER` of ``out``, as 3DGS trainers read it.
+    """Copy the COLMAP model of the stage result ``entry`` to `MODEL_FOLDER` of ``out``, as 3DGS
+    trainers read it.
 
-    It gets the coordinates in which the scene was given. Raises InputError if ``out`` has a folder of models.
+    It gets the coordinates in which the scene was given. Raises InputError if ``out`` has a folder
+    of models.
     """
     from gsbench.init.base import MODEL_FOLDER
 
     model = entry / MODEL_FOLDER
     if not model.is_dir():
-        raise InputError(f"the initial model is no longer in the store ({model}): run the trial again")
+        raise InputError(
+            f"the initial model is no longer in the store ({model}): run the trial again"
+        )
     first = out / MODEL_FOLDER.parts[0]
     if first.exists():
         raise InputError(f"{first} exists already: give another --out")
@@ -163,13 +211,20 @@ def export_init(entry: Path, out: Path, normalization: Normalization) -> None:
 
 def pool(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: 0, or 1 if a source was left out; raises InputError if none can be read."""
-    from gsbench.claims.pooling import PooledQuestion, describe, markdown_table, pool_sources  # slow
+    # slow
+    from gsbench.claims.pooling import PooledQuestion, describe, markdown_table, pool_sources
 
     parser = ArgumentParser("pool", "It is their mean, each with the same weight.")
     parser.add_argument("sources", nargs="+", type=path, metavar="ARCHIVE")
-    parser.add_argument("--arm", type=names, required=True, help="a densifier; names it goes by, comma between")
-    parser.add_argument("--baseline", type=names, default=(BASELINE,), help=f"to compare with ({BASELINE})")
-    parser.add_argument("--metric", default="psnr", help="such as psnr (the default), ssim, lpips_vgg")
+    parser.add_argument(
+        "--arm", type=names, required=True, help="a densifier; names it goes by, comma between"
+    )
+    parser.add_argument(
+        "--baseline", type=names, default=(BASELINE,), help=f"to compare with ({BASELINE})"
+    )
+    parser.add_argument(
+        "--metric", default="psnr", help="such as psnr (the default), ssim, lpips_vgg"
+    )
     add_where(parser)
     parser.add_argument("--protocol", help="only studies by this one, such as paper-1")
     options = parser.parse_args(argv)
@@ -177,7 +232,12 @@ def pool(argv: Sequence[str], runs: Path) -> int:
     pooled, notes, faults = pool_sources(options.sources, wanted, options.protocol)
     title = f"{options.arm[0]} against {options.baseline[0]}"
     shown = asked_quantity(options.metric)
-    lines = [f"{title}, difference in {shown.name}{BETTER[shown.direction]}", "", *markdown_table(pooled), ""]
+    lines = [
+        f"{title}, difference in {shown.name}{BETTER[shown.direction]}",
+        "",
+        *markdown_table(pooled),
+        "",
+    ]
     lines += [*describe(pooled), *notes, *faults]
     print("\n".join(lines))
     for fault in faults:
@@ -189,9 +249,13 @@ def site(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: 0, or 1 if an archive was left out; raises InputError if none can be read."""
     from gsbench.claims.site import INDEX, write_site  # here, for a quick answer to --help
 
-    parser = ArgumentParser("site", "It needs no server, and has pictures if the archives have them.")
+    parser = ArgumentParser(
+        "site", "It needs no server, and has pictures if the archives have them."
+    )
     parser.add_argument("archives", nargs="+", type=path, metavar="ARCHIVE")
-    parser.add_argument("--out", type=path, required=True, metavar="DIR", help="the folder to write into")
+    parser.add_argument(
+        "--out", type=path, required=True, metavar="DIR", help="the folder to write into"
+    )
     parser.add_argument("--title", default="Results of gsbench", help="of its first page")
     options = parser.parse_args(argv)
     page = options.out / INDEX

@@ -7,7 +7,13 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 from gsbench.datasets.archive import STAGING, fetch_scene, missing_parts, open_archive_at
-from gsbench.datasets.catalog import DATA_VARIABLE, PublicDataset, data_dir, read_catalog, wanted_files
+from gsbench.datasets.catalog import (
+    DATA_VARIABLE,
+    PublicDataset,
+    data_dir,
+    read_catalog,
+    wanted_files,
+)
 from gsbench.downloads import RetryPolicy
 from gsbench.errors import InputError
 from gsbench.files import remove_temporaries, storage_errors
@@ -33,9 +39,17 @@ def fetch(argv: Sequence[str], runs: Path) -> int:
     dataset = _dataset(catalog, options.dataset)
     scenes = [wanted_files(name, options.images) for name in _scenes(dataset, options.scenes)]
     mirror = _mirror(options.mirror or os.environ.get(MIRROR_VARIABLE))
-    print(f"{dataset.title}: {dataset.page}\nlicence: {dataset.licence}\nplease cite: {dataset.citation}", flush=True)
+    print(
+        f"{dataset.title}: {dataset.page}\nlicence: {dataset.licence}\nplease cite: "
+        f"{dataset.citation}",
+        flush=True,
+    )
     _make_folder(data)
-    with storage_errors(data), progress("fetch") as report, hold(data / LOCK, f"fetching into {data}"):
+    with (
+        storage_errors(data),
+        progress("fetch") as report,
+        hold(data / LOCK, f"fetching into {data}"),
+    ):
 
         def say(phase: str, done: int, total: int | None, note: str = "") -> None:
             report(phase, done, total, f"{readable_bytes(done)} of {readable_bytes(total or done)}")
@@ -46,7 +60,10 @@ def fetch(argv: Sequence[str], runs: Path) -> int:
             unfinished = [files for files in wanted if missing_parts(data, files)]
             for files in wanted:
                 if files not in unfinished:
-                    print(f"{files.scene}: is here, in {data / files.folder} ({', '.join(files.parts)})")
+                    print(
+                        f"{files.scene}: is here, in {data / files.folder} "
+                        f"({', '.join(files.parts)})"
+                    )
             where = archive.url if mirror is None else f"{mirror.rstrip('/')}/{archive.name}"
             if unfinished:
                 with open_archive_at(where, PATIENCE) as zipped:
@@ -63,11 +80,19 @@ def listing(datasets: Sequence[PublicDataset], data: Path) -> list[str]:
     for dataset in datasets:
         lines.append(f"{dataset.name}: {dataset.title}, {dataset.page}")
         for archive in dataset.archives:
-            lines.append(f"  {archive.url}{f' (as a whole {archive.size})' if archive.size else ''}")
+            lines.append(
+                f"  {archive.url}{f' (as a whole {archive.size})' if archive.size else ''}"
+            )
             for scene in sorted(archive.scenes):
                 files = wanted_files(scene)
                 missing = missing_parts(data, files)
-                state = "here" if not missing else "not here" if missing == files.parts else f"{missing[0]} is missing"
+                state = (
+                    "here"
+                    if not missing
+                    else "not here"
+                    if missing == files.parts
+                    else f"{missing[0]} is missing"
+                )
                 lines.append(f"    {scene:<12}{', '.join(files.parts):<22}{state}")
     return [*lines, f"data folder: {data} ({DATA_VARIABLE})"]
 
@@ -75,8 +100,11 @@ def listing(datasets: Sequence[PublicDataset], data: Path) -> list[str]:
 def _make_folder(data: Path) -> None:
     try:
         data.mkdir(parents=True, exist_ok=True)
-    except (FileExistsError, NotADirectoryError, FileNotFoundError) as error:  # `data` is a file, or lies in /proc
-        raise InputError(f"{data} cannot be the data folder ({error.strerror}): set {DATA_VARIABLE}") from error
+    # `data` is a file, or lies in /proc
+    except (FileExistsError, NotADirectoryError, FileNotFoundError) as error:
+        raise InputError(
+            f"{data} cannot be the data folder ({error.strerror}): set {DATA_VARIABLE}"
+        ) from error
 
 
 def _dataset(catalog: Mapping[str, PublicDataset], name: str) -> PublicDataset:
@@ -85,7 +113,9 @@ def _dataset(catalog: Mapping[str, PublicDataset], name: str) -> PublicDataset:
     for dataset in catalog.values():
         if name in dataset.scenes:
             raise InputError(f"{name} is a scene: gsbench fetch {dataset.name} {name}")
-    raise InputError(f"no data set {name!r}{did_you_mean(name, list(catalog))} (there are: {', '.join(catalog)})")
+    raise InputError(
+        f"no data set {name!r}{did_you_mean(name, list(catalog))} (there are: {', '.join(catalog)})"
+    )
 
 
 def _scenes(dataset: PublicDataset, names: Sequence[str]) -> Sequence[str]:
@@ -99,7 +129,8 @@ def _scenes(dataset: PublicDataset, names: Sequence[str]) -> Sequence[str]:
 
 
 def _mirror(mirror: str | None) -> str | None:
-    """The address or folder to fetch from instead of the published one; raises InputError if it is neither."""
+    """The address or folder to fetch from instead of the published one; raises InputError if it is
+    neither."""
     if not mirror:
         return None
     with suppress(ValueError):  # urlsplit raises for an address such as http://[::1
@@ -113,16 +144,26 @@ def _mirror(mirror: str | None) -> str | None:
 def _parser(names: Sequence[str]) -> ArgumentParser:
     parser = ArgumentParser(
         "fetch",
-        f"They come into the data folder (${DATA_VARIABLE}, else ./data), where scene=NAME finds them: only the wanted "
+        f"They come into the data folder (${DATA_VARIABLE}, else ./data), where scene=NAME finds "
+        "them: only the wanted "
         "scenes and image folders out of the archives. Stopped, the same command goes on.",
     )
     parser.add_argument("dataset", nargs="?", metavar="DATASET", help=", ".join(names))
-    parser.add_argument("scenes", nargs="*", metavar="SCENE", help="the scenes wanted; none: all of the data set")
-    parser.add_argument("--list", action="store_true", help="list all scenes, and which ones are here")
-    parser.add_argument("--images", metavar="FOLDER", help="another image folder than the scene file's, such as images")
+    parser.add_argument(
+        "scenes", nargs="*", metavar="SCENE", help="the scenes wanted; none: all of the data set"
+    )
+    parser.add_argument(
+        "--list", action="store_true", help="list all scenes, and which ones are here"
+    )
+    parser.add_argument(
+        "--images",
+        metavar="FOLDER",
+        help="another image folder than the scene file's, such as images",
+    )
     parser.add_argument(
         "--mirror",
         metavar="PLACE",
-        help=f"where the archives lie instead: the start of an address, or a folder with them (${MIRROR_VARIABLE})",
+        help="where the archives lie instead: the start of an address, or a folder with them "
+        f"(${MIRROR_VARIABLE})",
     )
     return parser

@@ -1,4 +1,5 @@
-"""Verbs about this machine: ``gsbench doctor`` (what is missing) and ``gsbench bench`` (how fast it is)."""
+"""Verbs about this machine: ``gsbench doctor`` (what is missing) and ``gsbench bench`` (how fast it
+is)."""
 
 import argparse
 import json
@@ -31,7 +32,8 @@ OPTIONAL = {  # module -> what needs it, and the extra that brings it
 }
 NOT_SHOWN = ("scene", "threads", "device")  # columns that only the JSON of `bench` has
 MAX_SIDE = 16_384  # px
-SHOWN_ERRORS = ("image", "gradient of means", "gradient of log_scales", "trained image")  # of a proof, in one line
+# of a proof, in one line
+SHOWN_ERRORS = ("image", "gradient of means", "gradient of log_scales", "trained image")
 MAX_COUNT = 1_000_000_000
 
 
@@ -47,10 +49,16 @@ def doctor(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: 1 if something is bad, or if a proof fails."""
     parser = ArgumentParser("doctor")
     parser.add_argument(
-        "--prove", action="store_true", help="compare a rasterizer with the float64 reference on this machine"
+        "--prove",
+        action="store_true",
+        help="compare a rasterizer with the float64 reference on this machine",
     )
-    parser.add_argument("--raster", default=AUTO, choices=names(), help="the rasterizer to prove (auto)")
-    parser.add_argument("--device", default="auto", help="where to prove it: auto, cpu, cuda or cuda:1")
+    parser.add_argument(
+        "--raster", default=AUTO, choices=names(), help="the rasterizer to prove (auto)"
+    )
+    parser.add_argument(
+        "--device", default="auto", help="where to prove it: auto, cpu, cuda or cuda:1"
+    )
     parser.add_argument("--json", action="store_true", help="print the proof as JSON")
     options = parser.parse_args(argv)
     if options.prove:
@@ -58,7 +66,13 @@ def doctor(argv: Sequence[str], runs: Path) -> int:
     if options.json or options.raster != AUTO or options.device != "auto":
         raise InputError("doctor: --raster, --device and --json belong to --prove")
     bad = 0
-    for findings in (check_packages(), check_devices(), check_proofs(), check_weights(), check_runs(runs)):
+    for findings in (
+        check_packages(),
+        check_devices(),
+        check_proofs(),
+        check_weights(),
+        check_runs(runs),
+    ):
         for verdict, topic, text in findings:
             print(f"{verdict:<5} {topic:<12} {text}")
             bad += verdict == "bad"
@@ -88,9 +102,14 @@ def _describe(proof: RasterProof) -> str:
     """A proof in one line."""
     verdict = "agrees with" if proof.passed else "departs from"
     largest = ", ".join(
-        f"{quantity} {proof.errors[quantity]:.1e}" for quantity in SHOWN_ERRORS if quantity in proof.errors
+        f"{quantity} {proof.errors[quantity]:.1e}"
+        for quantity in SHOWN_ERRORS
+        if quantity in proof.errors
     )
-    return f"raster={proof.raster} {verdict} the reference on {proof.device} ({proof.seconds:.0f} s): {largest}"
+    return (
+        f"raster={proof.raster} {verdict} the reference on {proof.device} ({proof.seconds:.0f} "
+        f"s): {largest}"
+    )
 
 
 def check_proofs() -> Iterator[Finding]:
@@ -108,7 +127,11 @@ def check_proofs() -> Iterator[Finding]:
             if proof is not None:
                 yield Finding("ok" if proof.passed else "bad", "proof", _describe(proof))
             elif device.type == "cuda" and executor.devices:
-                yield Finding("note", "proof", f"raster={executor.name} on {place}: none yet; its first use makes it")
+                yield Finding(
+                    "note",
+                    "proof",
+                    f"raster={executor.name} on {place}: none yet; its first use makes it",
+                )
 
 
 def check_packages() -> Iterator[Finding]:
@@ -116,10 +139,16 @@ def check_packages() -> Iterator[Finding]:
     from gsbench import __version__
 
     yield Finding("ok", "gsbench", f"{__version__} in {Path(__file__).resolve().parents[1]}")
-    yield Finding("ok", "python", f"{sys.version.split()[0]} ({sys.executable}), {available_threads()} cores to use")
+    yield Finding(
+        "ok",
+        "python",
+        f"{sys.version.split()[0]} ({sys.executable}), {available_threads()} cores to use",
+    )
     for name in REQUIRED:
         installed = version_of(name)
-        yield Finding("bad" if installed is None else "ok", name, installed or f"missing: {install_command()}")
+        yield Finding(
+            "bad" if installed is None else "ok", name, installed or f"missing: {install_command()}"
+        )
     for name, (purpose, extra) in OPTIONAL.items():
         installed = version_of(name)
         text = installed or f"not installed; needed for {purpose}: {install_command(extra)}"
@@ -127,25 +156,40 @@ def check_packages() -> Iterator[Finding]:
 
 
 def check_devices() -> Iterator[Finding]:
-    """Findings about torch, the GPUs that it can or cannot use and why, and the rasterizers on each device."""
+    """Findings about torch, the GPUs that it can or cannot use and why, and the rasterizers on each
+    device."""
     try:
         import torch
     except (ImportError, OSError) as error:
-        yield Finding("bad", "torch", f"cannot be imported ({str(error).partition(chr(10))[0]}): pip install torch")
+        yield Finding(
+            "bad",
+            "torch",
+            f"cannot be imported ({str(error).partition(chr(10))[0]}): pip install torch",
+        )
         return
     yield Finding("ok", "torch", str(torch.__version__))
     usable = torch.cuda.is_available()
     for index in range(torch.cuda.device_count() if usable else 0):
         free, total = torch.cuda.mem_get_info(index)
-        text = f"{torch.cuda.get_device_name(index)}, {readable_bytes(free)} of {readable_bytes(total)} free"
+        text = (
+            f"{torch.cuda.get_device_name(index)}, {readable_bytes(free)} of "
+            f"{readable_bytes(total)} free"
+        )
         untested = torch.version.hip is not None
-        yield Finding("note" if untested else "ok", "gpu", f"{text}{': AMD, never tested' if untested else ''}")
+        yield Finding(
+            "note" if untested else "ok",
+            "gpu",
+            f"{text}{': AMD, never tested' if untested else ''}",
+        )
     if not usable:
         listed = len(installed_gpus())
         if torch.version.cuda is not None:
             cause = "torch finds no usable NVIDIA driver; does nvidia-smi run?"
         elif listed:
-            cause = f"{counted(listed, 'NVIDIA GPU')} here, but this torch is a build for CPUs: see pytorch.org"
+            cause = (
+                f"{counted(listed, 'NVIDIA GPU')} here, but this torch is a build for CPUs: "
+                "see pytorch.org"
+            )
         else:
             cause = "this torch is a build for CPUs"
         yield Finding("note", "gpu", f"none ({cause}): raster=auto uses the CPU")
@@ -153,9 +197,15 @@ def check_devices() -> Iterator[Finding]:
     for executor in EXECUTORS:
         usable_on = [device for device in devices if executor.obstacle(device) is None]
         if usable_on:
-            yield Finding("ok", "rasterizer", f"raster={executor.name} on {' and '.join(usable_on)}: {executor.text}")
+            yield Finding(
+                "ok",
+                "rasterizer",
+                f"raster={executor.name} on {' and '.join(usable_on)}: {executor.text}",
+            )
         else:
-            yield Finding("note", "rasterizer", f"raster={executor.name} {executor.obstacle(devices[-1])}")
+            yield Finding(
+                "note", "rasterizer", f"raster={executor.name} {executor.obstacle(devices[-1])}"
+            )
     chosen = " and ".join(f"{resolve('auto', device).name} on {device}" for device in devices)
     yield Finding("ok", "rasterizer", f"raster=auto is {chosen}")
     yield from check_triton()
@@ -165,10 +215,13 @@ def check_triton() -> Iterator[Finding]:
     """Findings about the compiler that raster=triton needs at its first run on a GPU."""
     from gsbench.raster.executors import missing_tools
 
-    if version_of("triton") is None:  # it comes with torch for CUDA, so there is no GPU to run it on
+    # it comes with torch for CUDA, so there is no GPU to run it on
+    if version_of("triton") is None:
         return
     if missing := missing_tools():
-        yield Finding("note", "triton", f"at its first run on a GPU it needs {' and '.join(missing)}")
+        yield Finding(
+            "note", "triton", f"at its first run on a GPU it needs {' and '.join(missing)}"
+        )
 
 
 def check_weights() -> Iterator[Finding]:
@@ -183,10 +236,14 @@ def check_weights() -> Iterator[Finding]:
     wanted |= {f"LightGlue for {name}": (spec,) for name, spec in LIGHTGLUE_WEIGHTS.items()}
     for purpose, specs in wanted.items():
         try:
-            yield Finding("ok", "weights", f"{purpose}: {find_first_weights(specs, None, download=False)}")
+            yield Finding(
+                "ok", "weights", f"{purpose}: {find_first_weights(specs, None, download=False)}"
+            )
         except MissingWeightsError as error:
             origin = specs[0].url or specs[0].source
-            missing = f"{specs[0].names[0]} is not here; gsbench downloads it when needed from {origin}"
+            missing = (
+                f"{specs[0].names[0]} is not here; gsbench downloads it when needed from {origin}"
+            )
             place = f"or put it into ${WEIGHTS_VARIABLE} or {hub_cache()}"
             text = f"{missing}; {place}" if "not found" in str(error) else str(error)
             yield Finding("note", "weights", f"{purpose}: {text}")
@@ -201,30 +258,41 @@ def check_runs(runs: Path) -> Iterator[Finding]:
     except OSError:
         yield Finding("bad", "runs", f"{runs} cannot be written to: set GSBENCH_RUNS")
     else:
-        yield Finding("note" if free < LITTLE_SPACE else "ok", "runs", f"{runs}, {readable_bytes(free)} free")
+        yield Finding(
+            "note" if free < LITTLE_SPACE else "ok", "runs", f"{runs}, {readable_bytes(free)} free"
+        )
 
 
 def _bench_parser() -> ArgumentParser:
     names = ", ".join(executor.name for executor in EXECUTORS)
     parser = ArgumentParser("bench", "Times are medians of steps that take turns.")
-    parser.add_argument("--raster", default="cpu", help=f"names, comma between: {names} or your own, mine.MyRaster")
+    parser.add_argument(
+        "--raster", default="cpu", help=f"names, comma between: {names} or your own, mine.MyRaster"
+    )
     parser.add_argument("--size", default="500x375", help="image sizes, comma between")
     parser.add_argument("--count", default="100000", help="numbers of Gaussians, comma between")
     parser.add_argument(
         "--scene",
         default="trained",
         choices=("trained", "random", "skewed"),
-        help="like a trained model (default), like one at the start, or like one with its detail at few places",
+        help="like a trained model (default), like one at the start, or like one with its detail "
+        "at few places",
     )
     parser.add_argument("--ply", type=path, help="time this model instead of a synthetic scene")
     parser.add_argument("--repeats", type=_count, default=5, help="turns that count (default 5)")
-    parser.add_argument("--threads", type=_count, help="CPU threads (default: as many as torch takes)")
+    parser.add_argument(
+        "--threads", type=_count, help="CPU threads (default: as many as torch takes)"
+    )
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.add_argument(
-        "--kernels", action="store_true", help="with --json: add the time of each kernel, and of waits for the GPU"
+        "--kernels",
+        action="store_true",
+        help="with --json: add the time of each kernel, and of waits for the GPU",
     )
     parser.add_argument(
-        "--no-memory", action="store_true", help="do not measure peak memory, in processes of their own"
+        "--no-memory",
+        action="store_true",
+        help="do not measure peak memory, in processes of their own",
     )
     return parser
 
@@ -244,7 +312,8 @@ def bench(argv: Sequence[str], _runs: Path | None = None) -> int:
     rasters = options.raster.split(",")
     if AUTO in rasters:
         raise InputError(f"--raster {AUTO} is a choice among executors: name those to time")
-    allow_modules([raster for raster in rasters if "." in raster])  # the user typed them, which allows them
+    # the user typed them, which allows them
+    allow_modules([raster for raster in rasters if "." in raster])
 
     from gsbench.bench.measure import run_bench
 
@@ -269,20 +338,29 @@ def table(rows: list[dict[str, Any]]) -> str:
 
     used = pd.DataFrame(rows).drop(columns=list(NOT_SHOWN)).dropna(axis="columns", how="all")
     return used.to_string(
-        index=False, na_rep="-", formatters={"step_ratio": "{:.2f}".format}, float_format="{:.1f}".format
+        index=False,
+        na_rep="-",
+        formatters={"step_ratio": "{:.2f}".format},
+        float_format="{:.1f}".format,
     )
 
 
 def _size(text: str) -> tuple[int, int]:
     width, _, height = text.partition("x")
-    if not all(side.isascii() and side.isdigit() and MIN_SIZE <= int(side) <= MAX_SIDE for side in (width, height)):
+    if not all(
+        side.isascii() and side.isdigit() and MIN_SIZE <= int(side) <= MAX_SIDE
+        for side in (width, height)
+    ):
         raise argparse.ArgumentTypeError(
-            f"a size is WIDTHxHEIGHT, sides from {MIN_SIZE} to {MAX_SIDE} px, for example 500x375, got {text!r}"
+            f"a size is WIDTHxHEIGHT, sides from {MIN_SIZE} to {MAX_SIDE} px, for example "
+            f"500x375, got {text!r}"
         )
     return int(width), int(height)
 
 
 def _count(text: str) -> int:
     if not (text.isascii() and text.isdigit() and 1 <= int(text) <= MAX_COUNT):
-        raise argparse.ArgumentTypeError(f"a count is at least 1 and at most {MAX_COUNT}, got {text!r}")
+        raise argparse.ArgumentTypeError(
+            f"a count is at least 1 and at most {MAX_COUNT}, got {text!r}"
+        )
     return int(text)

@@ -1,25 +1,51 @@
-"""Questions about the configuration that Hydra answers: ``--cfg job``, ``--info``, tab completion."""
+"""Questions about the configuration that Hydra answers: ``--cfg job``, ``--info``, tab
+completion."""
 
 import os
 import re
 from contextlib import suppress
 from pathlib import Path
 
-from gsbench.config.command_words import check_search_path, check_single, parse_word, search_path, typed_permissions
+from gsbench.config.command_words import (
+    check_search_path,
+    check_single,
+    parse_word,
+    search_path,
+    typed_permissions,
+)
 from gsbench.config.compose import compose_whole, has_key, hydra_ready, run_main
 from gsbench.errors import InputError
 from gsbench.verbs.arguments import ArgumentParser
 
-QUERIES = ("--cfg", "-c", "--info", "-i", "--hydra-help", "--shell-completion", "-sc", "--resolve", "--package", "-p")
+QUERIES = (
+    "--cfg",
+    "-c",
+    "--info",
+    "-i",
+    "--hydra-help",
+    "--shell-completion",
+    "-sc",
+    "--resolve",
+    "--package",
+    "-p",
+)
 COMPLETION = re.compile(r"(install|uninstall|query)=(bash|zsh|fish)")
 
 
 def ask_hydra(argv: list[str]) -> int:
-    """Let Hydra answer a question about the configuration, and run no trial. Raises InputError for bad input."""
+    """Let Hydra answer a question about the configuration, and run no trial. Raises InputError for
+    bad input."""
     options = _parser().parse_args(argv)
-    asked = [options.cfg is not None, options.info is not None, options.shell_completion, options.hydra_help]
+    asked = [
+        options.cfg is not None,
+        options.info is not None,
+        options.shell_completion,
+        options.hydra_help,
+    ]
     if sum(asked) != 1 or ((options.resolve or options.package) and options.cfg is None):
-        raise InputError("ask one thing: --cfg job (with --resolve or --package KEY), --info, or --hydra-help")
+        raise InputError(
+            "ask one thing: --cfg job (with --resolve or --package KEY), --info, or --hydra-help"
+        )
     if options.shell_completion:
         if len(options.overrides) != 1 or not COMPLETION.fullmatch(options.overrides[0]):
             raise InputError("-sc takes install=bash or uninstall=bash, and zsh and fish likewise")
@@ -30,7 +56,9 @@ def ask_hydra(argv: list[str]) -> int:
         with hydra_ready():
             config = compose_whole([*search_path(folders, options.overrides), *options.overrides])
         if options.package is not None and not has_key(config, options.package):
-            raise InputError(f"--package {options.package}: there is no such part of the configuration")
+            raise InputError(
+                f"--package {options.package}: there is no such part of the configuration"
+            )
 
     def task(config: object) -> None:
         raise AssertionError("Hydra was asked a question, and ran the task instead")
@@ -40,7 +68,8 @@ def ask_hydra(argv: list[str]) -> int:
 
 
 def _check_typed(line: str) -> None:
-    """Refuse to complete a line that would make Hydra import a package which the line does not allow."""
+    """Refuse to complete a line that would make Hydra import a package which the line does not
+    allow."""
     words = []
     for word in line.split():
         with suppress(InputError):  # a half-typed word

@@ -1,4 +1,5 @@
-"""Verbs that show an experiment's results from its files: ``gsbench tables``, ``report`` and ``explain``."""
+"""Verbs that show an experiment's results from its files: ``gsbench tables``, ``report`` and
+``explain``."""
 
 import argparse
 import re
@@ -6,22 +7,45 @@ import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from gsbench.analysis.cells import check_averageable, make_cell, select_trials, swept_settings, to_frame, with_variants
+from gsbench.analysis.cells import (
+    check_averageable,
+    make_cell,
+    select_trials,
+    swept_settings,
+    to_frame,
+    with_variants,
+)
 from gsbench.analysis.differences import short_version
 from gsbench.analysis.fairness import fairness_table
 from gsbench.analysis.pairing import BASELINE
-from gsbench.analysis.paper import PAPER_TABLES, layout_of, load_paper, paper_tables, published_names, published_table
+from gsbench.analysis.paper import (
+    PAPER_TABLES,
+    layout_of,
+    load_paper,
+    paper_tables,
+    published_names,
+    published_table,
+)
 from gsbench.analysis.quantities import Quantity, quantity
 from gsbench.analysis.results import Arm, Experiment, TrialResult, load_experiment
 from gsbench.analysis.table_formats import FORMATS
-from gsbench.analysis.tables import DEFAULT_ROWS, build_table, compared_pairs, format_cell, with_agreement
+from gsbench.analysis.tables import (
+    DEFAULT_ROWS,
+    build_table,
+    compared_pairs,
+    format_cell,
+    with_agreement,
+)
 from gsbench.errors import InputError
 from gsbench.files import writable_output, write_text
 from gsbench.runs.keys import AS_RELEASED
 from gsbench.verbs.arguments import ArgumentParser, add_where, names, path
 from gsbench.words import some_of
 
-ADDRESS = "EXPERIMENT:SCENE:METRIC:ARM, such as table1:garden:lpips:volumetric or demo:courtyard:psnr:sfm-adc"
+ADDRESS = (
+    "EXPERIMENT:SCENE:METRIC:ARM, such as table1:garden:lpips:volumetric or "
+    "demo:courtyard:psnr:sfm-adc"
+)
 TRIALS = "trials"
 FAIRNESS = "fairness"
 PAPER_NOTES = "paper"  # `gsbench tables paper` shows the paper's own inconsistencies
@@ -40,7 +64,11 @@ def tables(argv: Sequence[str], runs: Path) -> int:
     for warning in experiment.warnings:
         print(f"left out: {warning}", file=sys.stderr)
     trials = select_trials(experiment.trials, dict(options.where))
-    texts = _trials(trials, options) if options.format == TRIALS else _tables(experiment, trials, options)
+    texts = (
+        _trials(trials, options)
+        if options.format == TRIALS
+        else _tables(experiment, trials, options)
+    )
     _write(texts, options.out, experiment.name)
     return 0
 
@@ -55,13 +83,19 @@ def _trials(trials: Sequence[TrialResult], options: argparse.Namespace) -> dict[
     """A CSV with one row per trial. Raises InputError for options that only a table has."""
     for name in ("rows", "columns", "metrics", "layout", "paper"):
         if getattr(options, name) is not None:
-            raise InputError(f"--format {TRIALS} shows every column of every trial, and takes no --{name}")
+            raise InputError(
+                f"--format {TRIALS} shows every column of every trial, and takes no --{name}"
+            )
     return {"-trials.csv": to_frame(trials).to_csv(index=False, lineterminator="\n")}
 
 
-def _tables(experiment: Experiment, trials: Sequence[TrialResult], options: argparse.Namespace) -> dict[str, str]:
+def _tables(
+    experiment: Experiment, trials: Sequence[TrialResult], options: argparse.Namespace
+) -> dict[str, str]:
     """The texts of the tables, by the ending of their file's name."""
-    own_layout = layout_of(experiment.name) if options.rows is None and options.columns is None else None
+    own_layout = (
+        layout_of(experiment.name) if options.rows is None and options.columns is None else None
+    )
     layout, metrics = options.layout or own_layout or "plain", options.metrics
     if layout == FAIRNESS:
         return _fairness_sheets(experiment, options.format)
@@ -83,10 +117,14 @@ def _fairness_sheets(experiment: Experiment, format_name: str) -> dict[str, str]
     """The fairness sheets of all compared pairs of arms, from all trials of the experiment."""
     trials, pairs = compared_pairs(experiment)
     if not pairs:
-        raise InputError(f"experiment {experiment.name} has one arm, so there is nothing to compare")
+        raise InputError(
+            f"experiment {experiment.name} has one arm, so there is nothing to compare"
+        )
     suffix, writer = FORMATS[format_name]
     return {
-        f"-{FAIRNESS}-{_as_file(second)}-{_as_file(first)}.{suffix}": writer(fairness_table(trials, first, second))
+        f"-{FAIRNESS}-{_as_file(second)}-{_as_file(first)}.{suffix}": writer(
+            fairness_table(trials, first, second)
+        )
         for first, second in pairs
     }
 
@@ -97,32 +135,56 @@ def _as_file(arm: Arm) -> str:
 
 
 def _tables_parser() -> ArgumentParser:
-    parser = ArgumentParser("tables", "`gsbench tables paper` lists where the paper contradicts itself.")
-    parser.add_argument(
-        "experiment", help="its name; table1, table2 and their _own look as in the paper, with its values"
+    parser = ArgumentParser(
+        "tables", "`gsbench tables paper` lists where the paper contradicts itself."
     )
-    parser.add_argument("--format", choices=[*FORMATS, TRIALS], help=f"default: md; {TRIALS}: CSV with one row a trial")
-    parser.add_argument("--out", type=path, metavar="PATH", help="a folder, or a file whose ending says the format")
     parser.add_argument(
-        "--rows", type=names, metavar="A,B", help=f"fields or settings (default {','.join(DEFAULT_ROWS)})"
+        "experiment",
+        help="its name; table1, table2 and their _own look as in the paper, with its values",
     )
-    parser.add_argument("--columns", type=names, metavar="A,B", help="fields or settings, crossed with all metrics")
-    parser.add_argument("--metrics", type=names, metavar="A,B", help="such as psnr,lpips_squeeze,gaussians,train_time")
+    parser.add_argument(
+        "--format",
+        choices=[*FORMATS, TRIALS],
+        help=f"default: md; {TRIALS}: CSV with one row a trial",
+    )
+    parser.add_argument(
+        "--out", type=path, metavar="PATH", help="a folder, or a file whose ending says the format"
+    )
+    parser.add_argument(
+        "--rows",
+        type=names,
+        metavar="A,B",
+        help=f"fields or settings (default {','.join(DEFAULT_ROWS)})",
+    )
+    parser.add_argument(
+        "--columns", type=names, metavar="A,B", help="fields or settings, crossed with all metrics"
+    )
+    parser.add_argument(
+        "--metrics",
+        type=names,
+        metavar="A,B",
+        help="such as psnr,lpips_squeeze,gaussians,train_time",
+    )
     add_where(parser)
-    parser.add_argument("--paper", metavar="NAME", help=f"published numbers, too: {', '.join(published_names())}")
+    parser.add_argument(
+        "--paper", metavar="NAME", help=f"published numbers, too: {', '.join(published_names())}"
+    )
     parser.add_argument(
         "--layout",
         choices=[*PAPER_TABLES, "plain", FAIRNESS],
-        help=f"the paper's layout for any experiment; {FAIRNESS}: for each pair of arms in what they differ, what was "
+        help=f"the paper's layout for any experiment; {FAIRNESS}: for each pair of arms in what "
+        "they differ, what was "
         "tuned, and whose defaults those are",
     )
     return parser
 
 
 def _write(texts: Mapping[str, str], out: Path | None, name: str) -> None:
-    """Print the texts, or write them to the file ``out``, or into the folder ``out`` unless it has the format's ending.
+    """Print the texts, or write them to the file ``out``, or into the folder ``out`` unless it has
+    the format's ending.
 
-    In a folder, files are named after the experiment. A second table is written beside the file ``out``.
+    In a folder, files are named after the experiment. A second table is written beside the file
+    ``out``.
     """
     if out is None:
         print("\n".join(texts.values()), end="")
@@ -142,15 +204,24 @@ def report(argv: Sequence[str], runs: Path) -> int:
     parser = ArgumentParser("report")
     parser.add_argument("experiment")
     parser.add_argument(
-        "--out", type=path, metavar="PATH", help=f"folder or .html file; default: the experiment's {REPORT_NAME}"
+        "--out",
+        type=path,
+        metavar="PATH",
+        help=f"folder or .html file; default: the experiment's {REPORT_NAME}",
     )
     parser.add_argument("--baseline", help=f"the densifier to compare with ({BASELINE})")
     options = parser.parse_args(argv)
     experiment = load_experiment(runs, options.experiment)
     densifiers = sorted({trial.densify for trial in experiment.trials})
     if options.baseline is not None and options.baseline not in densifiers:
-        raise InputError(f"--baseline {options.baseline}: {experiment.name} has {', '.join(densifiers)}")
-    file = experiment.folder / REPORT_NAME if options.out is None else file_at(options.out, experiment.name)
+        raise InputError(
+            f"--baseline {options.baseline}: {experiment.name} has {', '.join(densifiers)}"
+        )
+    file = (
+        experiment.folder / REPORT_NAME
+        if options.out is None
+        else file_at(options.out, experiment.name)
+    )
     for warning in experiment.warnings:
         print(f"left out: {warning}", file=sys.stderr)
     text = build_report(experiment, options.baseline or BASELINE)
@@ -161,7 +232,8 @@ def report(argv: Sequence[str], runs: Path) -> int:
 
 
 def file_at(out: Path, experiment: str) -> Path:
-    """The file that ``--out`` means: ``out`` itself, or in a folder a file named after the experiment."""
+    """The file that ``--out`` means: ``out`` itself, or in a folder a file named after the
+    experiment."""
     is_file = out.suffix.lower() in FILE_SUFFIXES and not out.is_dir()
     return out if is_file else out / f"{experiment}-{REPORT_NAME}"
 
@@ -191,20 +263,26 @@ def explain_cell(address: str, runs: Path) -> str:
     cell = make_cell(trials, shown, [scene], expected)
     lines = [
         f"{shown.name} of {trials[0].init}-{trials[0].densify} on {scene} in experiment {name}",
-        f"  {format_cell(cell, shown)}: mean ± deviation (n - 1) over {cell.count} of {expected} trials",
+        f"  {format_cell(cell, shown)}: mean ± deviation (n - 1) over {cell.count} of {expected} "
+        "trials",
     ]
     if cell.reason:
         lines.append(f"  not available: {cell.reason}")
-    lines += ["", "Conditions"] + [f"  {key}: {value}" for key, value in trials[0].conditions.items()]
+    lines += ["", "Conditions"] + [
+        f"  {key}: {value}" for key, value in trials[0].conditions.items()
+    ]
     lines += _trials_lines(trials, shown)
-    left_out = [line for line in experiment.warnings if line.startswith(f"{name}/{scene}/") and arm in line]
+    left_out = [
+        line for line in experiment.warnings if line.startswith(f"{name}/{scene}/") and arm in line
+    ]
     if left_out:
         lines += ["", "Left out", *(f"  {line}" for line in left_out)]
     return "\n".join(lines)
 
 
 def _trials_at(experiment: Experiment, scene: str, arm: str) -> list[TrialResult]:
-    """The trials of a scene and an arm: ``<init>-<densify>``, or the densifier alone if only one arm has it."""
+    """The trials of a scene and an arm: ``<init>-<densify>``, or the densifier alone if only one
+    arm has it."""
     of_scene = [trial for trial in experiment.trials if trial.scene == scene]
     if not of_scene:
         scenes = ", ".join(sorted({trial.scene for trial in experiment.trials}))
@@ -218,13 +296,18 @@ def _trials_at(experiment: Experiment, scene: str, arm: str) -> list[TrialResult
 
 
 def _trials_lines(trials: Sequence[TrialResult], shown: Quantity) -> list[str]:
-    """The value and the origin of each trial; a line that equals the previous trial's is not repeated."""
+    """The value and the origin of each trial; a line that equals the previous trial's is not
+    repeated."""
     lines = ["", "Trials"]
     previous: dict[str, str] = {}
     for trial in trials:
         value, origin = shown.read(trial), _origin(trial)
         lines.append(f"  seed {trial.seed}: {'n/a' if value is None else f'{value:.6g}'}")
-        lines += [f"    {label:<9} {text}" for label, text in origin.items() if previous.get(label) != text]
+        lines += [
+            f"    {label:<9} {text}"
+            for label, text in origin.items()
+            if previous.get(label) != text
+        ]
         previous = previous | origin
     return lines
 
@@ -240,17 +323,26 @@ def _origin(trial: TrialResult) -> dict[str, str]:
         counts = f"{record.num_gaussians or 0:,} from {record.num_init_points or 0:,} points"
     origin = {"folder": str(trial.path), "Gaussians": counts}
     origin["views"] = f"{'?' if record.test_views is None else record.test_views} for testing"
-    origin |= {key: str(value) for key, value in record.hashes.items() if key not in trial.conditions}
+    origin |= {
+        key: str(value) for key, value in record.hashes.items() if key not in trial.conditions
+    }
     if record.trained_by is not None:
         origin["program"] = f"{record.trained_by.version}: {' '.join(record.trained_by.command)}"
     if machine := trial.machine:
         origin["machine"] = machine
     if trial.code:
-        origin["code"] = ", ".join(f"{part} {short_version(version)}" for part, version in trial.code.items())
+        origin["code"] = ", ".join(
+            f"{part} {short_version(version)}" for part, version in trial.code.items()
+        )
     if record.code.commit:
         origin["commit"] = f"{record.code.commit}{', edited' if record.code.edited else ''}"
-    edited = [name.removeprefix("gsbench's ") for name, state in trial.rooms.items() if state != AS_RELEASED]
-    if edited and len(edited) < len(trial.rooms):  # before the first release all rooms count as edited
+    edited = [
+        name.removeprefix("gsbench's ")
+        for name, state in trial.rooms.items()
+        if state != AS_RELEASED
+    ]
+    # before the first release all rooms count as edited
+    if edited and len(edited) < len(trial.rooms):
         origin["edited"] = f"since the last release: {some_of(edited)}"
     origin["versions"] = ", ".join(f"{key} {value}" for key, value in record.versions.items())
     return origin

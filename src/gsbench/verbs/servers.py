@@ -27,13 +27,16 @@ from gsbench.view import ADDRESS
 
 VIEWER_PORT, DASHBOARD_PORT = 8080, 5000
 SECONDS_TO_ANSWER, SECONDS_TO_START = 5.0, 60
-LEAN = {"MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false"}  # MLflow's defaults take eight processes and 2 GB
+# MLflow's defaults take eight processes and 2 GB
+LEAN = {"MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false"}
 
 
 def view(argv: Sequence[str], runs: Path) -> int:
     parser = ArgumentParser("view")
     parser.add_argument("trial", nargs="+", metavar="TRIAL", help=ADDRESS)
-    parser.add_argument("--port", type=port, default=VIEWER_PORT, help=f"on this machine; 0: any ({VIEWER_PORT})")
+    parser.add_argument(
+        "--port", type=port, default=VIEWER_PORT, help=f"on this machine; 0: any ({VIEWER_PORT})"
+    )
     parser.add_argument("--device", default="auto", help="auto, cpu, cuda or cuda:1")
     options = parser.parse_args(argv)
     if len(options.trial) > 2:
@@ -50,7 +53,9 @@ def view(argv: Sequence[str], runs: Path) -> int:
     device = select_device(options.device)
     trials = [find_trial(address, runs) for address in options.trial]
     rasterizer = create_proven("auto", device).rasterizer
-    viewer = Viewer([TrialPainter(load_viewed(trial, device), rasterizer) for trial in trials], options.port)
+    viewer = Viewer(
+        [TrialPainter(load_viewed(trial, device), rasterizer) for trial in trials], options.port
+    )
     with stop_on_signals():
         print(f"{viewer.url}  (Ctrl+C ends it)", flush=True)
         try:
@@ -65,8 +70,14 @@ def view(argv: Sequence[str], runs: Path) -> int:
 def ui(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: serves the dashboard until Ctrl-C, if no server does already."""
     parser = ArgumentParser("ui")
-    parser.add_argument("experiment", nargs="?", help="open the comparison of its arms; default: the only experiment")
-    parser.add_argument("--uri", help="the tracker's address; default: $MLFLOW_TRACKING_URI, or the runs folder's")
+    parser.add_argument(
+        "experiment",
+        nargs="?",
+        help="open the comparison of its arms; default: the only experiment",
+    )
+    parser.add_argument(
+        "--uri", help="the tracker's address; default: $MLFLOW_TRACKING_URI, or the runs folder's"
+    )
     parser.add_argument("--port", type=port, default=DASHBOARD_PORT)
     parser.add_argument("--no-browser", action="store_true", help="only print the addresses")
     options = parser.parse_args(argv)
@@ -77,7 +88,9 @@ def ui(argv: Sequence[str], runs: Path) -> int:
     if home is None and len(names := list_experiments(runs)) == 1:
         home = experiment_home(runs, names[0])
     if uri == default_uri(runs) and not (runs / DATABASE).exists():
-        raise InputError(f"no MLflow database in {runs}: run a trial first, or `gsbench sync`, or give --uri")
+        raise InputError(
+            f"no MLflow database in {runs}: run a trial first, or `gsbench sync`, or give --uri"
+        )
     is_served = uri.startswith(("http://", "https://"))
     server = uri if is_served else f"http://127.0.0.1:{options.port}"
     pages = {"dashboard": server}
@@ -85,7 +98,9 @@ def ui(argv: Sequence[str], runs: Path) -> int:
         try:
             pages = addresses(server, publish(home, uri), version("mlflow"))
         except Exception as error:  # any error of the tracker's client
-            raise InputError(f"{uri} does not take {home.name} ({type(error).__name__}: {error})") from error
+            raise InputError(
+                f"{uri} does not take {home.name} ({type(error).__name__}: {error})"
+            ) from error
     for name, address in pages.items():
         print(f"{name:<10} {address}", flush=True)
     first = next(iter(pages.values()))
@@ -96,10 +111,13 @@ def ui(argv: Sequence[str], runs: Path) -> int:
 
 
 def _serves(server: str, experiment: str, page: str) -> bool:
-    """Return whether an MLflow server answers there that knows the experiment by the id in ``page``."""
+    """Return whether an MLflow server answers there that knows the experiment by the id in
+    ``page``."""
     place = f"{server}/api/2.0/mlflow/experiments/get-by-name"
     try:
-        answer = requests.get(place, params={"experiment_name": experiment}, timeout=SECONDS_TO_ANSWER)
+        answer = requests.get(
+            place, params={"experiment_name": experiment}, timeout=SECONDS_TO_ANSWER
+        )
         found = answer.json()["experiment"]["experiment_id"]
     except (requests.RequestException, ValueError, KeyError, TypeError):
         return False
@@ -108,7 +126,11 @@ def _serves(server: str, experiment: str, page: str) -> bool:
 
 def _has_screen() -> bool:
     """Return whether a browser would open in a window, not within this terminal."""
-    return os.name == "nt" or sys.platform == "darwin" or bool({"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys())
+    return (
+        os.name == "nt"
+        or sys.platform == "darwin"
+        or bool({"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys())
+    )
 
 
 def _open(server: str, page: str) -> None:
@@ -128,12 +150,26 @@ def serve(uri: str, port: int) -> int:
     mlflow_spec = importlib.util.find_spec("mlflow")
     assert mlflow_spec is not None
     assert mlflow_spec.origin is not None
-    command = [sys.executable, "-m", "mlflow", "ui", "--backend-store-uri", uri, "--host", "127.0.0.1"]
+    command = [
+        sys.executable,
+        "-m",
+        "mlflow",
+        "ui",
+        "--backend-store-uri",
+        uri,
+        "--host",
+        "127.0.0.1",
+    ]
     command += ["--port", str(port), "--workers", "1"]
-    # uvicorn imports modules from the current folder first, where a `yaml.py` may lie; MLflow's own folder is safe.
-    command += ["--uvicorn-opts", f"--app-dir={shlex.quote(str(Path(mlflow_spec.origin).parents[1]))}"]
+    # uvicorn imports modules from the current folder first, where a `yaml.py` may lie; MLflow's own
+    # folder is safe.
+    command += [
+        "--uvicorn-opts",
+        f"--app-dir={shlex.quote(str(Path(mlflow_spec.origin).parents[1]))}",
+    ]
     with stop_on_signals():
-        # Not `subprocess.run`: it would kill only `mlflow ui`, and its orphaned server would keep the port.
+        # Not `subprocess.run`: it would kill only `mlflow ui`, and its orphaned server would keep
+        # the port.
         server = subprocess.Popen(command, env=SETTINGS | LEAN | dict(os.environ))
         try:
             return server.wait()

@@ -44,17 +44,27 @@ log = logging.getLogger(__name__)
 
 
 def status(argv: Sequence[str], runs: Path) -> int:
-    """Run the verb: 0 if all trials are done, running or queued, 1 if some failed or are missing."""
+    """Run the verb: 0 if all trials are done, running or queued, 1 if some failed or are
+    missing."""
     parser = ArgumentParser("status")
-    parser.add_argument("experiment", nargs="?", help="its name; without one, a line for each experiment")
+    parser.add_argument(
+        "experiment", nargs="?", help="its name; without one, a line for each experiment"
+    )
     parser.add_argument("--all", action="store_true", help="list the finished trials too")
-    parser.add_argument("--watch", action="store_true", help="a table of arms and scenes, renewed until all have ended")
+    parser.add_argument(
+        "--watch",
+        action="store_true",
+        help="a table of arms and scenes, renewed until all have ended",
+    )
     parser.add_argument("--json", action="store_true", help="print a JSON list instead of lines")
-    parser.add_argument("--forget", action="store_true", help="remove trials from the plan that never started")
+    parser.add_argument(
+        "--forget", action="store_true", help="remove trials from the plan that never started"
+    )
     parser.add_argument(
         "--forget-superseded",
         action="store_true",
-        help="delete the folders of trials that older code made; what their stages computed stays in the store",
+        help="delete the folders of trials that older code made; what their stages computed stays "
+        "in the store",
     )
     options = parser.parse_args(argv)
     if options.experiment is None:
@@ -78,16 +88,25 @@ def status(argv: Sequence[str], runs: Path) -> int:
         print(f"{counted(len(missing), 'trial')} removed from the plan")
         return 0
     if options.json:
-        print(json.dumps([asdict(trial) for trial in trials], indent=1, default=str))  # str: of the folder
+        # str: of the folder
+        print(json.dumps([asdict(trial) for trial in trials], indent=1, default=str))
     else:
         print("\n".join(lines_of(trials, options.all)))
-    return 0 if all(trial.state in ("done", "running", "queued", "superseded") for trial in trials) else 1
+    return (
+        0
+        if all(trial.state in ("done", "running", "queued", "superseded") for trial in trials)
+        else 1
+    )
 
 
 def _watch(home: Path) -> None:
-    """Show the progress of the experiment in ``home`` until all its trials have ended, or until Ctrl-C."""
+    """Show the progress of the experiment in ``home`` until all its trials have ended, or until
+    Ctrl-C."""
     progress = progress_of(home)
-    with suppress(KeyboardInterrupt), Live(_progress_view(home.name, progress), auto_refresh=False) as live:
+    with (
+        suppress(KeyboardInterrupt),
+        Live(_progress_view(home.name, progress), auto_refresh=False) as live,
+    ):
         while not progress.has_ended:
             time.sleep(SECONDS_BETWEEN_LOOKS)
             progress = progress_of(home)
@@ -95,7 +114,8 @@ def _watch(home: Path) -> None:
 
 
 def _progress_view(name: str, progress: Progress) -> Group:
-    """A table of arms by scenes, with the numbers of trials that are done and in other states, and lines below it."""
+    """A table of arms by scenes, with the numbers of trials that are done and in other states, and
+    lines below it."""
     scenes = sorted({scene for _, scene in progress.cells})
     arms = sorted({arm for arm, _ in progress.cells})
     table = Table(title=escape(f"{name}: trials done of all"))
@@ -120,10 +140,12 @@ def _cell(counts: dict[str, int]) -> str:
 
 
 def progress_with_superseded(home: Path) -> list[TrialState]:
-    """The state of every trial of the experiment in ``home``, with ``superseded`` for those that older code made."""
+    """The state of every trial of the experiment in ``home``, with ``superseded`` for those that
+    older code made."""
     folders = {folder: trial.cwd for folder, trial in read_plan(home).items()}
 
-    # The user's modules are read in the folder where the trial's command was given: another may have a namesake.
+    # The user's modules are read in the folder where the trial's command was given: another may
+    # have a namesake.
     def present_digest(module: str, trial: TrialResult) -> str | None:
         return module_digest(module, folders[trial.path]) if trial.path in folders else None
 
@@ -137,7 +159,8 @@ def progress_with_superseded(home: Path) -> list[TrialState]:
 
 
 def lines_of(trials: list[TrialState], with_done: bool) -> list[str]:
-    """A line for each trial that is not done, or whose result is in doubt (or for each, ``with_done``); a summary."""
+    """A line for each trial that is not done, or whose result is in doubt (or for each,
+    ``with_done``); a summary."""
     lines = []
     for trial in sorted(trials, key=lambda trial: ORDER.index(trial.state)):
         if trial.state != "done" or trial.note or with_done:
@@ -182,34 +205,44 @@ def retry(argv: Sequence[str], runs: Path) -> int:
         nargs="*",
         default=[],
         metavar="KEY=VALUE",
-        help="settings that do not make a different trial: launch=slurm …; allow_targets=[mine] for your own code",
+        help="settings that do not make a different trial: launch=slurm …; allow_targets=[mine] "
+        "for your own code",
     )
     parser.add_argument("--dry-run", action="store_true", help="only list them")
     options = parser.parse_args(argv)
     home = experiment_home(runs, options.experiment)
     if refused := [change for change in options.changes if makes_other_trials(key_of(change))]:
-        raise InputError(f"{refused[0]} would make other trials than those of the plan: give the sweep's own command")
+        raise InputError(
+            f"{refused[0]} would make other trials than those of the plan: give the sweep's own "
+            "command"
+        )
     unfinished = [trial.folder for trial in states_of_experiment(home) if trial.state in RETRIED]
     if not unfinished:
         print(f"nothing to retry: all trials of {options.experiment} are done, running or queued")
         return 0
     planned = read_plan(home)
     modules = os.getcwd()  # noted now, since `recompose` changes the current folder
-    trials = [recompose(folder, planned.get(folder), runs, options.changes, modules) for folder in unfinished]
+    trials = [
+        recompose(folder, planned.get(folder), runs, options.changes, modules)
+        for folder in unfinished
+    ]
     _check_trackers(trials, options.changes)
     if options.dry_run:
         print("\n".join(describe_plan(trials, trials[0].values["launch"]["parallel"])))
         return 0
     replaced = [old for old, trial in zip(unfinished, trials, strict=True) if trial.folder != old]
     for old in replaced:
-        log.info("%s: its configuration has changed since; the new one is run", TrialFolder(old).label)
+        log.info(
+            "%s: its configuration has changed since; the new one is run", TrialFolder(old).label
+        )
     code = run_trials(trials)
     forget(home, [old for old in replaced if old in planned])
     return code
 
 
 def _check_trackers(trials: Sequence[Trial], changes: Sequence[str]) -> None:
-    """Raise InputError for a trial that would send its results to a tracker which only a file names.
+    """Raise InputError for a trial that would send its results to a tracker which only a file
+    names.
 
     The runs folder may be somebody else's, and its address theirs.
     """
@@ -217,34 +250,49 @@ def _check_trackers(trials: Sequence[Trial], changes: Sequence[str]) -> None:
     for trial in trials:
         if address := untyped_address(trial.values["tracking"], typed_uri):
             raise InputError(
-                f"{trial.files.label} would send its results to {address}, an address from a file: to allow it, type "
-                f"{TRACKER}={address} (for a trial in no plan: set {VARIABLE}={address}); tracking=none sends nothing"
+                f"{trial.files.label} would send its results to {address}, an address from a "
+                "file: to allow it, type "
+                f"{TRACKER}={address} (for a trial in no plan: set {VARIABLE}={address}); "
+                "tracking=none sends nothing"
             )
 
 
-def recompose(folder: Path, planned: PlannedTrial | None, runs: Path, changes: list[str], modules: str) -> Trial:
-    """The trial in ``folder``: from its planned overrides, else from the configuration that it wrote.
+def recompose(
+    folder: Path, planned: PlannedTrial | None, runs: Path, changes: list[str], modules: str
+) -> Trial:
+    """The trial in ``folder``: from its planned overrides, else from the configuration that it
+    wrote.
 
-    Neither gives permission to run code: ``changes`` must give it again. ``modules`` is the folder of the user's
-    modules.
+    Neither gives permission to run code: ``changes`` must give it again. ``modules`` is the folder
+    of the user's modules.
     """
     if planned is not None:
         if Path(planned.cwd).is_dir():
-            os.chdir(planned.cwd)  # relative paths were meant from there, and the trials are run from there
+            # relative paths were meant from there, and the trials are run from there
+            os.chdir(planned.cwd)
         replaced = {PERMISSIONS, *map(key_of, changes)}
         kept = [word for word in planned.overrides if key_of(word) not in replaced]
-        if any(change.startswith("launch=") and change not in planned.overrides for change in changes):
-            kept = [word for word in kept if not word.startswith("launch.")]  # they were meant for the other launcher
-        # Modules are not taken from planned.cwd: somebody else's plan would name a folder of theirs.
+        if any(
+            change.startswith("launch=") and change not in planned.overrides for change in changes
+        ):
+            # they were meant for the other launcher
+            kept = [word for word in kept if not word.startswith("launch.")]
+        # Modules are not taken from planned.cwd: somebody else's plan would name a folder of
+        # theirs.
         trial = compose_one([*kept, *changes], modules=modules)
         return Trial(trial.values | {"runs": str(runs)}, trial.overrides)
     files, allowed = TrialFolder(folder), typed_permissions(changes)
     if any(key_of(change) != PERMISSIONS for change in changes):
-        raise InputError(f"{files.label} is in no plan, so no setting of it can be changed: run it by its own command")
+        raise InputError(
+            f"{files.label} is in no plan, so no setting of it can be changed: run it by its own "
+            "command"
+        )
     allow_modules(allowed, modules)
     values = files.configuration() | {"runs": str(runs), PERMISSIONS: list(allowed)}
     if values["densify"].get("evaluated_from") == FROM_RENDERS:
-        raise InputError(f"{files.label} was entered from renders: give the command of `gsbench evaluate` again")
+        raise InputError(
+            f"{files.label} was entered from renders: give the command of `gsbench evaluate` again"
+        )
     return Trial(values, ())
 
 
@@ -253,13 +301,16 @@ def sync(argv: Sequence[str], runs: Path) -> int:
     parser = ArgumentParser("sync")
     parser.add_argument("experiment", nargs="?", help="its name; without one, all")
     parser.add_argument(
-        "--uri", help="such as http://127.0.0.1:5000; default: $MLFLOW_TRACKING_URI, or the runs folder's"
+        "--uri",
+        help="such as http://127.0.0.1:5000; default: $MLFLOW_TRACKING_URI, or the runs folder's",
     )
     options = parser.parse_args(argv)
     names = [options.experiment] if options.experiment else list_experiments(runs)
     homes = [experiment_home(runs, name) for name in names]
     try:
-        folders = [TrialFolder(Path(place)) for home in homes for place in sorted(trial_folders(home))]
+        folders = [
+            TrialFolder(Path(place)) for home in homes for place in sorted(trial_folders(home))
+        ]
         for line in send_missing(folders, options.uri):
             print(line, flush=True)
     except (MirrorError, OSError) as error:

@@ -1,4 +1,5 @@
-"""Verbs that compare versions of a trainer: ``gsbench gate`` and ``gsbench bisect`` (docs/gate.md)."""
+"""Verbs that compare versions of a trainer: ``gsbench gate`` and ``gsbench bisect``
+(docs/gate.md)."""
 
 import argparse
 import os
@@ -33,16 +34,21 @@ LOG = "bisect.log"
 
 
 def gate(argv: Sequence[str], runs: Path) -> int:
-    """Run the verb: 0 passed, 1 worse, 3 not decided; raises GsbenchError (1) if trials fail, InputError (2)."""
+    """Run the verb: 0 passed, 1 worse, 3 not decided; raises GsbenchError (1) if trials fail,
+    InputError (2)."""
     parser = ArgumentParser(
         "gate",
-        "It trains this version on scenes and seeds of an archive (gsbench export --results), seed by seed until it "
-        "is decided. Exit code 0: no (better, or worse by less than what matters), 1: yes, or its trials fail, 3: the "
+        "It trains this version on scenes and seeds of an archive (gsbench export --results), "
+        "seed by seed until it "
+        "is decided. Exit code 0: no (better, or worse by less than what matters), 1: yes, or its "
+        "trials fail, 3: the "
         "seeds do not tell, 2: bad input (docs/gate.md).",
     )
     parser.add_argument("archive", type=path, help="the results of the version that you trust")
     add_question(parser)
-    parser.add_argument("--seeds", type=int, help="the largest number of seeds; default: all that the archive has")
+    parser.add_argument(
+        "--seeds", type=int, help="the largest number of seeds; default: all that the archive has"
+    )
     add_where(parser)
     options = parser.parse_args(argv)
     by_scene = one_trial_per_scene("gate", options.settings, options.metric)
@@ -52,7 +58,10 @@ def gate(argv: Sequence[str], runs: Path) -> int:
         archived = unpack_archive(options.archive, Path(folder)).trials
         baseline = _baseline(select_trials(archived, dict(options.where)), by_scene)
         seeds = _seeds(baseline, options.seeds)
-        arms = {scene: (str(old[0].arm), by_scene[scene].folder.parent.name) for scene, old in baseline.items()}
+        arms = {
+            scene: (str(old[0].arm), by_scene[scene].folder.parent.name)
+            for scene, old in baseline.items()
+        }
         declaration = gates.declare_gate(options.metric, options.least, arms, seeds, example.values)
         trials = {
             (trial_key(scene, arms[scene][1], gates.NEW), seed): with_seed(trial, seed)
@@ -61,11 +70,17 @@ def gate(argv: Sequence[str], runs: Path) -> int:
         }
         make_runs_folder(checked_runs_folder(str(home.parent)))
         old = [trial for of_scene in baseline.values() for trial in of_scene if trial.seed in seeds]
-        gate = gates.Gate(declare_questions(home, declaration), lambda: old, lambda: _done(home, list(trials.values())))
+        gate = gates.Gate(
+            declare_questions(home, declaration),
+            lambda: old,
+            lambda: _done(home, list(trials.values())),
+        )
 
         def run(planned: Sequence[KeyAndSeed]) -> None:
             if code := run_trials([trials[key] for key in planned if key in trials]):
-                raise (InputError if code == 2 else GsbenchError)("the new version's trials fail: nothing is compared")
+                raise (InputError if code == 2 else GsbenchError)(
+                    "the new version's trials fail: nothing is compared"
+                )
 
         (verdict,) = run_looks(gate.declaration, gate.judged, run)
         if verdict.answer is None and not verdict.equal:
@@ -75,8 +90,11 @@ def gate(argv: Sequence[str], runs: Path) -> int:
     return EXIT_CODES[gates.result_of(verdict)]
 
 
-def _baseline(archived: Sequence[TrialResult], by_scene: Mapping[str, Trial]) -> dict[str, list[TrialResult]]:
-    """The archive's trials of each scene. If it has several arms there, the one with the name of the new trial's arm.
+def _baseline(
+    archived: Sequence[TrialResult], by_scene: Mapping[str, Trial]
+) -> dict[str, list[TrialResult]]:
+    """The archive's trials of each scene. If it has several arms there, the one with the name of
+    the new trial's arm.
 
     Raises InputError for a scene that the archive lacks, and if several arms or settings are left.
     """
@@ -89,44 +107,57 @@ def _baseline(archived: Sequence[TrialResult], by_scene: Mapping[str, Trial]) ->
         old = [trial for trial in old if str(trial.arm) == new.folder.parent.name] or old
         if len(variants := group_by(old, lambda trial: (trial.arm, trial.config_hash))) > 1:
             arms = listed([f"{arm} ({settings})" for arm, settings in variants])
-            raise InputError(f"the archive has several arms on {scene}, {arms}: choose by --where KEY=VALUE")
+            raise InputError(
+                f"the archive has several arms on {scene}, {arms}: choose by --where KEY=VALUE"
+            )
         baseline[scene] = old
     return baseline
 
 
 def _seeds(baseline: Mapping[str, Sequence[TrialResult]], most: int | None) -> list[int]:
     """The seeds that all scenes have, ``most`` at most; raises InputError if there are fewer."""
-    shared = sorted(set.intersection(*({trial.seed for trial in trials} for trials in baseline.values())))
+    shared = sorted(
+        set.intersection(*({trial.seed for trial in trials} for trials in baseline.values()))
+    )
     if most is not None and not 0 < most <= len(shared):
         raise InputError(f"--seeds {most}: the archive has {len(shared)} seeds of all scenes")
     return shared[:most]
 
 
 def _done(home: Path, trials: Sequence[Trial]) -> list[TrialResult]:
-    """The results of those ``trials`` that are done. Results of earlier code do not count as done."""
+    """The results of those ``trials`` that are done. Results of earlier code do not count as
+    done."""
     by_folder = {trial.folder: trial for trial in trials}
 
     def is_done(result: TrialResult) -> bool:
         trial, awaited = by_folder.get(result.path), result.record.awaited
         # A metric whose weights are missing does not make a trial unfinished.
-        return trial is not None and not trial.files.why_not_done(trial.values, lambda options: awaited)
+        return trial is not None and not trial.files.why_not_done(
+            trial.values, lambda options: awaited
+        )
 
     return list(filter(is_done, read_experiment(home).trials))
 
 
 def bisect(argv: Sequence[str], runs: Path) -> int:
-    """Run the verb: 0 if the commit is found, 3 if not; raises TrainingError if GOOD or BAD does not train."""
+    """Run the verb: 0 if the commit is found, 3 if not; raises TrainingError if GOOD or BAD does
+    not train."""
     parser = ArgumentParser(
         "bisect",
-        "It searches the git repository of this folder: one with a densifier of your own, or gsbench's checkout. Each "
-        "step trains one commit in a work tree of its own and compares it with GOOD, as gsbench gate does; all steps "
-        "share an error rate of 5 %. The same command goes on after a kill. Exit code 0: found, 3: not found "
+        "It searches the git repository of this folder: one with a densifier of your own, or "
+        "gsbench's checkout. Each "
+        "step trains one commit in a work tree of its own and compares it with GOOD, as gsbench "
+        "gate does; all steps "
+        "share an error rate of 5 %. The same command goes on after a kill. Exit code 0: found, "
+        "3: not found "
         "(docs/gate.md).",
     )
     parser.add_argument("good", help="a commit, tag or branch whose results are good")
     parser.add_argument("bad", help="a later one whose results are worse")
     add_question(parser)
-    parser.add_argument("--seeds", type=int, default=6, help="the largest number of seeds for each commit (6)")
+    parser.add_argument(
+        "--seeds", type=int, default=6, help="the largest number of seeds for each commit (6)"
+    )
     options = parser.parse_args(argv)
     with tempfile.TemporaryDirectory(prefix="gsbench-bisect-") as scratch:
         trees = WorkTrees(Path.cwd(), Path(scratch).resolve())
@@ -139,24 +170,33 @@ def bisect(argv: Sequence[str], runs: Path) -> int:
 
 @dataclass
 class CommitSearch:
-    """A search through ``commits``, the first of which is good, with one declaration for all its steps."""
+    """A search through ``commits``, the first of which is good, with one declaration for all its
+    steps."""
 
-    home: Path  # an experiment without trials for the declaration; each commit's trials are in one of its own
+    # an experiment without trials for the declaration; each commit's trials are in one of its own
+    home: Path
     settings: Sequence[str]
     scenes: frozenset[str]
     declaration: Declaration
     trees: WorkTrees
     commits: Sequence[tuple[str, str, str]]
-    answers: dict[int, str] = field(default_factory=dict)  # what was found out, by the commit's index
+    # results so far, by the commit's index
+    answers: dict[int, str] = field(default_factory=dict)
 
     def result(self, number: int) -> str | None:
-        """The result of a commit against the first one; None if it does not train. Trains what is missing."""
-        good, new = (self.home.parent / f"{self.home.name}_{self.commits[k][0][:HASH_LENGTH]}" for k in (0, number))
+        """The result of a commit against the first one; None if it does not train. Trains what is
+        missing."""
+        good, new = (
+            self.home.parent / f"{self.home.name}_{self.commits[k][0][:HASH_LENGTH]}"
+            for k in (0, number)
+        )
         gate = gates.Gate(self.declaration, lambda: _trials(good), lambda: _trials(new))
 
         def run(planned: Sequence[KeyAndSeed]) -> None:
             for version, commit, home in ((gates.BASELINE, 0, good), (gates.NEW, number, new)):
-                self._train(commit, home, [seed for key, seed in planned if key.endswith(f"/{version}")])
+                self._train(
+                    commit, home, [seed for key, seed in planned if key.endswith(f"/{version}")]
+                )
 
         try:
             (verdict,) = run_looks(self.declaration, gate.judged, run)
@@ -171,11 +211,16 @@ class CommitSearch:
     def _train(self, number: int, home: Path, seeds: Sequence[int]) -> None:
         """Train a commit with the seeds that are not done, by the code in its work tree."""
         done = {(trial.scene, trial.seed) for trial in _trials(home)}
-        missing = [str(seed) for seed in seeds if not {(scene, seed) for scene in self.scenes} <= done]
+        missing = [
+            str(seed) for seed in seeds if not {(scene, seed) for scene in self.scenes} <= done
+        ]
         if not missing:
             return
         commit, _, subject = self.commits[number]
-        print(f"{commit[:HASH_LENGTH]} {printable(subject)}: seeds {', '.join(missing)}", file=sys.stderr)
+        print(
+            f"{commit[:HASH_LENGTH]} {printable(subject)}: seeds {', '.join(missing)}",
+            file=sys.stderr,
+        )
         tree = self.trees.tree(commit)
         environment = os.environ | {"GSBENCH_RUNS": str(home.parent)}
         if (tree / OWN_SOURCE).is_file():
@@ -191,27 +236,37 @@ class CommitSearch:
         for number in reversed(range(len(self.commits))):
             commit, date, subject = self.commits[number]
             answer = "the good one" if number == 0 else self.answers.get(number, "not tried")
-            lines.append(printable(f"{commit[:HASH_LENGTH]}  {date}  {subject}\n            {answer}"))
+            lines.append(
+                printable(f"{commit[:HASH_LENGTH]}  {date}  {subject}\n            {answer}")
+            )
         return lines
 
 
-def _begin(options: argparse.Namespace, trees: WorkTrees, commits: Sequence[tuple[str, str, str]]) -> CommitSearch:
+def _begin(
+    options: argparse.Namespace, trees: WorkTrees, commits: Sequence[tuple[str, str, str]]
+) -> CommitSearch:
     """Check the settings, and declare the question of all steps before the first one."""
     by_scene = one_trial_per_scene("bisect", options.settings, options.metric)
     example = next(iter(by_scene.values()))  # its settings are those of all, apart from the scene
     for trial in by_scene.values():
         place = trial.values["scene"].get("path")
         if place and not Path(place).expanduser().is_absolute():
-            raise InputError(f"scene.path={place}: commits are trained in other folders, so give the whole path")
+            raise InputError(
+                f"scene.path={place}: commits are trained in other folders, so give the whole path"
+            )
     arms = {scene: (trial.folder.parent.name,) * 2 for scene, trial in by_scene.items()}
-    share = ERROR_RATE / gates.most_steps(len(commits) - 1)  # of each step, so that all together err in 5 % at most
+    # of each step, so that all together err in 5 % at most
+    share = ERROR_RATE / gates.most_steps(len(commits) - 1)
     seeds = range(max(0, options.seeds))
-    declaration = gates.declare_gate(options.metric, options.least, arms, seeds, example.values, share)
+    declaration = gates.declare_gate(
+        options.metric, options.least, arms, seeds, example.values, share
+    )
     settings = [word for word in options.settings if not word.startswith(("name=", "runs="))]
     runs = checked_runs_folder(str(example.files.runs))
     make_runs_folder(runs)
     # The name is a hash of the question, so that the same command continues the same search.
-    home = runs / f"{example.values['name']}_{sha256_of([commits[0][0], commits[-1][0], *settings])[:HASH_LENGTH]}"
+    question = sha256_of([commits[0][0], commits[-1][0], *settings])[:HASH_LENGTH]
+    home = runs / f"{example.values['name']}_{question}"
     declaration = declare_questions(home, declaration)
     return CommitSearch(home, settings, frozenset(by_scene), declaration, trees, commits)
 
@@ -223,10 +278,16 @@ def _trials(home: Path) -> tuple[TrialResult, ...]:
 def _conclusion(found: tuple[int, int] | None, search: CommitSearch) -> list[str]:
     """The lines that say which commit, or which commits, the search found."""
     if found is None:
-        return ["The last commit is not shown to be worse than the first: allow more --seeds, or take another metric."]
+        return [
+            "The last commit is not shown to be worse than the first: allow more --seeds, or take "
+            "another metric."
+        ]
     good, bad = found
     commit, date, subject = search.commits[bad]
     if bad - good == 1:
         return [printable(f"It became worse with {commit[:HASH_LENGTH]} ({date}): {subject}")]
     first = search.commits[good + 1][0][:HASH_LENGTH]
-    return [f"It became worse with one of {counted(bad - good, 'commit')}, from {first} to {commit[:HASH_LENGTH]}."]
+    return [
+        f"It became worse with one of {counted(bad - good, 'commit')}, from {first} to "
+        f"{commit[:HASH_LENGTH]}."
+    ]

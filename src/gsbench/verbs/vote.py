@@ -1,4 +1,5 @@
-"""``gsbench vote``: a page on which people compare renders blindly, and the verdict of their votes (docs/vote.md)."""
+"""``gsbench vote``: a page on which people compare renders blindly, and the verdict of their votes
+(docs/vote.md)."""
 
 import argparse
 import random
@@ -35,7 +36,9 @@ def vote(argv: Sequence[str], runs: Path) -> int:
     experiment = load_experiment(runs, options.experiment)
     if options.action == "make":
         if options.out is None or options.files:
-            raise InputError("vote make needs --out DIR, a new folder for the page, and takes no files")
+            raise InputError(
+                "vote make needs --out DIR, a new folder for the page, and takes no files"
+            )
         make(experiment, options)
     else:
         if options.out is not None or options.arms:
@@ -47,19 +50,36 @@ def vote(argv: Sequence[str], runs: Path) -> int:
 def _parser() -> ArgumentParser:
     parser = ArgumentParser(
         "vote",
-        "`make` writes the page, a folder that works without a server. `judge` takes the files that people save.",
+        "`make` writes the page, a folder that works without a server. `judge` takes the files "
+        "that people save.",
     )
     parser.add_argument("action", choices=["make", "judge"])
     parser.add_argument("experiment")
     parser.add_argument(
-        "files", nargs="*", type=path, metavar="VOTES.json", help="for judge; it remembers those of earlier calls"
+        "files",
+        nargs="*",
+        type=path,
+        metavar="VOTES.json",
+        help="for judge; it remembers those of earlier calls",
     )
-    parser.add_argument("--arms", type=names, default=(), metavar="A,B", help="the baseline first; default: all arms")
     parser.add_argument(
-        "--pairs", type=_whole, default=PAIRS, help=f"of renders that each person compares ({PAIRS}), before repeats"
+        "--arms",
+        type=names,
+        default=(),
+        metavar="A,B",
+        help="the baseline first; default: all arms",
     )
     parser.add_argument(
-        "--people", type=_whole, default=PEOPLE, help=f"whose votes are declared to count ({PEOPLE}), no more or fewer"
+        "--pairs",
+        type=_whole,
+        default=PAIRS,
+        help=f"of renders that each person compares ({PAIRS}), before repeats",
+    )
+    parser.add_argument(
+        "--people",
+        type=_whole,
+        default=PEOPLE,
+        help=f"whose votes are declared to count ({PEOPLE}), no more or fewer",
     )
     parser.add_argument("--out", type=path, metavar="DIR", help="for make: a new folder")
     return parser
@@ -74,7 +94,8 @@ def make(experiment: Experiment, options: argparse.Namespace) -> None:
     out: Path = options.out
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(
-            f"--out {out} is there already: give a new folder, since a page that people use must not change"
+            f"--out {out} is there already: give a new folder, since a page that people use must "
+            "not change"
         )
     make_runs_folder(experiment.folder.parent)
     rng = random.Random(secrets.randbits(256))
@@ -85,14 +106,23 @@ def make(experiment: Experiment, options: argparse.Namespace) -> None:
     folder.mkdir(parents=True)
     write_json(folder / VOTE_KEY, key.to_json())
     asked = [
-        Question(metric=METRIC, least=LEAST_PREFERENCE, baseline=arms[0], arm=arm, name=f"vote {key.round}")
+        Question(
+            metric=METRIC,
+            least=LEAST_PREFERENCE,
+            baseline=arms[0],
+            arm=arm,
+            name=f"vote {key.round}",
+        )
         for arm in arms[1:]
     ]
-    declaration = Declaration(time=key.time, questions=tuple(asked), votes=key.votes, vote_round=key.round)
+    declaration = Declaration(
+        time=key.time, questions=tuple(asked), votes=key.votes, vote_round=key.round
+    )
     declare_questions(experiment.folder, declaration)
     pairs, scenes = len(key.pairs), len({one.scene for one in key.pairs})
     print(
-        f"round {key.round}: {counted(len(key.showings), 'showing')}, {counted(pairs, 'pair')} of renders, and repeats"
+        f"round {key.round}: {counted(len(key.showings), 'showing')}, {counted(pairs, 'pair')} of "
+        "renders, and repeats"
     )
     print(f"declared: judged at {counted(key.votes, 'vote')} of {people_words(key.people)}")
     print(f"declared: whoever has more than {counted(key.traps_allowed, 'wrong trap')} is left out")
@@ -101,12 +131,16 @@ def make(experiment: Experiment, options: argparse.Namespace) -> None:
     level = ALPHA / len(asked)
     if not sign_test_needs(key.people, level) and not sign_test_needs(scenes, level):
         needed = next(n for n in range(1, 99) if sign_test_needs(n, level))
-        print(f"it will decide nothing: that needs {needed} people (--people {needed}) or {needed} scenes")
+        print(
+            f"it will decide nothing: that needs {needed} people (--people {needed}) or {needed} "
+            "scenes"
+        )
     print(out / PAGE)
 
 
 def judge(experiment: Experiment, files: Sequence[Path]) -> None:
-    """Take people's files into their rounds, and print the verdicts of these rounds; without files, of all rounds."""
+    """Take people's files into their rounds, and print the verdicts of these rounds; without files,
+    of all rounds."""
     ballots: dict[str, Ballot] = {}
     for file in files:
         if not file.is_file():
@@ -116,22 +150,35 @@ def judge(experiment: Experiment, files: Sequence[Path]) -> None:
         require_no_links(experiment.folder.parent, folder, below=True)
         check_ballot(ballot, read_key(folder), file)
         if ballot.person in ballots:
-            raise InputError(f"{file} is of the same person as another file: give one file for each person")
+            raise InputError(
+                f"{file} is of the same person as another file: give one file for each person"
+            )
         ballots[ballot.person] = ballot
         place = folder / f"{ballot.person}.json"
-        # A person who goes back and saves again would otherwise change votes after seeing a verdict.
+        # A person who goes back and saves again would otherwise change votes after seeing a
+        # verdict.
         if place.exists() and read_typed(place, Ballot) != ballot:
-            raise InputError(f"{file}: this person handed in other votes before, which stay ({place})")
+            raise InputError(
+                f"{file}: this person handed in other votes before, which stay ({place})"
+            )
         write_json(place, ballot.to_json())
     verdicts = load_rounds(experiment.folder)
     if not verdicts:
-        raise InputError(f"{experiment.name} has no round of votes: gsbench vote make {experiment.name} --out DIR")
+        raise InputError(
+            f"{experiment.name} has no round of votes: gsbench vote make {experiment.name} --out "
+            "DIR"
+        )
     trials, pairs = compared_pairs(experiment)
     judged = judge_pairs(trials, pairs, active_declaration(experiment.folder, trials))
-    rounds = {ballot.round for ballot in ballots.values()} or {verdict.key.round for verdict in verdicts}
+    rounds = {ballot.round for ballot in ballots.values()} or {
+        verdict.key.round for verdict in verdicts
+    }
     for verdict in verdicts:
         if verdict.key.round in rounds:
-            tables = [to_markdown(vote_table(pair, verdict.final, trials, judged)) for pair in verdict.pairs]
+            tables = [
+                to_markdown(vote_table(pair, verdict.final, trials, judged))
+                for pair in verdict.pairs
+            ]
             print("\n".join([*describe_round(verdict), *tables]))
 
 
@@ -144,11 +191,15 @@ def choose_arms(arms: Sequence[Arm], wanted: Sequence[str]) -> list[Arm]:
         chosen = sorted(arms, key=lambda arm: arm.densify != BASELINE)
     else:
         found = [
-            [arm for arm in arms if word in (str(arm), f"{arm.init}-{arm.densify}", arm.densify)] for word in wanted
+            [arm for arm in arms if word in (str(arm), f"{arm.init}-{arm.densify}", arm.densify)]
+            for word in wanted
         ]
         for word, own in zip(wanted, found, strict=True):
             if len(own) != 1:
-                raise InputError(f"--arms: {word!r} names {len(own)} arms; there are {some_of(list(map(str, arms)))}")
+                raise InputError(
+                    f"--arms: {word!r} names {len(own)} arms; there are "
+                    f"{some_of(list(map(str, arms)))}"
+                )
         chosen = list(dict.fromkeys(own[0] for own in found))
     if len(chosen) < 2:
         raise InputError(f"votes compare two arms or more, and here is {chosen[0]} alone")

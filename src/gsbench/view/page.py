@@ -1,8 +1,9 @@
-"""A trained model as one HTML page that turns in any browser without a network, with the test cameras.
+"""A trained model as one HTML page that turns in any browser without a network, with the test
+cameras.
 
-The page is the SuperSplat viewer, written by ``@playcanvas/splat-transform`` (MIT), which npx downloads and starts. Its
-settings, in the viewer's version 2, hold each test view as an annotation (its buttons lead from
-one to the next), and a flight through all of them.
+The page is the SuperSplat viewer, written by ``@playcanvas/splat-transform`` (MIT), which npx
+downloads and starts. Its settings, in the viewer's version 2, hold each test view as an annotation
+(its buttons lead from one to the next), and a flight through all of them.
 """
 
 import math
@@ -26,8 +27,8 @@ from gsbench.scene.types import View
 from gsbench.view.trials import model_file, model_folder, read_test_views
 
 PACKAGE = "@playcanvas/splat-transform@2.7.1"
-# Without a GPU, the colours' spherical harmonics are sorted into groups by one step instead of ten: each takes ten
-# seconds of a core for 20,000 Gaussians.
+# Without a GPU, the colours' spherical harmonics are sorted into groups by one step instead of ten:
+# each takes ten seconds of a core for 20,000 Gaussians.
 WITHOUT_GPU = ("-g", "cpu", "-i", "1")
 SECONDS_PER_VIEW = 4
 MIN_DEPTH = 0.2  # units: 3DGS's near plane
@@ -36,7 +37,8 @@ MIN_DEPTH = 0.2  # units: 3DGS's near plane
 def write_page(trial: TrialResult, out: Path) -> None:
     """Write the page of ``trial`` to the file ``out``.
 
-    Raises GsbenchError with the command to type if npx is missing or fails; then model and settings lie beside ``out``.
+    Raises GsbenchError with the command to type if npx is missing or fails; then model and settings
+    lie beside ``out``.
     """
     settings = page_settings(trial)
     npx = shutil.which("npx")
@@ -50,7 +52,9 @@ def write_page(trial: TrialResult, out: Path) -> None:
         files = [str(model), "-E", str(model.with_suffix(".json")), str(page)]
         said = ""
         for device in ((), WITHOUT_GPU):
-            done = subprocess.run([*words, *device, *files], capture_output=True, text=True, check=False)
+            done = subprocess.run(
+                [*words, *device, *files], capture_output=True, text=True, check=False
+            )
             if done.returncode == 0 and page.is_file():
                 with atomic(out, sync=False) as temporary:
                     shutil.copyfile(page, temporary)
@@ -64,20 +68,29 @@ def _by_hand(trial: TrialResult, settings: dict[str, Any], out: Path, cause: str
     shutil.copyfile(model_file(trial), model)
     write_json(out.with_suffix(".json"), settings)
     words = ["npx", PACKAGE, str(model), "-E", str(out.with_suffix(".json")), str(out)]
-    return f"{cause}: model and settings lie in {out.parent}; where it works, type: {shlex.join(words)}"
+    return (
+        f"{cause}: model and settings lie in {out.parent}; where it works, type: "
+        f"{shlex.join(words)}"
+    )
 
 
 def page_settings(trial: TrialResult) -> dict[str, Any]:
-    """The viewer's settings: the background of the training, and a camera for each test view, the first first."""
+    """The viewer's settings: the background of the training, and a camera for each test view, the
+    first first."""
     folder = model_folder(trial)
     points, _ = model_points(read_model(folder))
-    cameras = [(view.name, _camera(view, points, trial.record.to_training)) for view in read_test_views(trial, folder)]
+    cameras = [
+        (view.name, _camera(view, points, trial.record.to_training))
+        for view in read_test_views(trial, folder)
+    ]
     return {
         "version": 2,
         "tonemapping": "none",
         "highPrecisionRendering": False,
         "background": {"color": list(trial.config.get("train.background", (0.0, 0.0, 0.0)))},
-        "postEffectSettings": {name: {"enabled": False} | values for name, values in EFFECTS.items()},
+        "postEffectSettings": {
+            name: {"enabled": False} | values for name, values in EFFECTS.items()
+        },
         "animTracks": [_flight([camera for _, camera in cameras])],
         "cameras": [{"initial": cameras[0][1]}],
         "annotations": [_annotation(name, camera) for name, camera in cameras],
@@ -86,7 +99,8 @@ def page_settings(trial: TrialResult) -> dict[str, Any]:
 
 
 def _flight(cameras: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """The path through the cameras and back to the first, which the page shows until somebody takes the mouse."""
+    """The path through the cameras and back to the first, which the page shows until somebody takes
+    the mouse."""
     stops = [*cameras, cameras[0]]
     values = {
         "position": [number for camera in stops for number in camera["position"]],
@@ -119,18 +133,27 @@ EFFECTS: dict[str, dict[str, Any]] = {  # all are off; the viewer wants their va
 }
 
 
-def _camera(view: View, points: NDArray[np.floating], normalization: Normalization) -> dict[str, Any]:
-    """The place of a test view, the point that it looks at, and its angle (degrees) along the longer side.
+def _camera(
+    view: View, points: NDArray[np.floating], normalization: Normalization
+) -> dict[str, Any]:
+    """The place of a test view, the point that it looks at, and its angle (degrees) along the
+    longer side.
 
-    The point lies at the median depth of the initial ``points`` [P, 3] before the camera. The viewer turns models by
-    half a turn about z, since its y points up.
+    The point lies at the median depth of the initial ``points`` [P, 3] before the camera. The
+    viewer turns models by half a turn about z, since its y points up.
     """
     camera = view.camera
     forward = camera.rotation[2]
     depths = points @ forward + camera.translation[2]  # [P]
     before = depths[depths > MIN_DEPTH]
     depth = float(np.median(before)) if len(before) else 1.0
-    ends = normalization.undo(np.stack([camera.center, camera.center + depth * forward])) * (-1, -1, 1)  # [2, 3]
-    longer = camera.width / camera.fx if camera.width >= camera.height else camera.height / camera.fy
+    ends = normalization.undo(np.stack([camera.center, camera.center + depth * forward])) * (
+        -1,
+        -1,
+        1,
+    )  # [2, 3]
+    longer = (
+        camera.width / camera.fx if camera.width >= camera.height else camera.height / camera.fy
+    )
     position, target = ends.tolist()
     return {"position": position, "target": target, "fov": math.degrees(2 * math.atan(longer / 2))}

@@ -1,11 +1,12 @@
 """The viewer's page: viser handles camera and controls, gsbench's rasterizers draw the pictures.
 
-One trial fills the page; two are shown side by side from the same camera. Because all pictures are drawn here, the page
-shows what was evaluated in any browser.
+One trial fills the page; two are shown side by side from the same camera. Because all pictures are
+drawn here, the page shows what was evaluated in any browser.
 
-Only the viewer's own page and local programs that are not web pages may connect. A browser lets any web page connect to
-servers of this machine. It sends the page's origin (``Origin``) and the name under which the page called the server
-(``Host``), which reveals a foreign name that resolves to this machine (DNS rebinding).
+Only the viewer's own page and local programs that are not web pages may connect. A browser lets any
+web page connect to servers of this machine. It sends the page's origin (``Origin``) and the name
+under which the page called the server (``Host``), which reveals a foreign name that resolves to
+this machine (DNS rebinding).
 """
 
 import http
@@ -46,7 +47,8 @@ MAX_DISTANCE = 1e9  # world units
 
 
 class Viewer:
-    """Serves ``painters`` (one or two) on a loopback port until ``stop``; port 0 selects a free port."""
+    """Serves ``painters`` (one or two) on a loopback port until ``stop``; port 0 selects a free
+    port."""
 
     def __init__(self, painters: Sequence[TrialPainter], port: int) -> None:
         import viser
@@ -55,7 +57,9 @@ class Viewer:
         self.views: dict[str, View] = {view.name: view for view in painters[0].trial.views}
         with refuse_other_pages():
             self.server: Any = viser.ViserServer(host=HOST, port=port, verbose=False)
-        self.server.gui.configure_theme(control_layout="collapsible", show_logo=False, show_share_button=False)
+        self.server.gui.configure_theme(
+            control_layout="collapsible", show_logo=False, show_share_button=False
+        )
         self.server.scene.set_up_direction(mean_up(painters[0].trial.views))
         self._sessions: dict[int, Session] = {}
         self._add_controls()
@@ -73,7 +77,8 @@ class Viewer:
         self.server.stop()
 
     def draw(self, camera: Camera, layers: Layers, view: View | None) -> Picture:
-        """The page's picture from ``camera``: one pane for each trial and, if ``view`` is given, its photograph."""
+        """The page's picture from ``camera``: one pane for each trial and, if ``view`` is given,
+        its photograph."""
         panes = [] if view is None else [(f"photograph {view.name}", photograph_at(camera, view))]
         for painter in self.painters:
             label = f"{painter.trial.label}: {len(painter.trial.gaussians):,} Gaussians"
@@ -102,10 +107,15 @@ class Viewer:
         gui = self.server.gui
         lowest = min(float(painter.trial.log10_volumes.min()) for painter in self.painters)
         highest = max(float(painter.trial.log10_volumes.max()) for painter in self.painters)
-        lowest, highest = math.floor(min(lowest, DEFAULT_THRESHOLD)), math.ceil(max(highest, DEFAULT_THRESHOLD))
+        lowest, highest = (
+            math.floor(min(lowest, DEFAULT_THRESHOLD)),
+            math.ceil(max(highest, DEFAULT_THRESHOLD)),
+        )
         # Most folders start closed, because the panel covers the picture on a narrow page.
         with gui.add_folder("Test views"):
-            self._view = gui.add_dropdown("View", (FREE_VIEW, *self.views), initial_value=next(iter(self.views)))
+            self._view = gui.add_dropdown(
+                "View", (FREE_VIEW, *self.views), initial_value=next(iter(self.views))
+            )
             self._beside = gui.add_checkbox("Photograph beside", True)
         with gui.add_folder("Gaussians", expand_by_default=False):
             self._degree = gui.add_slider("SH degree", 0, 3, 1, 3)
@@ -113,7 +123,9 @@ class Viewer:
         with gui.add_folder("Growth", expand_by_default=False):
             self._cloud = gui.add_checkbox("Initial cloud", False)
             self._causes = gui.add_checkbox("Large ones by cause", False)
-            self._threshold = gui.add_slider("log10 volume >", lowest, highest, 0.001, round(DEFAULT_THRESHOLD, 3))
+            self._threshold = gui.add_slider(
+                "log10 volume >", lowest, highest, 0.001, round(DEFAULT_THRESHOLD, 3)
+            )
             self._legend = gui.add_markdown(self._legend_text())
         self._height = gui.add_dropdown("Picture height, px", HEIGHTS, initial_value=HEIGHTS[1])
         changes = (self._degree, self._share, self._cloud, self._causes, self._height)
@@ -162,12 +174,15 @@ class Viewer:
 
 
 class Session:
-    """One browser page, whose thread draws the newest state: coarsely while it changes, sharply when it rests."""
+    """One browser page, whose thread draws the newest state: coarsely while it changes, sharply
+    when it rests."""
 
     def __init__(self, viewer: Viewer, client: Any) -> None:
         self.viewer, self.client = viewer, client
         self._changed, self._stopped = threading.Event(), threading.Event()
-        self._thread = threading.Thread(target=self._loop, name=f"gsbench view {client.client_id}", daemon=True)
+        self._thread = threading.Thread(
+            target=self._loop, name=f"gsbench view {client.client_id}", daemon=True
+        )
         client.camera.on_update(lambda _: self.wake())
 
     def start(self) -> None:
@@ -184,7 +199,8 @@ class Session:
             self._thread.join(timeout=10)
 
     def go_to(self, view: View) -> None:
-        """Move the page's camera to that of ``view``, with a field of view that shows the whole view."""
+        """Move the page's camera to that of ``view``, with a field of view that shows the whole
+        view."""
         own, camera = view.camera, self.client.camera
         aspect = float(camera.aspect or 1.0) / self._panes()
         forward = own.rotation[2]  # [3] world
@@ -210,7 +226,9 @@ class Session:
             return
         page = self.client.camera
         try:
-            camera = page_camera(page.wxyz, page.position, page.fov, page.aspect, height, self._panes())
+            camera = page_camera(
+                page.wxyz, page.position, page.fov, page.aspect, height, self._panes()
+            )
             image = self.viewer.draw(camera, self.viewer.layers(), self.viewer.photograph())
         except Exception as error:  # noqa: BLE001 - a page may send any values, and they must not end this thread
             log.debug("view: %r", error)
@@ -220,13 +238,19 @@ class Session:
 
 
 def page_camera(
-    wxyz: NDArray[np.float64], position: NDArray[np.float64], fov: float, aspect: float, height: int, panes: int
+    wxyz: NDArray[np.float64],
+    position: NDArray[np.float64],
+    fov: float,
+    aspect: float,
+    height: int,
+    panes: int,
 ) -> Camera:
     """The camera of one of ``panes`` equal panes of a page.
 
-    ``wxyz`` rotates camera axes (x right, y down, z forward) to the world, and ``position`` [3] is in world units.
-    ``fov`` is the vertical field of view in radians, ``aspect`` the page's width over its height, ``height`` in px.
-    Raises ValueError for values that are no camera, or a page that is too wide.
+    ``wxyz`` rotates camera axes (x right, y down, z forward) to the world, and ``position`` [3] is
+    in world units. ``fov`` is the vertical field of view in radians, ``aspect`` the page's width
+    over its height, ``height`` in px. Raises ValueError for values that are no camera, or a page
+    that is too wide.
     """
     numbers = np.concatenate([np.ravel(wxyz), np.ravel(position), [fov, aspect]]).astype(np.float64)
     length = float(np.linalg.norm(numbers[:4]))
@@ -234,16 +258,28 @@ def page_camera(
     if not np.isfinite(numbers).all() or np.abs(numbers).max() > MAX_DISTANCE or length < 1e-6:
         raise ValueError("the page has no camera")
     if not (MIN_FOV < fov < math.pi - MIN_FOV and 1 / MAX_ASPECT < aspect < MAX_ASPECT):
-        raise ValueError(f"a page of {aspect:.3g} heights with a view of {fov:.3g} radians is not drawn")
+        raise ValueError(
+            f"a page of {aspect:.3g} heights with a view of {fov:.3g} radians is not drawn"
+        )
     world_from_camera = Rotation.from_quat(numbers[[1, 2, 3, 0]]).as_matrix()
     width = max(1, round(height * aspect / panes))
     focal = height / 2 / math.tan(fov / 2)
     rotation = world_from_camera.T
-    return Camera(width, height, focal, focal, width / 2, height / 2, rotation, -rotation @ np.asarray(position))
+    return Camera(
+        width,
+        height,
+        focal,
+        focal,
+        width / 2,
+        height / 2,
+        rotation,
+        -rotation @ np.asarray(position),
+    )
 
 
 def fitting_fov(camera: Camera, aspect: float) -> float:
-    """The vertical field of view (radians) with which a pane of ``aspect`` shows the whole image of ``camera``."""
+    """The vertical field of view (radians) with which a pane of ``aspect`` shows the whole image of
+    ``camera``."""
     half_height = max(camera.cy, camera.height - camera.cy) / camera.fy
     half_width = max(camera.cx, camera.width - camera.cx) / camera.fx
     return 2 * math.atan(max(half_height, half_width / aspect))
@@ -257,7 +293,8 @@ def mean_up(views: Sequence[View]) -> NDArray[np.float64]:
 
 
 def level_up(camera: Camera, up: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The upward direction nearest to ``up`` that keeps the picture of ``camera`` upright, a unit vector [3].
+    """The upward direction nearest to ``up`` that keeps the picture of ``camera`` upright, a unit
+    vector [3].
 
     A page rotates around its upward direction. Around the camera's own one, the horizon would tilt.
     """
@@ -269,7 +306,8 @@ def level_up(camera: Camera, up: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def orbit_distance(views: Sequence[View]) -> float:
-    """The distance from a page's camera to its pivot: the mean distance of the views from their centre, world units."""
+    """The distance from a page's camera to its pivot: the mean distance of the views from their
+    centre, world units."""
     centers = np.stack([view.camera.center for view in views])  # [V, 3]
     return max(float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).mean()), 1e-3)
 
@@ -281,13 +319,17 @@ def check_port(port: int) -> None:
         try:
             probe.bind((HOST, port))
         except OSError as error:
-            raise InputError(f"port {port} cannot be used ({error.strerror}); give another --port") from None
+            raise InputError(
+                f"port {port} cannot be used ({error.strerror}); give another --port"
+            ) from None
 
 
 def is_own_page(hosts: list[str], origins: list[str]) -> bool:
-    """Return whether ``Host`` and ``Origin`` headers belong to the viewer's own page or to a program without a page.
+    """Return whether ``Host`` and ``Origin`` headers belong to the viewer's own page or to a
+    program without a page.
 
-    Any port is allowed, since connections may be forwarded, but both headers must have the same port.
+    Any port is allowed, since connections may be forwarded, but both headers must have the same
+    port.
     """
     if len(hosts) != 1 or len(origins) > 1:
         return False
@@ -301,7 +343,8 @@ def is_own_page(hosts: list[str], origins: list[str]) -> bool:
 
 @contextmanager
 def refuse_other_pages() -> Iterator[None]:
-    """Make the server that viser starts within the block refuse foreign pages, for files and for connections.
+    """Make the server that viser starts within the block refuse foreign pages, for files and for
+    connections.
 
     Raises GsbenchError if viser did not start its server through `SERVE`.
     """
@@ -311,7 +354,9 @@ def refuse_other_pages() -> Iterator[None]:
 
     serve, started = websockets.asyncio.server.serve, []
 
-    def guarded(*words: Any, process_request: Callable[..., Any] | None = None, **settings: Any) -> Any:
+    def guarded(
+        *words: Any, process_request: Callable[..., Any] | None = None, **settings: Any
+    ) -> Any:
         def process(connection: Any, request: Any) -> Any:
             if not is_own_page(request.headers.get_all("Host"), request.headers.get_all("Origin")):
                 return Response(http.HTTPStatus.FORBIDDEN, "FORBIDDEN", Headers(), b"")
@@ -320,8 +365,11 @@ def refuse_other_pages() -> Iterator[None]:
         started.append(True)
         return serve(*words, process_request=process, **settings)
 
-    # viser has no parameter for a check of requests, so the function that it calls is replaced while it starts.
+    # viser has no parameter for a check of requests, so the function that it calls is replaced
+    # while it starts.
     with mock.patch(SERVE, guarded):
         yield
     if not started:
-        raise GsbenchError("this version of viser cannot be kept from strange web pages: install viser 1.1")
+        raise GsbenchError(
+            "this version of viser cannot be kept from strange web pages: install viser 1.1"
+        )

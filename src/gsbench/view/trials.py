@@ -1,4 +1,5 @@
-"""Trials as the viewer shows them: read from their folders and the store, and drawn from any camera.
+"""Trials as the viewer shows them: read from their folders and the store, and drawn from any
+camera.
 
 A picture is the render, the initial cloud, or large Gaussians coloured by their causes.
 """
@@ -46,9 +47,9 @@ Picture = NDArray[np.uint8]
 class ViewedTrial:
     """A trained model with everything that the viewer draws.
 
-    ``causes`` [N] are the values of ``Cause`` of the Gaussians, and ``log10_volumes`` [N] their volumes (world
-    units^3). ``cloud`` is the initial cloud. ``views`` are the test views with the evaluation's cameras and
-    photographs.
+    ``causes`` [N] are the values of ``Cause`` of the Gaussians, and ``log10_volumes`` [N] their
+    volumes (world units^3). ``cloud`` is the initial cloud. ``views`` are the test views with the
+    evaluation's cameras and photographs.
     """
 
     label: str
@@ -81,11 +82,16 @@ def find_trial(address: str, runs: Path) -> TrialResult:
         and (not seed or str(trial.seed) == seed[0])
     ]
     if not matches:
-        addresses = sorted({f"{name}:{t.scene}:{t.init}-{t.densify}:{t.seed}" for t in experiment.trials})
+        addresses = sorted(
+            {f"{name}:{t.scene}:{t.init}-{t.densify}:{t.seed}" for t in experiment.trials}
+        )
         raise InputError(f"no complete trial {address}; there are {', '.join(addresses)}")
     first = [trial for trial in matches if trial.seed == matches[0].seed]
     if len(first) > 1:
-        raise InputError(f"{address} names {len(first)} trials; give a folder: {', '.join(str(t.path) for t in first)}")
+        raise InputError(
+            f"{address} names {len(first)} trials; give a folder: "
+            f"{', '.join(str(t.path) for t in first)}"
+        )
     return matches[0]
 
 
@@ -107,7 +113,8 @@ def model_file(trial: TrialResult) -> Path:
 
 
 def load_viewed(trial: TrialResult, device: torch.device) -> ViewedTrial:
-    """Read everything that the viewer draws of ``trial``; raises InputError naming a missing or damaged file."""
+    """Read everything that the viewer draws of ``trial``; raises InputError naming a missing or
+    damaged file."""
     # A page's numbers are float32, so the viewer works in the coordinates of the training.
     gaussians = read_ply(model_file(trial), device, trial.record.to_training)
     model_dir = model_folder(trial)
@@ -128,10 +135,21 @@ def read_causes(path: Path, num_gaussians: int) -> NDArray[np.uint8]:
     try:
         with np.load(path) as lineage:
             causes = lineage["causes"][lineage["ids"]]
-    except (OSError, ValueError, KeyError, IndexError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+    except (
+        OSError,
+        ValueError,
+        KeyError,
+        IndexError,
+        EOFError,
+        zipfile.BadZipFile,
+        zlib.error,
+    ) as error:
         raise InputError(f"{path} cannot be read ({error}): run this trial again") from error
     if len(causes) != num_gaussians:
-        raise InputError(f"{path} is of {len(causes)} Gaussians, the model has {num_gaussians}: run this trial again")
+        raise InputError(
+            f"{path} is of {len(causes)} Gaussians, the model has {num_gaussians}: run this trial "
+            "again"
+        )
     return causes
 
 
@@ -140,12 +158,15 @@ def model_folder(trial: TrialResult) -> Path:
     runs = trial.path.parents[3]
     folder = Store(runs / STORE).folder(INIT, trial.record.hashes.get("init", "")) / MODEL_FOLDER
     if not folder.is_dir():
-        raise InputError(f"{folder} is gone, and it had the cameras of {trial.label}: run this trial again")
+        raise InputError(
+            f"{folder} is gone, and it had the cameras of {trial.label}: run this trial again"
+        )
     return folder
 
 
 def read_test_views(trial: TrialResult, model_dir: Path) -> tuple[View, ...]:
-    """The test views in the order of their names, with the photographs and cameras of the evaluation."""
+    """The test views in the order of their names, with the photographs and cameras of the
+    evaluation."""
     import pycolmap
 
     model = read_model(model_dir)
@@ -165,7 +186,9 @@ def read_test_views(trial: TrialResult, model_dir: Path) -> tuple[View, ...]:
             camera = replace(camera, cx=width / 2, cy=height / 2)
         views.append(View(image.name, camera, picture))
     if not views:
-        raise InputError(f"{trial.path / 'ground_truth'} holds no picture of a test view: run this trial again")
+        raise InputError(
+            f"{trial.path / 'ground_truth'} holds no picture of a test view: run this trial again"
+        )
     return tuple(views)
 
 
@@ -181,12 +204,15 @@ class Layers:
 
 
 class TrialPainter:
-    """Draws one trial from any camera. Like its rasterizer, it can be called from several threads."""
+    """Draws one trial from any camera. Like its rasterizer, it can be called from several
+    threads."""
 
     def __init__(self, trial: ViewedTrial, rasterizer: Rasterizer) -> None:
         self.trial, self.rasterizer = trial, rasterizer
         self._device = trial.gaussians.means.device
-        self._background = torch.tensor(trial.background, dtype=torch.float32, device=self._device)  # [3]
+        self._background = torch.tensor(
+            trial.background, dtype=torch.float32, device=self._device
+        )  # [3]
 
     @cached_property
     def _by_opacity(self) -> Gaussians:
@@ -202,12 +228,17 @@ class TrialPainter:
     @cached_property
     def _by_cause(self) -> Gaussians:
         """The Gaussians in the colours of their causes."""
-        palette = torch.tensor([cause.color for cause in Cause], device=self._device) / 255  # [C, 3]
-        colors = palette[torch.from_numpy(self.trial.causes.astype(np.int64)).to(self._device)]  # [N, 3]
+        palette = (
+            torch.tensor([cause.color for cause in Cause], device=self._device) / 255
+        )  # [C, 3]
+        colors = palette[
+            torch.from_numpy(self.trial.causes.astype(np.int64)).to(self._device)
+        ]  # [N, 3]
         return Gaussians(**(self.trial.gaussians.tensors() | {"sh_dc": rgb_to_dc(colors)}))
 
     def draw(self, camera: Camera, layers: Layers) -> Picture:
-        """The trial from ``camera``, [H, W, 3] uint8. With default ``layers`` this is the evaluation's render."""
+        """The trial from ``camera``, [H, W, 3] uint8. With default ``layers`` this is the
+        evaluation's render."""
         gaussians = self._initial if layers.cloud else self.trial.gaussians
         if not layers.cloud and layers.share < 100:
             count = max(1, round(layers.share / 100 * len(gaussians)))
@@ -230,22 +261,28 @@ class TrialPainter:
         counts = np.bincount(self.trial.causes[self.above(log10_volume)], minlength=len(Cause))
         return {cause: int(counts[cause]) for cause in Cause}
 
-    def _render(self, gaussians: Gaussians, camera: Camera, degree: int, background: torch.Tensor) -> RenderOutput:
+    def _render(
+        self, gaussians: Gaussians, camera: Camera, degree: int, background: torch.Tensor
+    ) -> RenderOutput:
         with torch.no_grad():
             return self.rasterizer.render(gaussians, camera, degree, background)
 
 
 def photograph_at(camera: Camera, view: View) -> Picture:
-    """The photograph of ``view`` resampled for the intrinsics of ``camera``, black outside the photograph."""
+    """The photograph of ``view`` resampled for the intrinsics of ``camera``, black outside the
+    photograph."""
     own, photograph = view.camera, Image.fromarray(view.image)
     shrink = max(own.fx / camera.fx, own.fy / camera.fy)
-    if shrink > 1:  # shrink with a filter first, because the transform below only interpolates neighbouring pixels
+    # shrink with a filter first, because the transform below only interpolates neighbouring pixels
+    if shrink > 1:
         own = own.resized(max(1, round(own.width / shrink)), max(1, round(own.height / shrink)))
         photograph = photograph.resize((own.width, own.height), Image.Resampling.BOX)
     sx, sy = own.fx / camera.fx, own.fy / camera.fy  # photograph pixels for one of the picture
     coefficients = (sx, 0, own.cx - sx * camera.cx, 0, sy, own.cy - sy * camera.cy)
     size = (camera.width, camera.height)
-    return np.asarray(photograph.transform(size, Image.Transform.AFFINE, coefficients, Image.Resampling.BILINEAR))
+    return np.asarray(
+        photograph.transform(size, Image.Transform.AFFINE, coefficients, Image.Resampling.BILINEAR)
+    )
 
 
 def side_by_side(panes: Sequence[tuple[str, Picture]]) -> Picture:
@@ -260,13 +297,21 @@ def side_by_side(panes: Sequence[tuple[str, Picture]]) -> Picture:
         if left:
             draw.line([(left, 0), (left, height)], fill=TEXT_COLOR)
         at, stroke = (left + MARGIN * size, MARGIN * size), max(1, round(size / 8))
-        draw.text(at, text, TEXT_COLOR, ImageFont.load_default(size), stroke_width=stroke, stroke_fill=SHADOW_COLOR)
+        draw.text(
+            at,
+            text,
+            TEXT_COLOR,
+            ImageFont.load_default(size),
+            stroke_width=stroke,
+            stroke_fill=SHADOW_COLOR,
+        )
         left += width
     return np.asarray(image)
 
 
 def _fitted(label: str, size: float, width: int) -> tuple[str, float]:
-    """The label in lines that fit into ``width`` px, and the text size, which is reduced if a word does not fit."""
+    """The label in lines that fit into ``width`` px, and the text size, which is reduced if a word
+    does not fit."""
     length, room = ImageFont.load_default(size).getlength, width - 2 * MARGIN * size
     first, *rest = label.split()
     lines = [first]

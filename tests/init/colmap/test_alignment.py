@@ -8,7 +8,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 from skimage.transform import SimilarityTransform
 
-from gsbench.init.colmap.alignment import align_poses, fit_similarity, rotation_angles, transformed_rotations
+from gsbench.init.colmap.alignment import (
+    align_poses,
+    fit_similarity,
+    rotation_angles,
+    transformed_rotations,
+)
 
 TRUE_SCALE = 2.5
 TRUE_ROTATION = Rotation.from_rotvec([0.3, -1.1, 2.0]).as_matrix()
@@ -59,7 +64,8 @@ def test_wrong_cameras_do_not_move_the_alignment(away: float):
     similarity = align_poses(centers, rotations, wrong, moved_rotations)
     assert similarity.scale == pytest.approx(TRUE_SCALE, rel=1e-9)
     np.testing.assert_allclose(similarity(centers), moved, atol=1e-8)
-    assert abs(fit_similarity(centers, wrong).scale - TRUE_SCALE) > 0.5  # plain least squares is moved
+    # plain least squares is moved
+    assert abs(fit_similarity(centers, wrong).scale - TRUE_SCALE) > 0.5
     angles = rotation_angles(transformed_rotations(similarity, rotations), moved_rotations)
     assert angles.max() < 1e-6
 
@@ -110,4 +116,6 @@ def test_cameras_without_wrong_ones_are_fitted_by_least_squares(count: int):
     centers, rotations, moved, moved_rotations = poses(count, seed=2)
     moved = moved + np.random.default_rng(6).uniform(-0.01, 0.01, moved.shape)
     similarity = align_poses(centers, rotations, moved, moved_rotations)
-    np.testing.assert_allclose(similarity(centers), fit_similarity(centers, moved)(centers), atol=1e-9)
+    np.testing.assert_allclose(
+        similarity(centers), fit_similarity(centers, moved)(centers), atol=1e-9
+    )

@@ -1,4 +1,5 @@
-"""COLMAP's database as pycolmap reads it back: who shares a camera, which features are strongest, what is counted."""
+"""COLMAP's database as pycolmap reads it back: who shares a camera, which features are strongest,
+what is counted."""
 
 from __future__ import annotations
 
@@ -16,7 +17,13 @@ from gsbench.init.colmap import database as made
 from gsbench.init.colmap import sift
 from gsbench.logs import Progress
 
-SIZES = {"a.png": (40, 30), "b.png": (40, 30), "c.png": (40, 32), "left/a.png": (40, 30), "left/b.png": (40, 30)}
+SIZES = {
+    "a.png": (40, 30),
+    "b.png": (40, 30),
+    "c.png": (40, 32),
+    "left/a.png": (40, 30),
+    "left/b.png": (40, 30),
+}
 
 
 @pytest.fixture
@@ -31,7 +38,8 @@ def images(tmp_path: Path) -> Path:
 def database(images: Path, tmp_path: Path) -> Path:
     """Cameras and images without features; the names are given in no order."""
     made.create_database(
-        tmp_path / "database.db", made.unknown_camera_groups(images, list(SIZES)[::-1], "single", "SIMPLE_RADIAL", None)
+        tmp_path / "database.db",
+        made.unknown_camera_groups(images, list(SIZES)[::-1], "single", "SIMPLE_RADIAL", None),
     )
     return tmp_path / "database.db"
 
@@ -51,7 +59,9 @@ def test_who_shares_a_camera(images: Path, sharing: str, expected: list[set[str]
         assert (camera.width, camera.height) == SIZES[names[0]]
         assert (camera.focal_length, camera.has_prior_focal_length) == (1.2 * 40, False)
     known = made.unknown_camera_groups(images, list(SIZES), sharing, "SIMPLE_RADIAL", 51.0)
-    assert all((camera.focal_length, camera.has_prior_focal_length) == (51.0, True) for camera, _ in known)
+    assert all(
+        (camera.focal_length, camera.has_prior_focal_length) == (51.0, True) for camera, _ in known
+    )
 
 
 def test_ids_follow_the_names_and_each_camera_has_a_rig(database: Path) -> None:
@@ -61,9 +71,14 @@ def test_ids_follow_the_names_and_each_camera_has_a_rig(database: Path) -> None:
         assert made.image_ids(database) == {image.name: image.image_id for image in stored}
         assert len(opened.read_all_rigs()) == len(opened.read_all_cameras()) == 2
         by_id = {camera.camera_id: camera for camera in opened.read_all_cameras()}
-        assert {image.name: (by_id[image.camera_id].width, by_id[image.camera_id].height) for image in stored} == SIZES
+        assert {
+            image.name: (by_id[image.camera_id].width, by_id[image.camera_id].height)
+            for image in stored
+        } == SIZES
     with made.image_ids_as_names(database) as names:
-        assert made.image_ids(database) == {str(number): number for number in map(int, names.values())}
+        assert made.image_ids(database) == {
+            str(number): number for number in map(int, names.values())
+        }
     assert made.image_ids(database).keys() == SIZES.keys()
 
 
@@ -74,7 +89,9 @@ def test_the_strongest_features_are_those_of_the_largest_area(database: Path) ->
     with pycolmap.Database.open(database) as opened:
         number = made.image_ids(database)["b.png"]
         opened.write_keypoints(number, keypoints)
-        opened.write_descriptors(number, pycolmap.FeatureDescriptors(pycolmap.FeatureExtractorType.SIFT, descriptors))
+        opened.write_descriptors(
+            number, pycolmap.FeatureDescriptors(pycolmap.FeatureExtractorType.SIFT, descriptors)
+        )
         opened.write_keypoints(made.image_ids(database)["a.png"], keypoints[:1])
         opened.write_descriptors(
             made.image_ids(database)["a.png"],
@@ -87,33 +104,47 @@ def test_the_strongest_features_are_those_of_the_largest_area(database: Path) ->
         )
     areas = [abs(np.linalg.det(row[2:].reshape(2, 2))) for row in keypoints.astype(float)]
     order = sorted(range(12), key=lambda row: -areas[row])
-    np.testing.assert_array_equal(made.strongest_descriptors(database, "b.png", 5), descriptors[order[:5]])
+    np.testing.assert_array_equal(
+        made.strongest_descriptors(database, "b.png", 5), descriptors[order[:5]]
+    )
     np.testing.assert_array_equal(made.strongest_descriptors(database, "a.png", 5), descriptors[:1])
     assert made.strongest_descriptors(database, "c.png", 5).shape == (0, 128)
 
 
 def test_counts_are_of_pairs_with_inliers(database: Path) -> None:
-    made.write_keypoints(database, {name: np.ones((10 + place, 2)) for place, name in enumerate(SIZES)})
+    made.write_keypoints(
+        database, {name: np.ones((10 + place, 2)) for place, name in enumerate(SIZES)}
+    )
     matches = np.stack([np.arange(9), np.arange(9)], axis=1)
     made.write_matches(
-        database, {("a.png", "b.png"): matches, ("b.png", "c.png"): matches, ("a.png", "c.png"): matches}
+        database,
+        {("a.png", "b.png"): matches, ("b.png", "c.png"): matches, ("a.png", "c.png"): matches},
     )
     ids = made.image_ids(database)
     with pycolmap.Database.open(database) as opened:
-        for names, count in ((("a.png", "b.png"), 1), (("b.png", "c.png"), 7), (("a.png", "c.png"), 0)):
+        for names, count in (
+            (("a.png", "b.png"), 1),
+            (("b.png", "c.png"), 7),
+            (("a.png", "c.png"), 0),
+        ):
             geometry = pycolmap.TwoViewGeometry()
             geometry.config = pycolmap.TwoViewGeometryConfiguration.UNCALIBRATED
             geometry.inlier_matches = matches[:count].astype(np.uint32)
             opened.write_two_view_geometry(*(ids[name] for name in names), geometry)
     assert made.database_counts(database) == {
-        "features": 10 + 11 + 12 + 13 + 14, "pairs_matched": 3, "pairs_verified": 2, "inlier_matches": 8,
-    }  # fmt: skip
+        "features": 10 + 11 + 12 + 13 + 14,
+        "pairs_matched": 3,
+        "pairs_verified": 2,
+        "inlier_matches": 8,
+    }
 
 
 def test_guessed_focal_lengths_become_known_ones(database: Path) -> None:
     made.write_keypoints(database, dict.fromkeys(SIZES, np.ones((3, 2))))
     some, none = np.zeros((1, 2)), np.zeros((0, 2))
-    made.write_matches(database, {("c.png", "b.png"): some, ("a.png", "b.png"): some, ("a.png", "c.png"): none})
+    made.write_matches(
+        database, {("c.png", "b.png"): some, ("a.png", "b.png"): some, ("a.png", "c.png"): none}
+    )
     assert made.cameras_without_prior(database)
     assert made.assume_focal_lengths(database, 0.9) == [("a.png", "b.png"), ("b.png", "c.png")]
     assert not made.cameras_without_prior(database)
@@ -128,15 +159,22 @@ def test_guessed_focal_lengths_become_known_ones(database: Path) -> None:
 def test_verification_tells_its_progress_in_parts(
     database: Path, monkeypatch: pytest.MonkeyPatch, count: int, each: int
 ) -> None:
-    """Of fifty pairs, or of a twentieth of them; each pair is listed once, by the ids of its images."""
+    """Of fifty pairs, or of a twentieth of them; each pair is listed once, by the ids of its
+    images."""
     pairs, listed, told = [("a.png", "b.png"), ("left/a.png", "c.png")] * (count // 2), [], []
     monkeypatch.setattr(
-        pycolmap, "verify_matches", lambda path, file, options: listed.append(Path(file).read_text().splitlines())
+        pycolmap,
+        "verify_matches",
+        lambda path, file, options: listed.append(Path(file).read_text().splitlines()),
     )
-    made.verify_pairs(database, pairs, None, lambda phase, done, total: told.append((phase, done, total)))
+    made.verify_pairs(
+        database, pairs, None, lambda phase, done, total: told.append((phase, done, total))
+    )
     assert told == [("verify", done, count) for done in (*range(0, count, each), count)]
     ids = made.image_ids(database)
-    assert [line for part in listed for line in part] == [f"{ids[first]} {ids[second]}" for first, second in pairs]
+    assert [line for part in listed for line in part] == [
+        f"{ids[first]} {ids[second]}" for first, second in pairs
+    ]
     assert not list(database.parent.glob("*.txt"))
 
 
@@ -145,15 +183,29 @@ def test_features_are_extracted_of_eight_images_at_a_time_or_two_a_thread(
     images: Path, monkeypatch: pytest.MonkeyPatch, threads: int, each: int
 ) -> None:
     calls, told, names = [], [], [f"{number}.png" for number in range(40)]
-    monkeypatch.setattr(pycolmap, "extract_features", lambda *paths, **options: calls.append(options))
+    monkeypatch.setattr(
+        pycolmap, "extract_features", lambda *paths, **options: calls.append(options)
+    )
     masks = images if threads == 4 else None
-    settings = Sfm(max_image_size=500, max_num_features=70, peak_threshold=0.01, edge_threshold=9.0, first_octave=1)
-    sift.extract_sift(Path("x.db"), images, names, settings, threads, lambda *state: told.append(state), masks)
+    settings = Sfm(
+        max_image_size=500,
+        max_num_features=70,
+        peak_threshold=0.01,
+        edge_threshold=9.0,
+        first_octave=1,
+    )
+    sift.extract_sift(
+        Path("x.db"), images, names, settings, threads, lambda *state: told.append(state), masks
+    )
     assert [name for call in calls for name in call["image_names"]] == names
     assert told == [("extract", done, 40) for done in (*range(0, 40, each), 40)]
     for call in calls:
         options = call["extraction_options"]
-        assert (options.num_threads, options.use_gpu, options.max_image_size) == (threads, False, 500)
+        assert (options.num_threads, options.use_gpu, options.max_image_size) == (
+            threads,
+            False,
+            500,
+        )
         assert (options.sift.max_num_features, options.sift.first_octave) == (70, 1)
         assert (options.sift.peak_threshold, options.sift.edge_threshold) == (0.01, 9.0)
         assert Path(call["reader_options"].mask_path) == (masks or Path())
@@ -165,7 +217,9 @@ def test_what_colmap_cannot_read_gets_a_png_under_its_name(images: Path, tmp_pat
     names = ["a.png", "left/c.WEBP"]
     folder = made.readable_images(images, names, tmp_path / "work")
     assert folder != images
-    assert sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*.*")) == sorted(names)
+    assert sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*.*")) == sorted(
+        names
+    )
     assert (folder / "a.png").resolve() == images / "a.png"
     with Image.open(folder / "left" / "c.WEBP") as copy:
         assert (copy.format, copy.getpixel((3, 4))) == ("PNG", (1, 2, 3))
@@ -194,18 +248,25 @@ def test_the_references_cameras_are_known_and_have_its_placed_images() -> None:
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
     groups = made.reference_camera_groups(model)
     assert [names for _, names in groups] == [["a", "c"], ["b", "d"]]
-    assert [(camera.mean_focal_length(), camera.width) for camera, _ in groups] == [(60.0, 80), (50.0, 40)]
+    assert [(camera.mean_focal_length(), camera.width) for camera, _ in groups] == [
+        (60.0, 80),
+        (50.0, 40),
+    ]
     assert all(camera.has_prior_focal_length for camera, _ in groups)
     assert not any(camera.has_prior_focal_length for camera in model.cameras.values())  # copies
 
 
-@pytest.mark.parametrize(("count", "processes", "size"), [(48, 2, 10), (10, 1, 3), (4, 8, 2), (200, 1, 16), (33, 3, 6)])
+@pytest.mark.parametrize(
+    ("count", "processes", "size"), [(48, 2, 10), (10, 1, 3), (4, 8, 2), (200, 1, 16), (33, 3, 6)]
+)
 def test_parts_are_small_enough_for_six_a_process(count: int, processes: int, size: int) -> None:
     """Blocks of ``size`` images: sqrt(12 processes) of them, rounded up, of 2 to 16 images each."""
     assert sift._block_size(count, processes) == size
 
 
-def test_matching_is_divided_over_processes_and_tells_one_sum(database: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_matching_is_divided_over_processes_and_tells_one_sum(
+    database: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     jobs, told = [], []
 
     def match(function: object, job: sift.MatchingJob, progress: Progress, what: str) -> None:
@@ -219,12 +280,16 @@ def test_matching_is_divided_over_processes_and_tells_one_sum(database: Path, mo
 
     monkeypatch.setattr(sift, "run_with_progress", match)
     pairs = list(itertools.combinations(SIZES, 2))
-    sift.match_sift(database, pairs, Sfm(), 3, lambda phase, done, total: told.append((phase, done, total)))
+    sift.match_sift(
+        database, pairs, Sfm(), 3, lambda phase, done, total: told.append((phase, done, total))
+    )
     assert (told[0], max(told)) == (("match", 0, 10), ("match", 10, 10))
     assert len({job.result for job in jobs}) == len(jobs) == 3
     divided = [pair for job in jobs for part in job.parts for pair in part]
     assert sorted(divided) == list(itertools.combinations(range(1, 6), 2))
     with pycolmap.Database.open(database) as opened:
         found, _ = opened.read_all_matches()
-    assert {pycolmap.pair_id_to_image_pair(pair) for pair in found} == {job.parts[0][0] for job in jobs}
+    assert {pycolmap.pair_id_to_image_pair(pair) for pair in found} == {
+        job.parts[0][0] for job in jobs
+    }
     assert sorted(path.name for path in database.parent.iterdir()) == ["database.db", "images"]

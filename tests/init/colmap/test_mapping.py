@@ -1,4 +1,5 @@
-"""Captures that COLMAP's defaults refuse: exact matches of a forward-facing rig whose cameras are known to the test."""
+"""Captures that COLMAP's defaults refuse: exact matches of a forward-facing rig whose cameras are
+known to the test."""
 
 from __future__ import annotations
 
@@ -37,10 +38,14 @@ WIDTH, HEIGHT, FOCAL = 640, 480, 520.0  # px; COLMAP's guess without EXIF is 1.2
 VERIFICATION = verification_options(Sfm())
 
 
-def small_baseline(folder: Path, spread: float = 0.2, turn: float = 0.0) -> tuple[Path, dict[str, np.ndarray]]:
-    """A database of exact matches between nine cameras side by side, looking ahead; and the true camera centres.
+def small_baseline(
+    folder: Path, spread: float = 0.2, turn: float = 0.0
+) -> tuple[Path, dict[str, np.ndarray]]:
+    """A database of exact matches between nine cameras side by side, looking ahead; and the true
+    camera centres.
 
-    ``spread`` is half the width of the rig, for points 3 to 9 away; at 0.2 no two cameras see one under 11 degrees.
+    ``spread`` is half the width of the rig, for points 3 to 9 away; at 0.2 no two cameras see one
+    under 11 degrees.
     """
     rng = np.random.default_rng(0)
     points = rng.uniform((-3, -2.2, 3), (3, 2.2, 9), (900, 3))
@@ -51,12 +56,22 @@ def small_baseline(folder: Path, spread: float = 0.2, turn: float = 0.0) -> tupl
         Image.new("RGB", (WIDTH, HEIGHT)).save(folder / "images" / name)
         center = np.array([(index % 3 - 1) * spread, (index // 3 - 1) * spread, 0.05 * (index % 2)])
         local = points - center
-        pixels = FOCAL * local[:, :2] / local[:, 2:] + (WIDTH / 2, HEIGHT / 2) + rng.normal(0, 0.3, (900, 2))
+        pixels = (
+            FOCAL * local[:, :2] / local[:, 2:]
+            + (WIDTH / 2, HEIGHT / 2)
+            + rng.normal(0, 0.3, (900, 2))
+        )
         inside = ((pixels > 0) & (pixels < (WIDTH, HEIGHT))).all(axis=1)
         names.append(name)
-        centers[name], seen[name], keypoints[name] = center, np.flatnonzero(inside), pixels[inside].astype(np.float32)
+        centers[name], seen[name], keypoints[name] = (
+            center,
+            np.flatnonzero(inside),
+            pixels[inside].astype(np.float32),
+        )
     database = folder / "database.db"
-    create_database(database, unknown_camera_groups(folder / "images", names, "single", "SIMPLE_RADIAL", None))
+    create_database(
+        database, unknown_camera_groups(folder / "images", names, "single", "SIMPLE_RADIAL", None)
+    )
     write_keypoints(database, keypoints)
     matches = {}
     for i, first in enumerate(names):
@@ -93,9 +108,11 @@ def test_a_small_baseline_without_a_focal_length_is_placed_by_another_way(tmp_pa
         np.stack([np.eye(3)] * 9),
     )
     placed = similarity(np.array([ours[name][0] for name in names]))
-    assert np.abs(placed - np.array([truth[name] for name in names])).max() < 0.03  # of a rig 0.4 wide
+    # of a rig 0.4 wide
+    assert np.abs(placed - np.array([truth[name] for name in names])).max() < 0.03
     (camera,) = result.model.cameras.values()
-    assert camera.mean_focal_length() == pytest.approx(FOCAL, rel=0.2)  # which so small a baseline fixes weakly
+    # which so small a baseline fixes weakly
+    assert camera.mean_focal_length() == pytest.approx(FOCAL, rel=0.2)
 
 
 def test_the_global_mapper_alone(tmp_path: Path) -> None:
@@ -170,16 +187,22 @@ def test_ways_are_tried_until_one_places_nine_of_ten(
     for name in names:
         Image.new("RGB", (40, 30)).save(tmp_path / "images" / name)
     create_database(
-        tmp_path / "database.db", unknown_camera_groups(tmp_path / "images", names, "single", "PINHOLE", 30.0)
+        tmp_path / "database.db",
+        unknown_camera_groups(tmp_path / "images", names, "single", "PINHOLE", 30.0),
     )
     monkeypatch.setattr(mapping, "_is_plausible", lambda model: True)
-    ways = [(f"way {k}", lambda sizes=sizes: [Model(*size) for size in sizes]) for k, sizes in enumerate(found)]
+    ways = [
+        (f"way {k}", lambda sizes=sizes: [Model(*size) for size in sizes])
+        for k, sizes in enumerate(found)
+    ]
     monkeypatch.setattr(mapping._Mapper, "strategies", lambda mapper: iter(ways))
     result = mapped(tmp_path / "database.db", "auto")
     assert (result.model.num_reg_images(), result.model.num_points3D()) == best
     place = next(k for k, sizes in enumerate(found) if best in sizes)
     assert (result.strategy, result.models) == (f"way {place}", len(found[place]))
-    assert result.tried == tuple((f"way {k}", max(sizes, default=(0, 0))[0]) for k, sizes in enumerate(found[:tried]))
+    assert result.tried == tuple(
+        (f"way {k}", max(sizes, default=(0, 0))[0]) for k, sizes in enumerate(found[:tried])
+    )
     assert bool(result.warnings) == (tried > 1)
     for sizes, said in (([], "found no pair of images"), ([(2, 99)], "placed only 2 of 10 images")):
         ways[:] = [("only", lambda sizes=sizes: [Model(*size) for size in sizes])]
@@ -189,18 +212,30 @@ def test_ways_are_tried_until_one_places_nine_of_ten(
 
 @pytest.mark.parametrize("prior", [True, False])
 @pytest.mark.parametrize("mapper", ["incremental", "global", "auto"])
-def test_the_ways_of_a_mapper(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mapper: Any, prior: bool) -> None:
+def test_the_ways_of_a_mapper(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mapper: Any, prior: bool
+) -> None:
     """From the defaults to assumed focal lengths, these only where none is known."""
     calls: list[tuple[object, ...]] = []
-    monkeypatch.setattr(mapping.colmap_database, "cameras_without_prior", lambda database: not prior)
-    own = mapping._Mapper
-    monkeypatch.setattr(own, "with_assumed_focal_lengths", lambda _, factor: calls.append(("assumed", factor)) or [])
     monkeypatch.setattr(
-        own, "incremental", lambda _, found, angle=None: calls.append(("incremental", found, angle)) or []
+        mapping.colmap_database, "cameras_without_prior", lambda database: not prior
     )
-    monkeypatch.setattr(own, "global_mapping", lambda made: calls.append(("global", made.database)) or [])
+    own = mapping._Mapper
+    monkeypatch.setattr(
+        own, "with_assumed_focal_lengths", lambda _, factor: calls.append(("assumed", factor)) or []
+    )
+    monkeypatch.setattr(
+        own,
+        "incremental",
+        lambda _, found, angle=None: calls.append(("incremental", found, angle)) or [],
+    )
+    monkeypatch.setattr(
+        own, "global_mapping", lambda made: calls.append(("global", made.database)) or []
+    )
     database = tmp_path / "a.db"
-    ways = list(own(database, tmp_path, tmp_path / "out", Sfm(mapper=mapper), no_progress, 9).strategies())
+    ways = list(
+        own(database, tmp_path, tmp_path / "out", Sfm(mapper=mapper), no_progress, 9).strategies()
+    )
     for _, run in ways:
         run()
     assumed = [] if prior else [("assumed", factor) for factor in mapping.FOCAL_FACTORS]
@@ -209,16 +244,20 @@ def test_the_ways_of_a_mapper(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, m
         "incremental": [("incremental", database, None)],
         "global": [("global", database)],
         "auto": [
-            ("incremental", database, None), ("incremental", database, small), ("global", database),
+            ("incremental", database, None),
+            ("incremental", database, small),
+            ("global", database),
             *assumed,
         ],
-    }  # fmt: skip
+    }
     assert calls == expected[mapper]
     assert len({name for name, _ in ways}) == len(ways)
     assert small < 16  # COLMAP's own
 
 
-def test_mapping_tells_its_progress_from_none_to_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_mapping_tells_its_progress_from_none_to_all(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """COLMAP may place an image twice, in two models: more than all is never told."""
     told: list[tuple[str, int, int]] = []
 
@@ -229,7 +268,9 @@ def test_mapping_tells_its_progress_from_none_to_all(tmp_path: Path, monkeypatch
 
     monkeypatch.setattr(pycolmap, "incremental_mapping", place)
     monkeypatch.setattr(pycolmap, "global_mapping", lambda *_, options: {0: Model(3)})
-    mapper = mapping._Mapper(tmp_path / "a.db", tmp_path, tmp_path / "out", Sfm(), lambda *at: told.append(at), 3)
+    mapper = mapping._Mapper(
+        tmp_path / "a.db", tmp_path, tmp_path / "out", Sfm(), lambda *at: told.append(at), 3
+    )
     assert [model.images for model in mapper.incremental(tmp_path / "a.db")] == [2, 2]
     assert told == [("map", done, 3) for done in (0, 1, 2, 3, 3, 3)]
     told.clear()
@@ -239,13 +280,18 @@ def test_mapping_tells_its_progress_from_none_to_all(tmp_path: Path, monkeypatch
 
 @pytest.mark.parametrize(("share", "plausible"), [(0.9, False), (1.1, True)])
 def test_half_of_the_points_must_be_seen_under_an_angle(share: float, plausible: bool) -> None:
-    """Two cameras on either side of points at a distance of one; a third stands beside the first."""
+    """Two cameras on either side of points at a distance of one; a third stands beside the
+    first."""
     half = np.tan(np.radians(share * mapping.MIN_ANGLE_DEG) / 2)
     model = pycolmap.Reconstruction()
-    model.add_camera_with_trivial_rig(pycolmap.Camera.create_from_model_name(1, "PINHOLE", 100.0, 100, 80))
+    model.add_camera_with_trivial_rig(
+        pycolmap.Camera.create_from_model_name(1, "PINHOLE", 100.0, 100, 80)
+    )
     for number, x in enumerate((-half, half, -half), start=1):
         pose = pycolmap.Rigid3d(np.column_stack([np.eye(3), [-x, 0, 0]]))
-        image = pycolmap.Image(name=f"{number}", keypoints=np.zeros((3, 2)), camera_id=1, image_id=number)
+        image = pycolmap.Image(
+            name=f"{number}", keypoints=np.zeros((3, 2)), camera_id=1, image_id=number
+        )
         model.add_image_with_trivial_frame(image, pose)
     for index, images in enumerate([(1, 2, 3), (1, 2), (1, 3)]):
         track = pycolmap.Track([pycolmap.TrackElement(number, index) for number in images])
@@ -255,27 +301,45 @@ def test_half_of_the_points_must_be_seen_under_an_angle(share: float, plausible:
 
 
 @pytest.mark.parametrize("intrinsics", ["estimate", "reference"])
-def test_settings_reach_colmaps_mappers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, intrinsics: Any) -> None:
+def test_settings_reach_colmaps_mappers(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, intrinsics: Any
+) -> None:
     given: list[Any] = []
     monkeypatch.setattr(
-        pycolmap, "incremental_mapping", lambda *_, next_image_callback, options: given.append(options) or {}
+        pycolmap,
+        "incremental_mapping",
+        lambda *_, next_image_callback, options: given.append(options) or {},
     )
     monkeypatch.setattr(pycolmap, "global_mapping", lambda *_, options: given.append(options) or {})
     tracks, refine = intrinsics == "estimate", intrinsics == "estimate"
-    settings = Sfm(seed=7, mapper_threads=3, min_model_size=5, two_view_tracks=tracks, intrinsics=intrinsics)
-    mapper = mapping._Mapper(tmp_path / "a.db", tmp_path, tmp_path / "out", settings, no_progress, 3)
+    settings = Sfm(
+        seed=7, mapper_threads=3, min_model_size=5, two_view_tracks=tracks, intrinsics=intrinsics
+    )
+    mapper = mapping._Mapper(
+        tmp_path / "a.db", tmp_path, tmp_path / "out", settings, no_progress, 3
+    )
     mapper.incremental(mapper.database)
     mapper.incremental(mapper.database, 2.5)
     mapper.global_mapping()
     *incremental, together = given
     assert [options.mapper.init_min_tri_angle for options in incremental] == [16.0, 2.5]
     for options in incremental:
-        assert (options.num_threads, options.mapper.num_threads, options.min_model_size) == (3, 3, 5)
+        assert (options.num_threads, options.mapper.num_threads, options.min_model_size) == (
+            3,
+            3,
+            5,
+        )
         seeds = (options.random_seed, options.mapper.random_seed, options.triangulation.random_seed)
         assert seeds == (7, 7, 7)
-        assert (options.multiple_models, options.triangulation.ignore_two_view_tracks) == (True, not tracks)
+        assert (options.multiple_models, options.triangulation.ignore_two_view_tracks) == (
+            True,
+            not tracks,
+        )
         assert (options.ba_refine_focal_length, options.ba_refine_extra_params) == (refine, refine)
-        own = options.mapper.abs_pose_refine_focal_length, options.mapper.abs_pose_refine_extra_params
+        own = (
+            options.mapper.abs_pose_refine_focal_length,
+            options.mapper.abs_pose_refine_extra_params,
+        )
         assert own == (refine, refine)
     assert (together.num_threads, together.random_seed, together.min_model_size) == (3, 7, 5)
     adjustment = together.mapper.bundle_adjustment
@@ -289,39 +353,63 @@ def test_a_focal_length_is_assumed_in_a_copy_that_is_verified_anew(
     database = tmp_path / "a.db"
     database.write_text("cameras")
     made = mapping.colmap_database
-    monkeypatch.setattr(made, "assume_focal_lengths", lambda *given: calls.append(given) or [("a", "b")])
+    monkeypatch.setattr(
+        made, "assume_focal_lengths", lambda *given: calls.append(given) or [("a", "b")]
+    )
     monkeypatch.setattr(made, "verify_pairs", lambda *given: calls.append(given))
-    monkeypatch.setattr(mapping._Mapper, "incremental", lambda _, *given: calls.append(given) or ["model"])
-    mapper = mapping._Mapper(database, tmp_path, tmp_path / "out", Sfm(seed=4, min_inliers=9), no_progress, 3)
+    monkeypatch.setattr(
+        mapping._Mapper, "incremental", lambda _, *given: calls.append(given) or ["model"]
+    )
+    mapper = mapping._Mapper(
+        database, tmp_path, tmp_path / "out", Sfm(seed=4, min_inliers=9), no_progress, 3
+    )
     assert mapper.with_assumed_focal_lengths(1.4) == ["model"]
     assumed, (copy, pairs, options, progress), mapped_from = calls
     assert assumed == (tmp_path / "assumed-1.4.db", 1.4)
     assert (copy.read_text(), database.read_text()) == ("cameras", "cameras")
     assert (pairs, progress) == ([("a", "b")], no_progress)
-    assert (options.ransac.random_seed, options.min_num_inliers, options.min_inlier_ratio) == (4, 9, 0.0)
+    assert (options.ransac.random_seed, options.min_num_inliers, options.min_inlier_ratio) == (
+        4,
+        9,
+        0.0,
+    )
     assert mapped_from == (copy, 2.0)
 
 
 def test_pairs_are_all_or_those_of_neighbours() -> None:
     assert select_pairs("abcd", Sfm()) == [(a, b) for a in "abcd" for b in "abcd" if a < b]
-    assert select_pairs("abcd", Sfm(pairs="sequential", overlap=1)) == [("a", "b"), ("b", "c"), ("c", "d")]
+    assert select_pairs("abcd", Sfm(pairs="sequential", overlap=1)) == [
+        ("a", "b"),
+        ("b", "c"),
+        ("c", "d"),
+    ]
 
 
 def test_common_poses_are_in_the_order_of_names() -> None:
     def model(centers: dict[str, list[float]], flip: float) -> pycolmap.Reconstruction:
         made = pycolmap.Reconstruction()
-        made.add_camera_with_trivial_rig(pycolmap.Camera.create_from_model_name(1, "PINHOLE", 100.0, 100, 80))
+        made.add_camera_with_trivial_rig(
+            pycolmap.Camera.create_from_model_name(1, "PINHOLE", 100.0, 100, 80)
+        )
         for number, (name, center) in enumerate(centers.items(), start=1):
             rotation = np.diag([flip, flip, 1.0])
             pose = pycolmap.Rigid3d(np.column_stack([rotation, -rotation @ center]))
-            made.add_image_with_trivial_frame(pycolmap.Image(name=name, camera_id=1, image_id=number), pose)
+            made.add_image_with_trivial_frame(
+                pycolmap.Image(name=name, camera_id=1, image_id=number), pose
+            )
         return made
 
     one = model({"b": [1.0, 2, 3], "a": [4.0, 5, 6], "x": [0.0, 0, 0]}, 1.0)
     other = model({"y": [9.0, 9, 9], "a": [7.0, 8, 9], "b": [3.0, 1, 2]}, -1.0)
     centers, rotations, other_centers, other_rotations = common_poses(one, other)
-    assert (centers.tolist(), other_centers.tolist()) == ([[4, 5, 6], [1, 2, 3]], [[7, 8, 9], [3, 1, 2]])
+    assert (centers.tolist(), other_centers.tolist()) == (
+        [[4, 5, 6], [1, 2, 3]],
+        [[7, 8, 9], [3, 1, 2]],
+    )
     np.testing.assert_array_equal(rotations, [np.eye(3)] * 2)
     np.testing.assert_array_equal(other_rotations, [np.diag([-1.0, -1, 1])] * 2)
     assert similarity_to(one, other) is None
-    assert [part.shape for part in common_poses(one, pycolmap.Reconstruction())] == [(0, 3), (0, 3, 3)] * 2
+    assert [part.shape for part in common_poses(one, pycolmap.Reconstruction())] == [
+        (0, 3),
+        (0, 3, 3),
+    ] * 2

@@ -1,4 +1,5 @@
-"""Pairs of neighbours and of a preview: against a slow restatement in whole numbers, and on photographs."""
+"""Pairs of neighbours and of a preview: against a slow restatement in whole numbers, and on
+photographs."""
 
 from __future__ import annotations
 
@@ -26,7 +27,9 @@ def sets_of_descriptors(sizes: list[int]) -> list[np.ndarray]:
     """Images that share some descriptors, with a little noise."""
     rng = np.random.default_rng(0)
     base = rng.integers(0, 256, (400, 128))
-    parts = [base[rng.permutation(400)[:size]] + rng.integers(-20, 20, (size, 128)) for size in sizes]
+    parts = [
+        base[rng.permutation(400)[:size]] + rng.integers(-20, 20, (size, 128)) for size in sizes
+    ]
     return [part.clip(0, 255).astype(np.uint8) for part in parts]
 
 

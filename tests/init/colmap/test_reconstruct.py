@@ -1,4 +1,5 @@
-"""Triangulation under given cameras, the options handed to COLMAP, and the poses of two models, on exact matches."""
+"""Triangulation under given cameras, the options handed to COLMAP, and the poses of two models, on
+exact matches."""
 
 from __future__ import annotations
 
@@ -13,7 +14,12 @@ from scipy.spatial.transform import Rotation
 from gsbench.errors import InputError
 from gsbench.init import Sfm
 from gsbench.init.colmap import reconstruct
-from gsbench.init.colmap.database import create_database, verify_pairs, write_keypoints, write_matches
+from gsbench.init.colmap.database import (
+    create_database,
+    verify_pairs,
+    write_keypoints,
+    write_matches,
+)
 from gsbench.logs import no_progress
 
 WIDTH, HEIGHT, FOCAL = 320, 240, 260.0  # px
@@ -23,7 +29,11 @@ POINTS = np.random.default_rng(0).uniform((-2, -1.5, 4), (2, 1.5, 7), (120, 3))
 
 def camera() -> pycolmap.Camera:
     return pycolmap.Camera(
-        model="SIMPLE_PINHOLE", width=WIDTH, height=HEIGHT, params=[FOCAL, WIDTH / 2, HEIGHT / 2], camera_id=1
+        model="SIMPLE_PINHOLE",
+        width=WIDTH,
+        height=HEIGHT,
+        params=[FOCAL, WIDTH / 2, HEIGHT / 2],
+        camera_id=1,
     )
 
 
@@ -31,7 +41,9 @@ def poses() -> dict[str, pycolmap.Rigid3d]:
     """Four cameras on an arc, each turned towards the points."""
     made = {}
     for index, name in enumerate(NAMES):
-        turn = Rotation.from_euler("yx", [8.0 * (index - 1.5), 3.0 * index], degrees=True).as_matrix()
+        turn = Rotation.from_euler(
+            "yx", [8.0 * (index - 1.5), 3.0 * index], degrees=True
+        ).as_matrix()
         center = np.array([0.8 * (index - 1.5), 0.2 * index, 0.1])
         made[name] = pycolmap.Rigid3d(pycolmap.Rotation3d(turn), -turn @ center)
     return made
@@ -56,7 +68,9 @@ def database(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name, pose in poses().items():
         Image.new("RGB", (WIDTH, HEIGHT)).save(folder / "images" / name)
         local = POINTS @ pose.rotation.matrix().T + pose.translation
-        keypoints[name] = (FOCAL * local[:, :2] / local[:, 2:] + (WIDTH / 2, HEIGHT / 2)).astype(np.float32)
+        keypoints[name] = (FOCAL * local[:, :2] / local[:, 2:] + (WIDTH / 2, HEIGHT / 2)).astype(
+            np.float32
+        )
     path = folder / "database.db"
     create_database(path, [(camera(), NAMES)])
     write_keypoints(path, keypoints)
@@ -67,7 +81,9 @@ def database(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_points_come_from_the_named_images_under_cameras_that_do_not_change(database: Path, tmp_path: Path) -> None:
+def test_points_come_from_the_named_images_under_cameras_that_do_not_change(
+    database: Path, tmp_path: Path
+) -> None:
     said: list[tuple[str, int, int | None]] = []
     model = reconstruct.triangulate(
         database,
@@ -92,25 +108,44 @@ def test_points_come_from_the_named_images_under_cameras_that_do_not_change(data
         np.testing.assert_allclose(point.xyz, POINTS[index], atol=1e-3)
 
 
-def test_matches_that_contradict_the_cameras_triangulate_nothing(database: Path, tmp_path: Path) -> None:
-    reference, images = model_of(dict(zip(NAMES, reversed(poses().values()), strict=True))), database.parent / "images"
-    with pytest.raises(InputError, match="no point could be triangulated under the reference cameras"):
+def test_matches_that_contradict_the_cameras_triangulate_nothing(
+    database: Path, tmp_path: Path
+) -> None:
+    reference, images = (
+        model_of(dict(zip(NAMES, reversed(poses().values()), strict=True))),
+        database.parent / "images",
+    )
+    with pytest.raises(
+        InputError, match="no point could be triangulated under the reference cameras"
+    ):
         reconstruct.triangulate(
-            database, images, tmp_path / "out", reference, NAMES, Sfm(threads=1), lambda *args, **options: None
+            database,
+            images,
+            tmp_path / "out",
+            reference,
+            NAMES,
+            Sfm(threads=1),
+            lambda *args, **options: None,
         )
 
 
 def test_the_poses_of_two_models_are_paired_by_name() -> None:
     scale, shift = 2.0, np.array([1.0, -2.0, 3.0])
     moved = {  # in the opposite order, and without the first
-        name: pycolmap.Rigid3d(pose.rotation, scale * pose.translation - pose.rotation.matrix() @ shift)
+        name: pycolmap.Rigid3d(
+            pose.rotation, scale * pose.translation - pose.rotation.matrix() @ shift
+        )
         for name, pose in reversed(list(poses().items())[1:])
     }
     first, second = model_of(poses()), model_of(moved)
     centers, rotations, other_centers, other_rotations = reconstruct.common_poses(first, second)
-    np.testing.assert_allclose(centers, [[0.8 * (k - 1.5), 0.2 * k, 0.1] for k in (1, 2, 3)], atol=1e-12)
+    np.testing.assert_allclose(
+        centers, [[0.8 * (k - 1.5), 0.2 * k, 0.1] for k in (1, 2, 3)], atol=1e-12
+    )
     np.testing.assert_allclose(other_centers, scale * centers + shift, atol=1e-12)
-    np.testing.assert_allclose(rotations, [poses()[name].rotation.matrix() for name in NAMES[1:]], atol=1e-12)
+    np.testing.assert_allclose(
+        rotations, [poses()[name].rotation.matrix() for name in NAMES[1:]], atol=1e-12
+    )
     np.testing.assert_allclose(other_rotations, rotations, atol=1e-12)
     found = reconstruct.similarity_to(first, second)
     assert found is not None
@@ -120,15 +155,29 @@ def test_the_poses_of_two_models_are_paired_by_name() -> None:
 
 
 def test_options_reach_colmap() -> None:
-    options = Sfm(seed=7, min_inliers=11, min_inlier_ratio=0.31, threads=2, two_view_tracks=True, min_model_size=5)
+    options = Sfm(
+        seed=7,
+        min_inliers=11,
+        min_inlier_ratio=0.31,
+        threads=2,
+        two_view_tracks=True,
+        min_model_size=5,
+    )
     verification = reconstruct.verification_options(options)
     assert verification.ransac.random_seed == 7
     assert (verification.min_num_inliers, verification.min_inlier_ratio) == (11, 0.31)
     pipeline = reconstruct.pipeline_options(options)
-    assert pipeline.random_seed == pipeline.mapper.random_seed == pipeline.triangulation.random_seed == 7
+    assert (
+        pipeline.random_seed
+        == pipeline.mapper.random_seed
+        == pipeline.triangulation.random_seed
+        == 7
+    )
     assert pipeline.num_threads == pipeline.mapper.num_threads == options.mapper_threads
     assert not pipeline.triangulation.ignore_two_view_tracks
-    assert reconstruct.pipeline_options(Sfm(two_view_tracks=False)).triangulation.ignore_two_view_tracks
+    assert reconstruct.pipeline_options(
+        Sfm(two_view_tracks=False)
+    ).triangulation.ignore_two_view_tracks
     assert pipeline.multiple_models
     assert pipeline.min_model_size == 5
     for intrinsics, refined in (("estimate", True), ("reference", False)):
@@ -141,5 +190,9 @@ def test_options_reach_colmap() -> None:
 def test_pairs_of_names() -> None:
     assert reconstruct.select_pairs("abc", Sfm()) == [("a", "b"), ("a", "c"), ("b", "c")]
     sequential = reconstruct.select_pairs("abcd", Sfm(pairs="sequential", overlap=1))
-    assert {frozenset(pair) for pair in sequential} >= {frozenset("ab"), frozenset("bc"), frozenset("cd")}
+    assert {frozenset(pair) for pair in sequential} >= {
+        frozenset("ab"),
+        frozenset("bc"),
+        frozenset("cd"),
+    }
     assert len(sequential) < 6

@@ -39,21 +39,28 @@ def test_shares_are_about_equal_and_parts_hold_few_images():
     parts = divide_pairs(pairs, 10)
     assert max(len({image for pair in part for image in pair}) for part in parts) <= 2 * 10
     assert divide_pairs(list(itertools.combinations(range(1, 5), 2)), 2) == [
-        [(1, 2)], [(1, 3), (1, 4), (2, 3), (2, 4)], [(3, 4)],
-    ]  # fmt: skip
+        [(1, 2)],
+        [(1, 3), (1, 4), (2, 3), (2, 4)],
+        [(3, 4)],
+    ]
     sizes = [sum(map(len, share)) for share in distribute_parts(parts, 4)]
     assert max(sizes) - min(sizes) <= 10 * 10
 
 
 @pytest.fixture(scope="module")
-def features(bare_photos: Capture, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[tuple[str, str]]]:
+def features(
+    bare_photos: Capture, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, list[tuple[str, str]]]:
     """A database with features of photographs whose names have spaces, and all pairs of them."""
     folder = tmp_path_factory.mktemp("features")
     (folder / "images").mkdir()
     names = [f"IMG {index} (1).png" for index in range(len(bare_photos.image_names))]
     for name, original in zip(names, bare_photos.image_names, strict=True):
         shutil.copy(bare_photos.images / original, folder / "images" / name)
-    create_database(folder / "database.db", unknown_camera_groups(folder / "images", names, "single", "PINHOLE", 300.0))
+    create_database(
+        folder / "database.db",
+        unknown_camera_groups(folder / "images", names, "single", "PINHOLE", 300.0),
+    )
     extract_sift(folder / "database.db", folder / "images", names, Sfm(), 1, no_progress)
     return folder / "database.db", list(itertools.combinations(names, 2))
 
@@ -64,11 +71,17 @@ def read_matches(database: Path) -> tuple[dict[int, bytes], dict[int, tuple[byte
         pair_ids, matches = opened.read_all_matches()
         geometry_ids, geometries = opened.read_two_view_geometries()
     return (
-        {pair: np.asarray(indices).tobytes() for pair, indices in zip(pair_ids, matches, strict=True)},
+        {
+            pair: np.asarray(indices).tobytes()
+            for pair, indices in zip(pair_ids, matches, strict=True)
+        },
         {
             pair: (
                 np.asarray(geometry.inlier_matches).tobytes(),
-                *(b"" if part is None else np.asarray(part).tobytes() for part in (geometry.E, geometry.F, geometry.H)),
+                *(
+                    b"" if part is None else np.asarray(part).tobytes()
+                    for part in (geometry.E, geometry.F, geometry.H)
+                ),
             )
             for pair, geometry in zip(geometry_ids, geometries, strict=True)
         },
@@ -105,14 +118,18 @@ def test_matches_are_those_of_colmap_on_one_thread(
     assert sum(len(matches) > 0 for matches in theirs[0].values()) > 10
     assert (told[0], max(told)) == (0, len(pairs))
     assert sorted(path.name for path in tmp_path.iterdir()) == ["colmap.db", "database.db"]
-    with pycolmap.Database.open(tmp_path / "database.db") as opened:  # the names are the photographs' again
-        assert {image.name for image in opened.read_all_images()} == {name for pair in pairs for name in pair}
+    # the names are the photographs' again
+    with pycolmap.Database.open(tmp_path / "database.db") as opened:
+        assert {image.name for image in opened.read_all_images()} == {
+            name for pair in pairs for name in pair
+        }
 
 
 def test_colmaps_matcher_never_gets_a_second_thread(
     features: tuple[Path, list[tuple[str, str]]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    """Two threads of it in one process can spoil each other's matches, too rarely for a test to see."""
+    """Two threads of it in one process can spoil each other's matches, too rarely for a test to
+    see."""
     database, pairs = features
     shutil.copy(database, tmp_path / "database.db")
     threads = []
@@ -132,13 +149,20 @@ def test_colmaps_matcher_never_gets_a_second_thread(
 
 @pytest.mark.slow
 def test_auto_leaves_out_what_a_preview_does_not_propose(
-    features: tuple[Path, list[tuple[str, str]]], bare_photos: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    features: tuple[Path, list[tuple[str, str]]],
+    bare_photos: Capture,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ):
-    """Few images: all pairs, to the bit. More than that (here: more than five): each with its best partners."""
+    """Few images: all pairs, to the bit. More than that (here: more than five): each with its best
+    partners."""
     exhaustive = Sfm(threads=1).run(bare_photos, tmp_path / "all")
     auto = Sfm(threads=1, pairs="auto").run(bare_photos, tmp_path / "auto")
     assert auto.counts["pairs_left_out"] == 0
-    assert {**auto.counts, "pairs_matched": exhaustive.counts["pairs_matched"]}.items() >= exhaustive.counts.items()
+    assert {
+        **auto.counts,
+        "pairs_matched": exhaustive.counts["pairs_matched"],
+    }.items() >= exhaustive.counts.items()
     for name in ("cameras.bin", "images.bin", "points3D.bin"):
         written = (tmp_path / "auto" / MODEL_FOLDER / name).read_bytes()
         assert written == (tmp_path / "all" / MODEL_FOLDER / name).read_bytes()
@@ -146,9 +170,13 @@ def test_auto_leaves_out_what_a_preview_does_not_propose(
     database, pairs = features
     shutil.copy(database, tmp_path / "database.db")
     names = sorted({name for pair in pairs for name in pair})
-    task = DatabaseTask(tmp_path / "database.db", bare_photos.images, names, pairs, bare_photos, tmp_path)
+    task = DatabaseTask(
+        tmp_path / "database.db", bare_photos.images, names, pairs, bare_photos, tmp_path
+    )
     monkeypatch.setattr("gsbench.init.colmap.pairs.ALL_PAIRS_UP_TO", 5)
-    monkeypatch.setattr("gsbench.init.colmap.pairs.best_pairs", lambda descriptors: best_pairs(descriptors, 2))
+    monkeypatch.setattr(
+        "gsbench.init.colmap.pairs.best_pairs", lambda descriptors: best_pairs(descriptors, 2)
+    )
     monkeypatch.setattr("gsbench.init.colmap.sift.extract_sift", lambda *_: None)
     counts = Sfm(threads=1, pairs="auto").fill_database(task, no_progress, Timer())
     assert counts["pairs_selected"] + counts["pairs_left_out"] == len(pairs)
@@ -156,4 +184,5 @@ def test_auto_leaves_out_what_a_preview_does_not_propose(
     matched = read_matches(task.database)[0]
     assert len(matched) == counts["pairs_selected"]
     kept = {tuple(sorted(pycolmap.pair_id_to_image_pair(pair))) for pair in matched}
-    assert {(index, index + 1) for index in range(1, len(names))} <= kept  # neighbours on the arc agree best
+    # neighbours on the arc agree best
+    assert {(index, index + 1) for index in range(1, len(names))} <= kept

@@ -1,4 +1,5 @@
-"""The overlay draws what it says: one outline, of the right Gaussian, in its place, in the colour of its cause."""
+"""The overlay draws what it says: one outline, of the right Gaussian, in its place, in the colour
+of its cause."""
 
 from __future__ import annotations
 
@@ -65,7 +66,11 @@ def test_of_too_many_the_most_voluminous_are_outlined(monkeypatch: pytest.Monkey
 def test_a_legend_stands_below_the_picture_word_by_word(words_in_a_line: int) -> None:
     """Words of 11 px, each half of that after the one before, 14 px a line, 2 px from the left."""
     font = ImageFont.load_default(11)
-    words = [("title", (255, 255, 255)), ("word", (255, 255, 255)), (Cause.CLONE.words, Cause.CLONE.color)]
+    words = [
+        ("title", (255, 255, 255)),
+        ("word", (255, 255, 255)),
+        (Cause.CLONE.words, Cause.CLONE.color),
+    ]
     first, second, third = (math.ceil(font.getlength(text)) + 5 for text, _ in words)
     width, at = {
         3: (first + second + third, [(2, 0), (2 + first, 0), (2 + first + second, 0)]),

@@ -1,4 +1,5 @@
-"""What steps hand on: another program gets the training views and the settings, an initialiser its cameras."""
+"""What steps hand on: another program gets the training views and the settings, an initialiser its
+cameras."""
 
 from __future__ import annotations
 
@@ -54,20 +55,33 @@ if model != "none":
 def views(tmp_path: Path) -> Any:
     """Four training views and two test views of noise, and a cloud of seven points."""
     rng = np.random.default_rng(0)
-    made = [View(f"{k}.png", orbit_camera(0.1 * k), rng.integers(0, 256, (32, 40, 3), np.uint8)) for k in range(6)]
+    made = [
+        View(f"{k}.png", orbit_camera(0.1 * k), rng.integers(0, 256, (32, 40, 3), np.uint8))
+        for k in range(6)
+    ]
     store = Store(tmp_path / "store")
     cloud = (rng.normal((0, 0, 4), size=(7, 3)), rng.integers(0, 256, (7, 3), np.uint8))
-    write_model(store.path(CLOUD_STEP) / MODEL_FOLDER, {view.name: view.camera for view in made}, cloud=cloud)
+    write_model(
+        store.path(CLOUD_STEP) / MODEL_FOLDER,
+        {view.name: view.camera for view in made},
+        cloud=cloud,
+    )
     scene = Scene("made", tuple(made[2:]), tuple(made[:2]))
     capture = Capture("made", tmp_path, (), (), None, False, "0")
-    return SimpleNamespace(capture=capture, inputs={"capture": "0"}, init=CLOUD_STEP, store=store, scene=scene)
+    return SimpleNamespace(
+        capture=capture, inputs={"capture": "0"}, init=CLOUD_STEP, store=store, scene=scene
+    )
 
 
 def parts_of(seed: int = 5) -> Any:
     return SimpleNamespace(
-        values={"densify": {"name": "other"}}, train=SimpleNamespace(iterations=900), seed=seed, threads=3,
-        device=torch.device("cpu"), initializer=Random(),
-    )  # fmt: skip
+        values={"densify": {"name": "other"}},
+        train=SimpleNamespace(iterations=900),
+        seed=seed,
+        threads=3,
+        device=torch.device("cpu"),
+        initializer=Random(),
+    )
 
 
 def trainer(tmp_path: Path, model: str, cameras: bool = True, **settings: Any) -> External:
@@ -76,7 +90,12 @@ def trainer(tmp_path: Path, model: str, cameras: bool = True, **settings: Any) -
     rest = ["{iterations}", "{seed}", "{device}", "{threads}", "{kind}"]
     command = [sys.executable, str(tmp_path / "program.py"), *words, *rest]
     return External(
-        command=command, result="*.ply", version="7", options={"kind": "a b"}, environment={"SET": "{seed}"}, **settings
+        command=command,
+        result="*.ply",
+        version="7",
+        options={"kind": "a b"},
+        environment={"SET": "{seed}"},
+        **settings,
     )
 
 
@@ -93,43 +112,63 @@ def test_a_program_is_given_the_training_views_and_the_settings(
     folder.mkdir()
     step.build(folder)
     said = json.loads((folder / "trainer.log").read_text().splitlines()[-1])
-    assert [name for name in said["there"] if name.startswith("images")] == [f"images/{k}.png" for k in range(2, 6)]
+    assert [name for name in said["there"] if name.startswith("images")] == [
+        f"images/{k}.png" for k in range(2, 6)
+    ]
     assert "sparse/0/points3D.bin" in said["there"]
     assert said["rest"] == ["900", "5", "cpu", "3", "a b"]
     assert said["frames"] == (["0.png", "1.png"] if cameras else [])
     assert (said["own"], said["set"]) == ([], "5")
     summary = json.loads((folder / "training.json").read_text())
-    assert (summary["num_gaussians"], summary["num_init_points"], summary["iterations"]) == (9, 7, 900)
+    assert (summary["num_gaussians"], summary["num_init_points"], summary["iterations"]) == (
+        9,
+        7,
+        900,
+    )
     assert summary["trained_by"]["command"][2:4] == ["{data}", "{output}"]
     assert summary["trained_by"]["version"] == "7"
     assert summary["seconds"] > 0
     assert summary["peak_memory_mb"] > 0
     assert (step.stage.version, step.inputs["contract"]) == (1, 1)  # raised by hand
     assert sorted(path.name for path in folder.iterdir()) == [
-        "events.jsonl", "lineage.npz", "point_cloud.ply", "trainer.log", "training.json",
-    ]  # fmt: skip
+        "events.jsonl",
+        "lineage.npz",
+        "point_cloud.ply",
+        "trainer.log",
+        "training.json",
+    ]
     keys = {external_step(views, program, parts_of(seed)).key for seed in (5, 6)}
     assert len(keys) == 2
     assert step.key in keys
 
 
-def test_a_program_works_in_the_given_coordinates_and_its_model_is_normalized(views: Any, tmp_path: Path) -> None:
+def test_a_program_works_in_the_given_coordinates_and_its_model_is_normalized(
+    views: Any, tmp_path: Path
+) -> None:
     normalization = Normalization((5e5, 5.4e6, 300.0), 0.01)
     views.capture = replace(views.capture, normalization=normalization)
     given = tmp_path / "given.ply"
     write_ply(random_gaussians(9, dtype=torch.float32), given, normalization)
     copied = tmp_path / "copied"
     code = (
-        f"import shutil, sys; shutil.copytree(sys.argv[1], {str(copied)!r}); shutil.copy({str(given)!r}, sys.argv[2])"
+        f"import shutil, sys; shutil.copytree(sys.argv[1], {str(copied)!r}); "
+        f"shutil.copy({str(given)!r}, sys.argv[2])"
     )
-    program = External(command=[sys.executable, "-c", code, "{data}", "{output}"], result="*.ply", version="7")
+    program = External(
+        command=[sys.executable, "-c", code, "{data}", "{output}"], result="*.ply", version="7"
+    )
     folder = tmp_path / "built"
     folder.mkdir()
     external_step(views, program, parts_of()).build(folder)
-    seen, inside = read_model(copied / MODEL_FOLDER), read_model(views.store.path(CLOUD_STEP) / MODEL_FOLDER)
+    seen, inside = (
+        read_model(copied / MODEL_FOLDER),
+        read_model(views.store.path(CLOUD_STEP) / MODEL_FOLDER),
+    )
     for view in views.scene.train:
         center = seen.find_image_with_name(view.name).projection_center()
-        np.testing.assert_allclose(center, np.array(normalization.center) + view.camera.center / 0.01, atol=1e-6)
+        np.testing.assert_allclose(
+            center, np.array(normalization.center) + view.camera.center / 0.01, atol=1e-6
+        )
     wanted_points = np.array(normalization.center) + model_points(inside)[0] / 0.01
     np.testing.assert_allclose(model_points(seen)[0], wanted_points, atol=1e-6)
     kept, wanted = read_ply(folder / "point_cloud.ply"), random_gaussians(9, dtype=torch.float32)
@@ -139,7 +178,11 @@ def test_a_program_works_in_the_given_coordinates_and_its_model_is_normalized(vi
 
 @pytest.mark.parametrize(("minutes", "limit"), [(2.5, 150.0), (None, None)])
 def test_a_program_has_the_time_that_is_set(
-    views: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, minutes: float | None, limit: float | None
+    views: Any,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    minutes: float | None,
+    limit: float | None,
 ) -> None:
     given: list[Any] = []
     ended = SimpleNamespace(seconds=1.0, peak_memory_mb=1.0)
@@ -154,11 +197,18 @@ def test_a_program_has_the_time_that_is_set(
     assert seconds == limit
 
 
-def test_a_program_gets_the_environment_without_gsbenchs_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_program_gets_the_environment_without_gsbenchs_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for name, value in (("GSBENCH_X", "1"), ("KEPT", "2"), SAFE_PATH):
         monkeypatch.setenv(name, value)
     found = train_steps.environment_of(trainer(tmp_path, "none"), {"seed": 5})
-    assert (found.get("GSBENCH_X"), found.get("KEPT"), found.get(SAFE_PATH[0]), found["SET"]) == (None, "2", None, "5")
+    assert (found.get("GSBENCH_X"), found.get("KEPT"), found.get(SAFE_PATH[0]), found["SET"]) == (
+        None,
+        "2",
+        None,
+        "5",
+    )
     monkeypatch.setenv(SAFE_PATH[0], "1")  # the user's own
     assert train_steps.environment_of(trainer(tmp_path, "none"), {"seed": 5})[SAFE_PATH[0]] == "1"
 
@@ -168,13 +218,21 @@ def test_a_training_leaves_its_model_its_lineage_and_its_summary(
 ) -> None:
     told: list[tuple[Any, ...]] = []
     reset: list[torch.device] = []
-    monkeypatch.setattr(train_steps, "progress", lambda title: nullcontext(lambda *counts: told.append(counts)))
+    monkeypatch.setattr(
+        train_steps, "progress", lambda title: nullcontext(lambda *counts: told.append(counts))
+    )
     monkeypatch.setattr(train_steps, "reset_peak_memory", reset.append)
     cpu = torch.device("cpu")
     parts: Any = SimpleNamespace(
-        trainer=ADC(), rasterizer=ReferenceRasterizer(), train=TrainConfig(iterations=2), seed=5, device=cpu,
-        measured_earlier=[1], user_code=UserCode(), initializer=Random(),
-    )  # fmt: skip
+        trainer=ADC(),
+        rasterizer=ReferenceRasterizer(),
+        train=TrainConfig(iterations=2),
+        seed=5,
+        device=cpu,
+        measured_earlier=[1],
+        user_code=UserCode(),
+        initializer=Random(),
+    )
     step = train_step(views, parts)
     assert step.inputs["snapshots"] == [1]
     assert set(WITHOUT_EFFECT_ON_MODEL).isdisjoint(step.inputs["train"])
@@ -182,7 +240,11 @@ def test_a_training_leaves_its_model_its_lineage_and_its_summary(
     folder.mkdir()
     step.build(folder)
     summary = json.loads((folder / "training.json").read_text())
-    assert (summary["iterations"], summary["num_init_points"], summary["num_gaussians"]) == (2, 7, 7)
+    assert (summary["iterations"], summary["num_init_points"], summary["num_gaussians"]) == (
+        2,
+        7,
+        7,
+    )
     assert summary["causes"]["initial"] == 7
     assert len(read_ply(folder / "point_cloud.ply", cpu)) == 7
     with np.load(folder / "lineage.npz") as lineage:
@@ -202,7 +264,9 @@ def test_renders_of_a_program_are_collected_for_the_test_views(
         return SimpleNamespace(seconds=1.0, peak_memory_mb=1.0)
 
     monkeypatch.setattr(train_steps, "run_program", run)
-    external_step(views, replace(trainer(tmp_path, "none"), result="*.png"), parts_of()).build(tmp_path)
+    external_step(views, replace(trainer(tmp_path, "none"), result="*.png"), parts_of()).build(
+        tmp_path
+    )
     for view in views.scene.test:
         assert (np.asarray(Image.open(tmp_path / "renders" / view.name)) == 255 - view.image).all()
     summary = json.loads((tmp_path / "training.json").read_text())
@@ -224,11 +288,15 @@ def test_a_program_without_a_result_is_named_with_its_log(views: Any, tmp_path: 
     assert not any((tmp_path / "built" / "work").glob("data/*"))
 
 
-def test_the_version_that_a_program_tells_must_be_the_one_that_is_set(views: Any, tmp_path: Path) -> None:
+def test_the_version_that_a_program_tells_must_be_the_one_that_is_set(
+    views: Any, tmp_path: Path
+) -> None:
     write_ply(random_gaussians(9, dtype=torch.float32), tmp_path / "model.ply")
     for said, fits in (("other 7.1", True), ("other 8", False)):
         tells = f"{shlex.quote(sys.executable)} -c \"print('{said}')\""
-        step = external_step(views, trainer(tmp_path, str(tmp_path / "model.ply"), version_command=tells), parts_of())
+        step = external_step(
+            views, trainer(tmp_path, str(tmp_path / "model.ply"), version_command=tells), parts_of()
+        )
         folder = tmp_path / said
         folder.mkdir()
         if fits:
@@ -264,14 +332,21 @@ def test_an_initialiser_gets_the_cameras_that_stand_in_for_those_that_did_not_co
     tmp_path: Path, has_reference: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     told: list[tuple[Any, ...]] = []
-    monkeypatch.setattr(scene_steps, "progress", lambda title: nullcontext(lambda *counts: told.append(counts)))
+    monkeypatch.setattr(
+        scene_steps, "progress", lambda title: nullcontext(lambda *counts: told.append(counts))
+    )
     Image.new("RGB", (4, 4)).save(tmp_path / "a.png")
-    store, capture = Store(tmp_path / "store"), Capture("made", tmp_path, ("a.png",), (), None, False, "0")
+    store, capture = (
+        Store(tmp_path / "store"),
+        Capture("made", tmp_path, ("a.png",), (), None, False, "0"),
+    )
     reference = CLOUD_STEP if has_reference else None
     step = init_step(store, capture, Noting(), reference)  # type: ignore[arg-type]
     step.build(tmp_path)
     assert told == [("photographs", 1, 1)]
-    assert (tmp_path / "given").read_text() == str(store.path(CLOUD_STEP) / MODEL_FOLDER if has_reference else None)
+    assert (tmp_path / "given").read_text() == str(
+        store.path(CLOUD_STEP) / MODEL_FOLDER if has_reference else None
+    )
     assert step.inputs["reference"] == (CLOUD_STEP.key if has_reference else None)
     assert step.inputs["options"]["count"] == 3
     others = [

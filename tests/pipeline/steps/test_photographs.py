@@ -1,4 +1,5 @@
-"""The photographs of a trial before anything looks at them: who makes them, what replaces pixels, what is kept."""
+"""The photographs of a trial before anything looks at them: who makes them, what replaces pixels,
+what is kept."""
 
 from __future__ import annotations
 
@@ -14,7 +15,13 @@ from PIL import Image
 
 from gsbench.errors import InputError
 from gsbench.pipeline.steps import scene as scene_steps
-from gsbench.pipeline.steps.scene import CaptureSource, Views, ground_truth_step, masked_capture, masking_step
+from gsbench.pipeline.steps.scene import (
+    CaptureSource,
+    Views,
+    ground_truth_step,
+    masked_capture,
+    masking_step,
+)
 from gsbench.runs.keys import INIT, Step
 from gsbench.runs.store import Store
 from gsbench.scene.images import read_mask
@@ -25,13 +32,16 @@ from gsbench.scene.types import Capture, Scene
 
 @pytest.fixture
 def photographs(tmp_path: Path) -> Path:
-    """Four photographs, the second of them transparent on its left half, and masks that ignore the upper half."""
+    """Four photographs, the second of them transparent on its left half, and masks that ignore the
+    upper half."""
     for index, name in enumerate(("a", "b", "c", "d")):
         pixels = np.full((20, 30, 4), [10, 20, 30, 255], np.uint8)
         pixels[19, 29, 2] += 0 if name == "b" else index  # no photograph twice
         pixels[:, :15, 3] = 0 if name == "b" else 255
         (tmp_path / "photos" / "images").mkdir(parents=True, exist_ok=True)
-        Image.fromarray(pixels if name == "b" else pixels[..., :3]).save(tmp_path / "photos" / "images" / f"{name}.png")
+        Image.fromarray(pixels if name == "b" else pixels[..., :3]).save(
+            tmp_path / "photos" / "images" / f"{name}.png"
+        )
         (tmp_path / "photos" / "masks").mkdir(exist_ok=True)
         counts = np.repeat([[0], [255]], 10, axis=0).astype(np.uint8).repeat(30, axis=1)
         Image.fromarray(counts).save(tmp_path / "photos" / "masks" / f"{name}.png.png")
@@ -39,7 +49,9 @@ def photographs(tmp_path: Path) -> Path:
 
 
 def test_only_a_courtyard_and_cameras_in_a_file_are_made(photographs: Path) -> None:
-    made = CaptureSource(SceneConfig(name="made", kind="courtyard", views=9, width=40, height=30, seed=3)).step
+    made = CaptureSource(
+        SceneConfig(name="made", kind="courtyard", views=9, width=40, height=30, seed=3)
+    ).step
     assert made is not None
     assert {"views": 9, "width": 40, "height": 30, "seed": 3}.items() <= made.inputs.items()
     source = CaptureSource(SceneConfig(name="own", kind="photos", path=str(photographs)))
@@ -47,7 +59,9 @@ def test_only_a_courtyard_and_cameras_in_a_file_are_made(photographs: Path) -> N
     capture = source.read(None)
     assert capture.image_names == ("a.png", "b.png", "c.png", "d.png")
     assert not capture.masks
-    with_masks = CaptureSource(SceneConfig(name="own", kind="photos", path=str(photographs), masks="masks"))
+    with_masks = CaptureSource(
+        SceneConfig(name="own", kind="photos", path=str(photographs), masks="masks")
+    )
     assert with_masks.read(None).masks.keys() == set(capture.image_names)
     small = SceneConfig(name="own", kind="photos", path=str(photographs), downscale=2)
     with pytest.raises(InputError, match=r"scene\.downscale=2 leaves 15x10 px of .*a\.png"):
@@ -58,17 +72,27 @@ def test_pixels_are_replaced_where_a_mask_or_a_colour_behind_them_asks_for_it(
     photographs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     told: list[tuple[int, int]] = []
-    monkeypatch.setattr(scene_steps, "progress", lambda title: nullcontext(lambda _, *counts: told.append(counts)))
-    bare, masks = read_photos("own", str(photographs)), read_photos("own", str(photographs), masks="masks")
+    monkeypatch.setattr(
+        scene_steps, "progress", lambda title: nullcontext(lambda _, *counts: told.append(counts))
+    )
+    bare, masks = (
+        read_photos("own", str(photographs)),
+        read_photos("own", str(photographs), masks="masks"),
+    )
     assert masking_step(bare, "black") is None  # as they are read anyway
-    steps = [masking_step(capture, behind) for capture, behind in ((bare, "white"), (masks, "white"), (masks, "black"))]
+    steps = [
+        masking_step(capture, behind)
+        for capture, behind in ((bare, "white"), (masks, "white"), (masks, "black"))
+    ]
     assert len({step.key for step in steps if step is not None}) == 3
     for name, step in zip(("white", "both", "masks"), steps, strict=True):
         assert step is not None
         step.build(tmp_path / name)
-    assert told == [(done, 4) for done in (1, 2, 3, 4)] * 3  # of four photographs, the last is told as all
+    # of four photographs, the last is told as all
+    assert told == [(done, 4) for done in (1, 2, 3, 4)] * 3
     read = {
-        name: np.asarray(Image.open(tmp_path / name / "images" / "b.png").convert("RGB")) for name in ("white", "both")
+        name: np.asarray(Image.open(tmp_path / name / "images" / "b.png").convert("RGB"))
+        for name in ("white", "both")
     }
     assert (read["white"][:, :15] == 255).all()
     assert (read["white"][:, 15:] == [10, 20, 30]).all()
@@ -88,8 +112,10 @@ def test_ground_truth_is_the_test_views_and_their_masks(tmp_path: Path, tiny_sce
     views: Any = SimpleNamespace(scene=scene, inputs={}, init=init)
     ground_truth_step(views).build(tmp_path)
     assert sorted(path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*.png")) == [
-        "00.png", "08.png", "masks/08.png",
-    ]  # fmt: skip
+        "00.png",
+        "08.png",
+        "masks/08.png",
+    ]
     for view in scene.test:
         np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / view.name)), view.image)
     np.testing.assert_array_equal(read_mask(tmp_path / "masks" / "08.png"), counts)
@@ -100,11 +126,22 @@ def test_each_setting_that_changes_views_makes_another_key(tmp_path: Path) -> No
     init, store = Step(INIT, {}, lambda folder: None), Store(tmp_path / "store")
     base = SceneConfig(name="own", kind="photos", path=str(tmp_path))
     changes: list[dict[str, Any]] = [
-        {}, {"downscale": 2}, {"max_size": 100}, {"resample": "area"}, {"principal_point": "centred"},
-    ]  # fmt: skip
-    keys = [ground_truth_step(Views(store, capture, init, replace(base, **change))).key for change in changes]
+        {},
+        {"downscale": 2},
+        {"max_size": 100},
+        {"resample": "area"},
+        {"principal_point": "centred"},
+    ]
+    keys = [
+        ground_truth_step(Views(store, capture, init, replace(base, **change))).key
+        for change in changes
+    ]
     others = [replace(capture, test_names=("b",)), replace(capture, fingerprint="1")]
     keys += [ground_truth_step(Views(store, other, init, base)).key for other in others]
-    keys.append(ground_truth_step(Views(store, capture, Step(INIT, {"a": 1}, lambda folder: None), base)).key)
+    keys.append(
+        ground_truth_step(
+            Views(store, capture, Step(INIT, {"a": 1}, lambda folder: None), base)
+        ).key
+    )
     assert len(set(keys)) == len(keys) == 8
     assert ground_truth_step(Views(store, capture, init, replace(base, seed=5))).key == keys[0]

@@ -12,7 +12,12 @@ from PIL import Image
 from gsbench.errors import InputError
 from gsbench.scene.colmap import read_model
 from gsbench.scene.courtyard.layout import BOX, SPHERE, build_layout
-from gsbench.scene.courtyard.render import courtyard_cameras, render_courtyard, render_view, ring_camera
+from gsbench.scene.courtyard.render import (
+    courtyard_cameras,
+    render_courtyard,
+    render_view,
+    ring_camera,
+)
 from gsbench.scene.load import load_scene
 from gsbench.scene.readers import read_colmap
 from tests.scene.cameras import cameras_of
@@ -27,12 +32,20 @@ def capture_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("threads", [1, 5])
-def test_same_arguments_same_bytes(capture_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, threads: int):
+def test_same_arguments_same_bytes(
+    capture_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, threads: int
+):
     monkeypatch.setattr("gsbench.scene.courtyard.render.available_threads", lambda: threads)
     told = []
-    render_courtyard(tmp_path, views=4, width=160, height=120, progress=lambda *state: told.append(state))
+    render_courtyard(
+        tmp_path, views=4, width=160, height=120, progress=lambda *state: told.append(state)
+    )
     assert told == [("courtyard", done, 4) for done in range(1, 5)]
-    names = sorted(path.relative_to(capture_dir).as_posix() for path in capture_dir.rglob("*") if path.is_file())
+    names = sorted(
+        path.relative_to(capture_dir).as_posix()
+        for path in capture_dir.rglob("*")
+        if path.is_file()
+    )
     same, different, failed = filecmp.cmpfiles(capture_dir, tmp_path, names, shallow=False)
     assert len(same) == len(names) >= 7
     assert not different
@@ -54,12 +67,18 @@ def test_neighbouring_views_are_close(views: int):
     centers = np.array([camera.center for camera in courtyard_cameras(views, 40, 30).values()])
     azimuth = np.degrees(np.unwrap(np.arctan2(centers[:, 1], centers[:, 0])))
     assert np.abs(np.diff(azimuth)).max() <= 7.5 + 1e-9
-    assert 4.0 < np.linalg.norm(centers[:, :2], axis=1).min() < np.linalg.norm(centers[:, :2], axis=1).max() < 5.0
+    assert (
+        4.0
+        < np.linalg.norm(centers[:, :2], axis=1).min()
+        < np.linalg.norm(centers[:, :2], axis=1).max()
+        < 5.0
+    )
     assert surface_distance(centers).min() > 0.5  # no camera in or at a thing
 
 
 def test_a_surface_point_looks_alike_from_two_views():
-    """Project lawn points by the pinhole formula alone into two neighbouring views: the colours agree."""
+    """Project lawn points by the pinhole formula alone into two neighbouring views: the colours
+    agree."""
     layout = build_layout(0)
     a, b = list(courtyard_cameras(48, 400, 300).values())[10:12]
     images = [render_view(layout, camera, 0).astype(float) for camera in (a, b)]
@@ -162,11 +181,21 @@ def test_surface_distance_against_dense_samples_of_the_surfaces():
     on_spheres = layout.center[spheres] + layout.size[spheres, :1] * directions
     faces = rng.uniform(-1, 1, (len(boxes), 3))
     faces[np.arange(len(boxes)), rng.integers(0, 3, len(boxes))] = 1.0
-    on_boxes = layout.center[boxes] + np.einsum("bij,bj->bi", layout.rotation[boxes], faces * layout.size[boxes, :3])
-    on_tube = np.array([[0.8, 0.0, 0.4], [0.58, 0.0, 0.6], [0.7 * np.cos(2), 0.7 * np.sin(2), 0.81]])  # the well
-    assert surface_distance(np.concatenate([on_spheres, on_boxes, on_tube, [[3.1, 3.1, 0.0]]])).max() < 1e-9
+    on_boxes = layout.center[boxes] + np.einsum(
+        "bij,bj->bi", layout.rotation[boxes], faces * layout.size[boxes, :3]
+    )
+    # the well
+    on_tube = np.array(
+        [[0.8, 0.0, 0.4], [0.58, 0.0, 0.6], [0.7 * np.cos(2), 0.7 * np.sin(2), 0.81]]
+    )
+    assert (
+        surface_distance(np.concatenate([on_spheres, on_boxes, on_tube, [[3.1, 3.1, 0.0]]])).max()
+        < 1e-9
+    )
     # on open lawn the ground is nearest; high above everything the roof tops are
-    np.testing.assert_allclose(surface_distance(np.array([[-2.5, 3.6, 0.2], [-2.5, 3.6, -0.1]])), [0.2, 0.1], atol=1e-9)
+    np.testing.assert_allclose(
+        surface_distance(np.array([[-2.5, 3.6, 0.2], [-2.5, 3.6, -0.1]])), [0.2, 0.1], atol=1e-9
+    )
     assert surface_distance(np.array([[0.0, 0.0, 8.0]]))[0] > 4
     assert surface_distance(np.array([[0.0, 0.0, 8.0]]), limit=0.5)[0] == 0.5
 

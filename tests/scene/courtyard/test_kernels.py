@@ -1,6 +1,8 @@
-"""What a ray meets, against dense samples of it and against trying every primitive; and the pinned textures.
+"""What a ray meets, against dense samples of it and against trying every primitive; and the pinned
+textures.
 
-The functions run as plain Python here: nothing is compiled, and the pinned values are the same on every processor.
+The functions run as plain Python here: nothing is compiled, and the pinned values are the same on
+every processor.
 """
 
 from __future__ import annotations
@@ -39,7 +41,9 @@ SHAPES = {
 }
 
 
-def is_inside(kind: int, size: tuple[float, float, float], points: NDArray[np.float64]) -> NDArray[np.bool_]:
+def is_inside(
+    kind: int, size: tuple[float, float, float], points: NDArray[np.float64]
+) -> NDArray[np.bool_]:
     """Which of ``points`` [P, 3] lie in the solid; [P]."""
     if kind == BOX:
         return (np.abs(points) < size).all(axis=-1)
@@ -49,13 +53,17 @@ def is_inside(kind: int, size: tuple[float, float, float], points: NDArray[np.fl
     return (radii < size[0]) & (radii > size[2]) & (np.abs(points[:, 2]) < size[1])
 
 
-def rays(seed: int, count: int, reach: float) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+def rays(
+    seed: int, count: int, reach: float
+) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
     """Origins and unit directions: from around a place towards it, some of them along an axis."""
     rng = np.random.default_rng(seed)
     directions = rng.normal(size=(count, 3))
     directions[: count // 4] = np.eye(3)[rng.integers(0, 3, count // 4)]
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    return list(zip(rng.uniform(-0.7, 0.7, (count, 3)) - reach * directions, directions, strict=True))
+    return list(
+        zip(rng.uniform(-0.7, 0.7, (count, 3)) - reach * directions, directions, strict=True)
+    )
 
 
 @pytest.mark.parametrize("name", SHAPES)
@@ -87,13 +95,18 @@ def test_normals_are_the_gradient_of_the_distance(name: str) -> None:
             continue
         tried += 1
         point = origin + t * direction
-        moved = [[PLAIN.signed_distance(kind, size, *(point + s * step)) for s in (1, -1)] for step in 1e-6 * np.eye(3)]
+        moved = [
+            [PLAIN.signed_distance(kind, size, *(point + s * step)) for s in (1, -1)]
+            for step in 1e-6 * np.eye(3)
+        ]
         *normal, u, v = PLAIN.local_normal(kind, size, *point)
         np.testing.assert_allclose(normal, np.diff(moved, axis=1)[:, 0] / -2e-6, atol=1e-4)
         assert np.dot(normal, direction) < 0
         x, y, z = point
         if kind == BOX:  # along the longer side of the face, then along the other
-            along = sorted((axis for axis in range(3) if normal[axis] == 0), key=lambda axis: -size[axis])
+            along = sorted(
+                (axis for axis in range(3) if normal[axis] == 0), key=lambda axis: -size[axis]
+            )
             assert [u, v] == [point[axis] for axis in along]
         elif kind == TUBE:
             on_end = abs(normal[2]) == 1
@@ -112,7 +125,13 @@ def test_the_first_hit_is_that_of_trying_every_primitive() -> None:
         ]
         ground = -origin[2] / direction[2] if direction[2] < 0 else inf
         expected = min(ground, *local)
-        index = PLAIN.SKY if expected == inf else PLAIN.GROUND if expected == ground else int(np.argmin(local))
+        index = (
+            PLAIN.SKY
+            if expected == inf
+            else PLAIN.GROUND
+            if expected == ground
+            else int(np.argmin(local))
+        )
         t, hit = PLAIN.cast(LAYOUT, *origin, *direction, False)
         assert (hit, t) == (index, pytest.approx(expected))
         _, anything = PLAIN.cast(LAYOUT, *origin, *direction, True)
@@ -124,7 +143,9 @@ def test_the_first_hit_is_that_of_trying_every_primitive() -> None:
 
 def test_the_nearest_surface_is_that_of_trying_every_primitive() -> None:
     rng = np.random.default_rng(5)
-    for point in np.concatenate([rng.uniform([-7, -7, 0], [7, 7, 3], (40, 3)), LAYOUT.center[::6] + 0.1]):
+    for point in np.concatenate(
+        [rng.uniform([-7, -7, 0], [7, 7, 3], (40, 3)), LAYOUT.center[::6] + 0.1]
+    ):
         distances = [
             abs(PLAIN.signed_distance(kind, size, *((point - center) @ turn)))
             for kind, center, turn, size in zip(*SOLIDS, strict=True)
@@ -154,7 +175,8 @@ PINNED = {
 
 @pytest.mark.parametrize("name", PINNED)
 def test_textures_are_those_of_this_version(name: str) -> None:
-    """Lightness and warmth, or a colour, at points near and far: raise the courtyard's VERSION where they change."""
+    """Lightness and warmth, or a colour, at points near and far: raise the courtyard's VERSION
+    where they change."""
     rng = np.random.default_rng(6)
     values = []
     for footprint in (0.0005, 0.004, 0.015, 0.05, 0.2):
@@ -164,12 +186,18 @@ def test_textures_are_those_of_this_version(name: str) -> None:
             elif name == "SKY":
                 values.append(PLAIN.sky(px, py, pz, 3))
             else:
-                values.append(PLAIN.shade_factors(getattr(layout, name), px, py, pz, u, v, footprint, 3))
                 values.append(
-                    PLAIN.shade_factors(getattr(layout, name), u / 8, v / 8, 0.45, u / 8, v / 8, footprint, 3)
+                    PLAIN.shade_factors(getattr(layout, name), px, py, pz, u, v, footprint, 3)
+                )
+                values.append(
+                    PLAIN.shade_factors(
+                        getattr(layout, name), u / 8, v / 8, 0.45, u / 8, v / 8, footprint, 3
+                    )
                 )
     assert np.isfinite(values).all()
-    assert fingerprint(np.array(values)) == pytest.approx(PINNED[name], rel=1e-9), fingerprint(np.array(values))
+    assert fingerprint(np.array(values)) == pytest.approx(PINNED[name], rel=1e-9), fingerprint(
+        np.array(values)
+    )
 
 
 def test_noise_is_its_cells_at_their_corners_and_smooth_between() -> None:
@@ -179,7 +207,14 @@ def test_noise_is_its_cells_at_their_corners_and_smooth_between() -> None:
         assert PLAIN.noise3(i, 4 - i, 0, 7) == pytest.approx(corner)
         for x, y in ((i + 1e-4, 4 - i), (i - 1e-4, 4 - i), (i, 4 - i + 1e-4), (i, 4 - i - 1e-4)):
             assert PLAIN.noise2(x, y, 7) == pytest.approx(corner, abs=1e-9)  # no slope at a corner
-    cells = np.array([PLAIN.random_cell(i, j, k, 0) for i in range(-8, 8) for j in range(-8, 8) for k in range(4)])
+    cells = np.array(
+        [
+            PLAIN.random_cell(i, j, k, 0)
+            for i in range(-8, 8)
+            for j in range(-8, 8)
+            for k in range(4)
+        ]
+    )
     assert 0 <= cells.min() < 0.01 < 0.99 < cells.max() < 1
     counts, _ = np.histogram(cells, bins=8, range=(0, 1))
     assert np.abs(counts - 128).max() < 5 * 128**0.5
@@ -188,7 +223,9 @@ def test_noise_is_its_cells_at_their_corners_and_smooth_between() -> None:
 def test_pebbles_are_the_two_nearest_of_all_feature_points() -> None:
     rng = np.random.default_rng(8)
     cells = [(i, j) for i in range(-9, 9) for j in range(-9, 9)]
-    places = np.array([[i + PLAIN.random_cell(i, j, 1, 2), j + PLAIN.random_cell(i, j, 2, 2)] for i, j in cells])
+    places = np.array(
+        [[i + PLAIN.random_cell(i, j, 1, 2), j + PLAIN.random_cell(i, j, 2, 2)] for i, j in cells]
+    )
     for x, y in rng.uniform(-1, 1, (40, 2)):
         distances = np.linalg.norm(places - [x / 0.2, y / 0.2], axis=1)
         nearest, second = np.argsort(distances)[:2]

@@ -1,4 +1,5 @@
-"""The report as one HTML file: it needs no network and no other file, and can be read without JavaScript."""
+"""The report as one HTML file: it needs no network and no other file, and can be read without
+JavaScript."""
 
 import itertools
 import math
@@ -54,14 +55,17 @@ Curve = list[tuple[float, float]]
 
 
 def build_report(experiment: Experiment, baseline: str = BASELINE) -> str:
-    """The report as HTML, made from the experiment's files alone; every densifier is compared with ``baseline``."""
+    """The report as HTML, made from the experiment's files alone; every densifier is compared with
+    ``baseline``."""
     trials, pairs = compared_pairs(experiment, baseline)
     arms = sorted({trial.arm for trial in trials})
     declared = active_declaration(experiment.folder, trials)
     judged = verdicts.judge_pairs(trials, pairs, declared)
     quantity = next((one.declared for one in judged if one.declared is not None), None)
     paper_table = layout_of(experiment.name)
-    tables = [build_table(experiment)] if paper_table is None else paper_tables(experiment, paper_table)
+    tables = (
+        [build_table(experiment)] if paper_table is None else paper_tables(experiment, paper_table)
+    )
     volumes, volume_notes = volume_charts(trials, arms)
     return fill(
         "report.html.j2",
@@ -76,14 +80,19 @@ def build_report(experiment: Experiment, baseline: str = BASELINE) -> str:
         families=verdicts.families(judged),
         # The top of the page has the notes on verdicts.
         tables=[
-            replace(one, notes=tuple(note for note in one.notes if not note.startswith(verdicts.VERDICT)))
+            replace(
+                one,
+                notes=tuple(note for note in one.notes if not note.startswith(verdicts.VERDICT)),
+            )
             for one in with_agreement(tables)
         ],
         ranks=[rank_plot(one) for one in rank_all(trials, choose_quantities(trials)) if pairs],
         contradictions=[] if paper_table is None else load_paper().contradictions,
         search=search_summary(experiment.folder),
         say=verdicts,
-        signed=lambda value, decimals: "unknown" if value is None else signed(value, f".{decimals}f"),
+        signed=lambda value, decimals: (
+            "unknown" if value is None else signed(value, f".{decimals}f")
+        ),
         training=training_charts(trials, arms),
         event_table=event_table(trials, arms),
         events=event_charts(trials, arms),
@@ -96,7 +105,8 @@ def build_report(experiment: Experiment, baseline: str = BASELINE) -> str:
 
 
 def trial_figures(trials: Sequence[TrialResult]) -> list[tuple[str, str]]:
-    """(caption, data URI) of the pictures in trials' ``figures`` folders, for one seed of each scene and arm.
+    """(caption, data URI) of the pictures in trials' ``figures`` folders, for one seed of each
+    scene and arm.
 
     A picture that arms of a scene share, such as that of their initial cloud, appears once.
     """
@@ -106,7 +116,9 @@ def trial_figures(trials: Sequence[TrialResult]) -> list[tuple[str, str]]:
         for path in sorted((trial.path / layout.FIGURES).glob("*.png")):
             key = path.stem.replace("_", " "), trial.scene, png_uri(read_image(path))
             sources.setdefault(key, []).append(f"{trial.init}-{trial.densify}, seed {trial.seed}")
-    return [(f"{name}: {scene}, {'; '.join(arms)}", uri) for (name, scene, uri), arms in sources.items()]
+    return [
+        (f"{name}: {scene}, {'; '.join(arms)}", uri) for (name, scene, uri), arms in sources.items()
+    ]
 
 
 def compare_arms(trials: Sequence[TrialResult], judged: PairVerdicts) -> dict[str, Any]:
@@ -126,7 +138,9 @@ def compare_arms(trials: Sequence[TrialResult], judged: PairVerdicts) -> dict[st
     }
 
 
-def show_votes(verdict: RoundVerdict, trials: Sequence[TrialResult], judged: Sequence[PairVerdicts]) -> dict[str, Any]:
+def show_votes(
+    verdict: RoundVerdict, trials: Sequence[TrialResult], judged: Sequence[PairVerdicts]
+) -> dict[str, Any]:
     """Everything that the page shows of a round of people's votes."""
     views, faults = [], list[str]()
     for pair in verdict.pairs:
@@ -155,7 +169,8 @@ def _costs(trials: Sequence[TrialResult], first: Arm, second: Arm) -> list[str]:
 
 
 def _spread_of_times(trials: Sequence[TrialResult]) -> str:
-    """Say how far the training times of equal trials differ: a smaller change of times means nothing."""
+    """Say how far the training times of equal trials differ: a smaller change of times means
+    nothing."""
     cells = group_by(trials, lambda trial: (trial.arm, trial.scene)).values()
     times = [[t for trial in cell if (t := COSTS["train_time"][1](trial))] for cell in cells]
     spread = max((max(own) / min(own) - 1 for own in times if own), default=0.0)
@@ -166,8 +181,12 @@ def _forest(verdict: Verdict) -> str:
     rows = [ForestRow(scene.scene, scene.mean, scene.interval) for scene in verdict.scenes]
     if len(rows) > 1:
         rows.append(ForestRow("mean of scenes", verdict.mean or 0.0, verdict.interval))
-    better = "right of zero is better" if verdict.quantity.direction == 1 else "left of zero is better"
-    return forest_plot(f"{verdict.quantity.name}: {better}", rows, "difference", verdict.quantity.direction)
+    better = (
+        "right of zero is better" if verdict.quantity.direction == 1 else "left of zero is better"
+    )
+    return forest_plot(
+        f"{verdict.quantity.name}: {better}", rows, "difference", verdict.quantity.direction
+    )
 
 
 def training_charts(trials: Sequence[TrialResult], arms: Sequence[Arm]) -> list[str]:
@@ -175,29 +194,53 @@ def training_charts(trials: Sequence[TrialResult], arms: Sequence[Arm]) -> list[
     keys = [key for key, _, _ in CURVES]
     means = {arm: _mean_curves(_trials_of(trials, arm), layout.CURVES, keys) for arm in arms}
     charts = [
-        line_chart(title, [(str(arm), curves[key]) for arm, curves in means.items()], "iteration", y_label)
+        line_chart(
+            title, [(str(arm), curves[key]) for arm, curves in means.items()], "iteration", y_label
+        )
         for key, title, y_label in CURVES
     ]
     return [chart for chart in charts if chart]
 
 
 def event_table(trials: Sequence[TrialResult], arms: Sequence[Arm]) -> Table | None:
-    """A row per cause of growth or pruning, with the mean number of Gaussians per arm; None if nothing was logged."""
+    """A row per cause of growth or pruning, with the mean number of Gaussians per arm; None if
+    nothing was logged."""
     rows = []
     for cause in EVENT_CAUSES:
-        means = [fmean(float(trial.record.events.get(cause, 0)) for trial in _trials_of(trials, arm)) for arm in arms]
+        means = [
+            fmean(float(trial.record.events.get(cause, 0)) for trial in _trials_of(trials, arm))
+            for arm in arms
+        ]
         if any(means):
-            rows.append(Row((cause.replace("_", " "),), tuple(TableEntry(f"{mean:,.0f}") for mean in means)))
+            rows.append(
+                Row((cause.replace("_", " "),), tuple(TableEntry(f"{mean:,.0f}") for mean in means))
+            )
     columns = tuple(Column("", str(arm), ("events", str(arm))) for arm in arms)
-    return Table("Gaussians by cause, mean of a trial", ("cause",), columns, tuple(rows)) if rows else None
+    return (
+        Table("Gaussians by cause, mean of a trial", ("cause",), columns, tuple(rows))
+        if rows
+        else None
+    )
 
 
 def event_charts(trials: Sequence[TrialResult], arms: Sequence[Arm]) -> list[str]:
     """Events by cause over the iterations of each arm."""
-    means = {arm: _mean_curves(_trials_of(trials, arm), layout.EVENTS, EVENT_CAUSES) for arm in arms}
-    causes = [cause for cause in EVENT_CAUSES if any(count for own in means.values() for _, count in own[cause])]
-    series = {arm: [(cause.replace("_", " "), own[cause]) for cause in causes] for arm, own in means.items()}
-    charts = [line_chart(f"Refinement over time: {arm}", own, "iteration", "Gaussians") for arm, own in series.items()]
+    means = {
+        arm: _mean_curves(_trials_of(trials, arm), layout.EVENTS, EVENT_CAUSES) for arm in arms
+    }
+    causes = [
+        cause
+        for cause in EVENT_CAUSES
+        if any(count for own in means.values() for _, count in own[cause])
+    ]
+    series = {
+        arm: [(cause.replace("_", " "), own[cause]) for cause in causes]
+        for arm, own in means.items()
+    }
+    charts = [
+        line_chart(f"Refinement over time: {arm}", own, "iteration", "Gaussians")
+        for arm, own in series.items()
+    ]
     return [chart for chart in charts if chart]
 
 
@@ -206,7 +249,8 @@ def _trials_of(trials: Sequence[TrialResult], arm: Arm) -> list[TrialResult]:
 
 
 def _mean_curves(trials: Sequence[TrialResult], name: str, keys: Sequence[str]) -> dict[str, Curve]:
-    """The mean curve over trials of each key in the trials' file ``name``; each file is read once."""
+    """The mean curve over trials of each key in the trials' file ``name``; each file is read
+    once."""
     curves_by_key: dict[str, list[Curve]] = {key: [] for key in keys}
     for trial in trials:
         rows = trial.folder.curves(name)
@@ -224,21 +268,33 @@ def mean_by_step(curves: Sequence[Curve]) -> Curve:
     return [(step, fmean(curve[step] for curve in filled)) for step in shared]
 
 
-def volume_charts(trials: Sequence[TrialResult], arms: Sequence[Arm]) -> tuple[list[str], list[str]]:
-    """(charts, notes): histograms of the Gaussians' volumes, for final models and for logged iterations."""
+def volume_charts(
+    trials: Sequence[TrialResult], arms: Sequence[Arm]
+) -> tuple[list[str], list[str]]:
+    """(charts, notes): histograms of the Gaussians' volumes, for final models and for logged
+    iterations."""
     threshold = _threshold(trials)
     final: list[tuple[str, Curve]] = []
     notes = []
     for arm in arms:
         try:
-            volumes = np.concatenate([_volumes_in_training(trial) for trial in _trials_of(trials, arm)])
+            volumes = np.concatenate(
+                [_volumes_in_training(trial) for trial in _trials_of(trials, arm)]
+            )
         except InputError as error:
             notes.append(f"{arm}: no histogram, {error}")
             continue
         final.append((str(arm), histogram(volumes)))
         if threshold:
-            notes.append(f"{arm}: {np.mean(volumes > math.log10(threshold)):.2%} of volumes exceed {threshold:g}.")
-    charts = [line_chart("Volumes of the trained Gaussians", final, *VOLUME_AXES, log=True, marker=threshold)]
+            notes.append(
+                f"{arm}: {np.mean(volumes > math.log10(threshold)):.2%} of volumes exceed "
+                f"{threshold:g}."
+            )
+    charts = [
+        line_chart(
+            "Volumes of the trained Gaussians", final, *VOLUME_AXES, log=True, marker=threshold
+        )
+    ]
     for arm in arms:
         histograms = _logged_histograms(_trials_of(trials, arm))
         logged = [(f"iteration {step}", curve) for step, curve in histograms.items()]
@@ -248,12 +304,16 @@ def volume_charts(trials: Sequence[TrialResult], arms: Sequence[Arm]) -> tuple[l
 
 
 def _volumes_in_training(trial: TrialResult) -> NDArray[np.float64]:
-    """log10 of the volumes [N] of a trial's Gaussians, in cubed units of its training, as V_th is."""
-    return log10_volumes(trial.path / layout.POINT_CLOUD) + 3 * math.log10(trial.record.to_training.scale)
+    """log10 of the volumes [N] of a trial's Gaussians, in cubed units of its training, as V_th
+    is."""
+    return log10_volumes(trial.path / layout.POINT_CLOUD) + 3 * math.log10(
+        trial.record.to_training.scale
+    )
 
 
 def log10_volumes(path: Path) -> NDArray[np.float64]:
-    """log10 of the volumes ``4/3 π s1 s2 s3`` [N] of a 3DGS PLY, whose scales are natural logarithms.
+    """log10 of the volumes ``4/3 π s1 s2 s3`` [N] of a 3DGS PLY, whose scales are natural
+    logarithms.
 
     Raises `InputError` for a file that cannot be read as a 3DGS PLY.
     """
@@ -261,25 +321,37 @@ def log10_volumes(path: Path) -> NDArray[np.float64]:
 
     try:
         vertices = PlyData.read(path)["vertex"]
-        logs = np.sum([np.asarray(vertices[f"scale_{axis}"], dtype=np.float64) for axis in range(3)], axis=0)
+        logs = np.sum(
+            [np.asarray(vertices[f"scale_{axis}"], dtype=np.float64) for axis in range(3)], axis=0
+        )
     except (OSError, ValueError, KeyError, PlyParseError) as error:
         raise InputError(f"{path} is not a readable 3DGS PLY ({error})") from None
     return np.asarray(LOG10_SPHERE + logs / math.log(10))
 
 
 def histogram(volumes: NDArray[np.float64]) -> Curve:
-    """(volume, share) of each filled bin of a quarter decade, from the finite log10 ``volumes`` [N]."""
+    """(volume, share) of each filled bin of a quarter decade, from the finite log10 ``volumes``
+    [N]."""
     finite = volumes[np.isfinite(volumes)]
     bins, counts = np.unique(np.floor(finite / BIN_WIDTH), return_counts=True)
-    return list(zip((10 ** ((bins + 0.5) * BIN_WIDTH)).tolist(), (counts / len(finite)).tolist(), strict=True))
+    return list(
+        zip(
+            (10 ** ((bins + 0.5) * BIN_WIDTH)).tolist(),
+            (counts / len(finite)).tolist(),
+            strict=True,
+        )
+    )
 
 
 def _logged_histograms(trials: Sequence[TrialResult]) -> dict[int, Curve]:
-    """The logged histograms by iteration, pooled over trials, as (volume at the bin's centre, share)."""
+    """The logged histograms by iteration, pooled over trials, as (volume at the bin's centre,
+    share)."""
     pooled: dict[int, dict[float, float]] = defaultdict(lambda: defaultdict(float))
     for trial in trials:
         for row in trial.folder.curves(layout.HISTOGRAMS, Histogram):
-            for (low, high), count in zip(itertools.pairwise(row.log10_edges), row.counts, strict=True):
+            for (low, high), count in zip(
+                itertools.pairwise(row.log10_edges), row.counts, strict=True
+            ):
                 pooled[row.step][10 ** ((low + high) / 2)] += count
     return {
         step: [(volume, count / total) for volume, count in sorted(bins.items()) if count]
@@ -289,14 +361,17 @@ def _logged_histograms(trials: Sequence[TrialResult]) -> dict[int, Curve]:
 
 
 def _threshold(trials: Sequence[TrialResult]) -> float | None:
-    """The absolute volume threshold (cubed scene units), if all arms that have one have the same; else None."""
+    """The absolute volume threshold (cubed scene units), if all arms that have one have the same;
+    else None."""
     configs = [group[0].config for group in group_by(trials, lambda trial: trial.arm).values()]
     thresholds = [
         config["densify.volume_threshold"]
         for config in configs
-        if config.get("densify.threshold_mode", "absolute") == "absolute" and "densify.volume_threshold" in config
+        if config.get("densify.threshold_mode", "absolute") == "absolute"
+        and "densify.volume_threshold" in config
     ]
-    are_numbers = all(isinstance(value, int | float) for value in thresholds)  # a damaged file may hold anything
+    # a damaged file may hold anything
+    are_numbers = all(isinstance(value, int | float) for value in thresholds)
     return float(thresholds[0]) if are_numbers and len(set(thresholds)) == 1 else None
 
 
@@ -308,7 +383,9 @@ def provenance(trials: Sequence[TrialResult]) -> Table:
             "protocol": trial.record.protocol,
             "iterations": str(trial.record.iterations),
             **{f"{key} hash": str(value)[:12] for key, value in trial.record.hashes.items()},
-            "code": ", ".join(f"{part} {short_version(version)}" for part, version in trial.code.items()),
+            "code": ", ".join(
+                f"{part} {short_version(version)}" for part, version in trial.code.items()
+            ),
             "machine": trial.machine or "",
             "versions": ", ".join(f"{key} {value}" for key, value in trial.record.versions.items()),
         }
@@ -324,13 +401,21 @@ def provenance(trials: Sequence[TrialResult]) -> Table:
 
 
 def search_summary(home: Path) -> tuple[str, str] | None:
-    """A line on the experiment's search, and its chart as SVG; None if there is no search or it cannot be read."""
+    """A line on the experiment's search, and its chart as SVG; None if there is no search or it
+    cannot be read."""
     record = read_if_sound(home / layout.TUNING, TuningRecord)
     if record is None:
         return None
-    done = [(number, point, point.value) for number, point in enumerate(record.points, 1) if point.value is not None]
+    done = [
+        (number, point, point.value)
+        for number, point in enumerate(record.points, 1)
+        if point.value is not None
+    ]
     failed = len(record.points) - len(done)
-    count = f"{len(record.points)} of {counted(record.wanted, 'point')}, each {counted(len(record.seeds), 'seed')}"
+    count = (
+        f"{len(record.points)} of {counted(record.wanted, 'point')}, each "
+        f"{counted(len(record.seeds), 'seed')}"
+    )
     count += f"; {failed} failed" if failed else ""
     if not done:
         return f"{count}; none has a result yet.", ""

@@ -1,6 +1,7 @@
 """Charts as inline SVG, without script or network, each with a description in words.
 
-This module computes positions; the templates ``line_chart``, ``forest_plot`` and ``rank_plot`` write the elements.
+This module computes positions; the templates ``line_chart``, ``forest_plot`` and ``rank_plot``
+write the elements.
 """
 
 import itertools
@@ -17,7 +18,8 @@ from gsbench.words import true_minus
 WIDTH, HEIGHT = 380, 250  # px at full size; text is 12 px
 LEFT, RIGHT, TOP, BOTTOM = 58, 18, 26, 44  # margins
 FOREST_LEFT, FOREST_TOP, FOREST_ROW = 132, 12, 26
-COLORS = ("#4477aa", "#cc3311", "#228833", "#aa3377", "#b8860b", "#0099a8")  # distinct for colour-blind readers
+# distinct for colour-blind readers
+COLORS = ("#4477aa", "#cc3311", "#228833", "#aa3377", "#b8860b", "#0099a8")
 DASHES = ("", "6 3", "2 3", "8 3 2 3", "1 2", "10 4")
 TICKS = 5
 THOUSANDS = 1e4  # numbers from here on are written with k or M
@@ -34,7 +36,8 @@ class ForestRow:
     interval: Interval | None = None
 
     def color(self, better: int) -> str:
-        """Grey if the interval contains 0 or is unknown, green on the side of the sign ``better``, else red."""
+        """Grey if the interval contains 0 or is unknown, green on the side of the sign ``better``,
+        else red."""
         if self.interval is None or not self.interval.excludes_zero():
             return "#555555"
         return "#1b7837" if self.mean * better > 0.0 else "#b2182b"
@@ -48,22 +51,38 @@ def line_chart(
     log: bool = False,
     marker: float | None = None,
 ) -> str:
-    """Named lines over common axes, both linear or both logarithmic (``log``); "" without any point.
+    """Named lines over common axes, both linear or both logarithmic (``log``); "" without any
+    point.
 
     ``marker`` is the x of a vertical line. Points that a logarithmic axis cannot show are dropped.
     """
-    shown = [(name, [(x, y) for x, y in points if not log or (x > 0 and y > 0)]) for name, points in series]
+    shown = [
+        (name, [(x, y) for x, y in points if not log or (x > 0 and y > 0)])
+        for name, points in series
+    ]
     shown = [(name, points) for name, points in shown if points]
     if not shown:
         return ""
     all_points = [point for _, points in shown for point in points]
-    x = Axis([x for x, _ in all_points] + ([] if marker is None else [marker]), log, LEFT, WIDTH - RIGHT)
+    x = Axis(
+        [x for x, _ in all_points] + ([] if marker is None else [marker]), log, LEFT, WIDTH - RIGHT
+    )
     y = Axis([y for _, y in all_points], log, HEIGHT - BOTTOM, TOP)
     lines = [
-        {"name": name, "points": [(x.to_px(a), y.to_px(b)) for a, b in points], "color": color, "dash": dash}
-        for (name, points), color, dash in zip(shown, itertools.cycle(COLORS), itertools.cycle(DASHES), strict=False)
+        {
+            "name": name,
+            "points": [(x.to_px(a), y.to_px(b)) for a, b in points],
+            "color": color,
+            "dash": dash,
+        }
+        for (name, points), color, dash in zip(
+            shown, itertools.cycle(COLORS), itertools.cycle(DASHES), strict=False
+        )
     ]
-    words = f"{title}. {y_label} against {x_label}: {'; '.join(f'{name} {_ends(points)}' for name, points in shown)}."
+    words = (
+        f"{title}. {y_label} against {x_label}: "
+        f"{'; '.join(f'{name} {_ends(points)}' for name, points in shown)}."
+    )
     marked = None if marker is None else (x.to_px(marker), f"V_th {marker:g}")
     return fill(
         "line_chart.html.j2",
@@ -82,14 +101,23 @@ def line_chart(
 
 
 def forest_plot(title: str, rows: Sequence[ForestRow], x_label: str, better: int) -> str:
-    """Differences with intervals, one per row, and a line at 0; ``better`` is the sign of an improvement."""
+    """Differences with intervals, one per row, and a line at 0; ``better`` is the sign of an
+    improvement."""
     if not rows:
         return ""
     intervals = [row.interval for row in rows if row.interval is not None]
-    ends = [0.0, *(row.mean for row in rows), *(end for one in intervals for end in (one.low, one.high))]
+    ends = [
+        0.0,
+        *(row.mean for row in rows),
+        *(end for one in intervals for end in (one.low, one.high)),
+    ]
     words = [
         f"{row.label} {short_number(row.mean)}"
-        + (f", interval {short_number(row.interval.low)} to {short_number(row.interval.high)}" if row.interval else "")
+        + (
+            f", interval {short_number(row.interval.low)} to {short_number(row.interval.high)}"
+            if row.interval
+            else ""
+        )
         for row in rows
     ]
     bottom = FOREST_TOP + FOREST_ROW * len(rows)
@@ -97,7 +125,10 @@ def forest_plot(title: str, rows: Sequence[ForestRow], x_label: str, better: int
         "forest_plot.html.j2",
         title=title,
         words=f"{title}. {x_label}. {'; '.join(words)}.",
-        rows=[(FOREST_TOP + FOREST_ROW * (k + 0.5), row, row.color(better)) for k, row in enumerate(rows)],
+        rows=[
+            (FOREST_TOP + FOREST_ROW * (k + 0.5), row, row.color(better))
+            for k, row in enumerate(rows)
+        ],
         x=Axis(ends, False, FOREST_LEFT, WIDTH - RIGHT, ticks=3),
         x_label=x_label,
         width=WIDTH,
@@ -112,7 +143,8 @@ LETTER = 6.6  # px, a letter of 12 px on average
 
 
 def rank_plot(ranking: Ranking) -> str:
-    """Mean ranks, one arm per row. A bar at the right joins arms that do not differ, the scale shows what would."""
+    """Mean ranks, one arm per row. A bar at the right joins arms that do not differ, the scale
+    shows what would."""
     names, count, groups = [str(arm) for arm in ranking.arms], len(ranking.scenes), ranking.groups
     left = 20 + LETTER * max(map(len, names))
     right = left + max(160.0, WIDTH - left - 30)
@@ -121,17 +153,26 @@ def rank_plot(ranking: Ranking) -> str:
     def to_px(rank: float) -> float:
         return left + (rank - 1) / (len(names) - 1) * (right - left)
 
-    listed = ", ".join(f"{name} {rank:.2f}" for name, rank in zip(names, ranking.ranks, strict=True))
+    listed = ", ".join(
+        f"{name} {rank:.2f}" for name, rank in zip(names, ranking.ranks, strict=True)
+    )
     joined = "; ".join(f"{names[first]} to {names[last]}" for first, last in groups) or "none"
     critical = f"{ranking.critical:.2f}"
-    friedman = "" if ranking.p is None else f" Friedman's test that no arm differs: p {p_text(ranking.p)}."
+    friedman = (
+        "" if ranking.p is None else f" Friedman's test that no arm differs: p {p_text(ranking.p)}."
+    )
     return fill(
         "rank_plot.html.j2",
         title=f"{ranking.quantity.name}: ranks over {count} scenes",
-        words=f"Mean ranks, 1 is best: {listed}. Critical difference {critical}. Not different: {joined}.",
-        note=f"A bar joins arms whose ranks differ by less than the critical difference (CD, Nemenyi, 5 %).{friedman}",
+        words=f"Mean ranks, 1 is best: {listed}. Critical difference {critical}. Not different: "
+        f"{joined}.",
+        note="A bar joins arms whose ranks differ by less than the critical difference (CD, "
+        f"Nemenyi, 5 %).{friedman}",
         arms=list(zip(heights, names, ranking.ranks, strict=True)),
-        groups=[(right + 14 + GROUP_STEP * k, heights[a] - 6, heights[b] + 6) for k, (a, b) in enumerate(groups)],
+        groups=[
+            (right + 14 + GROUP_STEP * k, heights[a] - 6, heights[b] + 6)
+            for k, (a, b) in enumerate(groups)
+        ],
         critical=f"CD {critical}",
         scale=to_px(1 + ranking.critical) - to_px(1),
         x=to_px,
@@ -150,7 +191,9 @@ ROUND = (1, 2, 2.5, 5, 10)  # steps between ticks, as multiples of a power of te
 class Axis:
     """Maps values to pixels from ``start`` to ``end``, with ticks at round values."""
 
-    def __init__(self, values: Sequence[float], log: bool, start: float, end: float, ticks: int = TICKS) -> None:
+    def __init__(
+        self, values: Sequence[float], log: bool, start: float, end: float, ticks: int = TICKS
+    ) -> None:
         self._log, self.start, self.end = log, start, end
         scaled = [self._scale(value) for value in values]
         low, high = min(scaled), max(scaled)
@@ -185,7 +228,8 @@ class Axis:
 
 
 def _round_ticks(low: float, high: float, count: int) -> list[float]:
-    """About ``count`` round values from ``low`` to ``high``, but at least two, since one gives no scale."""
+    """About ``count`` round values from ``low`` to ``high``, but at least two, since one gives no
+    scale."""
     raw = (high - low) / count
     power = 10.0 ** math.floor(math.log10(raw))
     first = next(index for index, factor in enumerate(ROUND) if factor * power >= raw)
@@ -200,7 +244,9 @@ def _round_ticks(low: float, high: float, count: int) -> list[float]:
 def _ends(points: Points) -> str:
     """The first and the last point of a line in words."""
     (x0, y0), (x1, y1) = points[0], points[-1]
-    return f"from {short_number(y0)} at {short_number(x0)} to {short_number(y1)} at {short_number(x1)}"
+    return (
+        f"from {short_number(y0)} at {short_number(x0)} to {short_number(y1)} at {short_number(x1)}"
+    )
 
 
 def short_number(value: float) -> str:
@@ -209,5 +255,11 @@ def short_number(value: float) -> str:
     for limit, unit, suffix in ((1e6, 1e6, "M"), (THOUSANDS, 1e3, "k")):
         if magnitude >= limit:
             return true_minus(f"{value / unit:.3g}{suffix}")
-    text = f"{value:.0e}" if 0 < magnitude < 1e-4 else f"{value:.3g}" if magnitude < 1000 else f"{value:.0f}"
+    text = (
+        f"{value:.0e}"
+        if 0 < magnitude < 1e-4
+        else f"{value:.3g}"
+        if magnitude < 1000
+        else f"{value:.0f}"
+    )
     return true_minus(text)

@@ -1,4 +1,5 @@
-"""COLMAP's database: creating it with cameras and images, and adding keypoints and matches of any extractor."""
+"""COLMAP's database: creating it with cameras and images, and adding keypoints and matches of any
+extractor."""
 
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
@@ -17,16 +18,19 @@ from gsbench.scene.images import image_size, read_image
 from gsbench.scene.types import Capture
 
 COLMAP_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
-VERIFY_CALLS = 20  # COLMAP reports no progress within a call, so the pairs are divided over several calls
+# COLMAP reports no progress within a call, so the pairs are divided over several calls
+VERIFY_CALLS = 20
 MIN_PAIRS_PER_CALL = 50
 
 
-CameraGroups = Sequence[tuple[pycolmap.Camera, Sequence[str]]]  # each camera with the names of its images
+# each camera with the names of its images
+CameraGroups = Sequence[tuple[pycolmap.Camera, Sequence[str]]]
 
 
 @dataclass(frozen=True)
 class DatabaseTask:
-    """A database with cameras and images, to be filled with matches, and the pairs of images to match.
+    """A database with cameras and images, to be filled with matches, and the pairs of images to
+    match.
 
     ``images`` is a folder with the names of the capture in which COLMAP can read every file.
     """
@@ -42,8 +46,9 @@ class DatabaseTask:
 def readable_images(images: Path, names: Sequence[str], work_dir: Path) -> Path:
     """A folder in which COLMAP can read every image, under the same ``names``.
 
-    This is ``images`` if COLMAP can read all formats. Otherwise (WebP) it is a new folder below ``work_dir`` with links
-    to the readable files and PNG copies of the others. COLMAP recognises PNG content under any file name.
+    This is ``images`` if COLMAP can read all formats. Otherwise (WebP) it is a new folder below
+    ``work_dir`` with links to the readable files and PNG copies of the others. COLMAP recognises
+    PNG content under any file name.
     """
     unreadable = [name for name in names if Path(name).suffix.lower() not in COLMAP_SUFFIXES]
     if not unreadable:
@@ -61,7 +66,8 @@ def readable_images(images: Path, names: Sequence[str], work_dir: Path) -> Path:
 
 
 def colmap_masks(masks: Mapping[str, Path], work_dir: Path) -> Path | None:
-    """A folder below ``work_dir`` with links to the masks, named as COLMAP expects; None if there are no masks."""
+    """A folder below ``work_dir`` with links to the masks, named as COLMAP expects; None if there
+    are no masks."""
     if not masks:
         return None
     folder = work_dir / "masks"
@@ -73,8 +79,11 @@ def colmap_masks(masks: Mapping[str, Path], work_dir: Path) -> Path | None:
     return folder
 
 
-def reference_camera_groups(reference: pycolmap.Reconstruction) -> list[tuple[pycolmap.Camera, list[str]]]:
-    """The reference's cameras, as known ones, each with the sorted names of its images that have a pose."""
+def reference_camera_groups(
+    reference: pycolmap.Reconstruction,
+) -> list[tuple[pycolmap.Camera, list[str]]]:
+    """The reference's cameras, as known ones, each with the sorted names of its images that have a
+    pose."""
     groups: dict[int, list[str]] = {}
     for image in reference.images.values():
         if image.has_pose:
@@ -94,9 +103,10 @@ def unknown_camera_groups(
 ) -> list[tuple[pycolmap.Camera, list[str]]]:
     """Cameras to be estimated, each with the names of its images.
 
-    ``sharing`` is ``single`` for one camera for all images of a size, ``per_folder`` for one for each size in each
-    sub-folder, or ``per_image``. The initial focal length in px is ``focal_length``, else from the EXIF data of the
-    group's first image, else 1.2 x the longest side (COLMAP's default).
+    ``sharing`` is ``single`` for one camera for all images of a size, ``per_folder`` for one for
+    each size in each sub-folder, or ``per_image``. The initial focal length in px is
+    ``focal_length``, else from the EXIF data of the group's first image, else 1.2 x the longest
+    side (COLMAP's default).
     """
     groups: dict[tuple[object, ...], list[str]] = {}
     for name in names:
@@ -110,7 +120,9 @@ def unknown_camera_groups(
     for group in groups.values():
         camera = pycolmap.infer_camera_from_image(images / group[0], options)
         if focal_length is not None:
-            camera = pycolmap.Camera.create_from_model_name(0, model, focal_length, camera.width, camera.height)
+            camera = pycolmap.Camera.create_from_model_name(
+                0, model, focal_length, camera.width, camera.height
+            )
             camera.has_prior_focal_length = True
         result.append((camera, group))
     return result
@@ -119,8 +131,8 @@ def unknown_camera_groups(
 def create_database(path: Path, groups: CameraGroups) -> dict[str, int]:
     """Create a database with cameras and images but no features; returns the image ids by name.
 
-    The ids follow the sorted names. Because they are fixed here, extraction and matching give the same database on any
-    number of threads. Each camera gets its own rig.
+    The ids follow the sorted names. Because they are fixed here, extraction and matching give the
+    same database on any number of threads. Each camera gets its own rig.
     """
     path.unlink(missing_ok=True)
     camera_ids: dict[str, int] = {}
@@ -146,7 +158,8 @@ def create_database(path: Path, groups: CameraGroups) -> dict[str, int]:
 
 
 def write_keypoints(path: Path, keypoints: Mapping[str, NDArray[np.float32]]) -> None:
-    """Add ``keypoints`` [K, 2] by image name, in px of the image file; the centre of the first pixel is (0.5, 0.5)."""
+    """Add ``keypoints`` [K, 2] by image name, in px of the image file; the centre of the first
+    pixel is (0.5, 0.5)."""
     ids = image_ids(path)
     with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
         for name, points in keypoints.items():
@@ -154,7 +167,8 @@ def write_keypoints(path: Path, keypoints: Mapping[str, NDArray[np.float32]]) ->
 
 
 def write_matches(path: Path, matches: Mapping[tuple[str, str], NDArray[np.uint32]]) -> None:
-    """Add ``matches`` [M, 2] by pairs of image names: indices of keypoints in the first and the second image."""
+    """Add ``matches`` [M, 2] by pairs of image names: indices of keypoints in the first and the
+    second image."""
     ids = image_ids(path)
     with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
         for (first, second), indices in matches.items():
@@ -162,7 +176,10 @@ def write_matches(path: Path, matches: Mapping[tuple[str, str], NDArray[np.uint3
 
 
 def verify_pairs(
-    path: Path, pairs: Sequence[tuple[str, str]], options: pycolmap.TwoViewGeometryOptions, progress: Progress
+    path: Path,
+    pairs: Sequence[tuple[str, str]],
+    options: pycolmap.TwoViewGeometryOptions,
+    progress: Progress,
 ) -> None:
     """Run COLMAP's geometric verification on the stored matches of ``pairs``."""
     list_file = path.with_suffix(".pairs.txt")
@@ -171,14 +188,17 @@ def verify_pairs(
     with image_ids_as_names(path) as new_names:
         for start in range(0, len(pairs), size):
             part = pairs[start : start + size]
-            write_pairs(list_file, [(new_names[first], new_names[second]) for first, second in part])
+            write_pairs(
+                list_file, [(new_names[first], new_names[second]) for first, second in part]
+            )
             pycolmap.verify_matches(path, list_file, options)
             progress("verify", start + len(part), len(pairs))
     list_file.unlink(missing_ok=True)
 
 
 def cameras_without_prior(path: Path) -> bool:
-    """Return whether the focal length of at least one camera is neither given nor in the EXIF data."""
+    """Return whether the focal length of at least one camera is neither given nor in the EXIF
+    data."""
     with pycolmap.Database.open(path) as database:
         return any(not camera.has_prior_focal_length for camera in database.read_all_cameras())
 
@@ -186,7 +206,8 @@ def cameras_without_prior(path: Path) -> bool:
 def assume_focal_lengths(path: Path, factor: float) -> list[tuple[str, str]]:
     """Set each unknown focal length to ``factor`` times the longest side, and mark it as known.
 
-    Drops the geometries that were verified before, and returns the pairs of image names that have matches.
+    Drops the geometries that were verified before, and returns the pairs of image names that have
+    matches.
     """
     with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
         for camera in database.read_all_cameras():
@@ -207,7 +228,8 @@ def assume_focal_lengths(path: Path, factor: float) -> list[tuple[str, str]]:
 
 
 def write_pairs(path: Path, pairs: Sequence[tuple[str, str]]) -> None:
-    """Write COLMAP's list of image pairs, two names on each line; names must have no spaces (`image_ids_as_names`)."""
+    """Write COLMAP's list of image pairs, two names on each line; names must have no spaces
+    (`image_ids_as_names`)."""
     path.write_text("".join(f"{first} {second}\n" for first, second in pairs), encoding="utf-8")
 
 
@@ -215,7 +237,8 @@ def write_pairs(path: Path, pairs: Sequence[tuple[str, str]]) -> None:
 def image_ids_as_names(path: Path) -> Iterator[dict[str, str]]:
     """Rename the images to their ids within the context; yields the new names by the old ones.
 
-    COLMAP splits the lines of its pair lists at spaces, and names of photographs often contain spaces.
+    COLMAP splits the lines of its pair lists at spaces, and names of photographs often contain
+    spaces.
     """
     ids = image_ids(path)
     rename_images(path, {image_id: str(image_id) for image_id in ids.values()})
@@ -240,10 +263,14 @@ def rename_images(path: Path, names: Mapping[int, str]) -> None:
 
 
 def strongest_descriptors(path: Path, name: str, count: int) -> NDArray[np.uint8]:
-    """The descriptors [K, 128] of the ``count`` features with the largest scales of an image, largest first."""
+    """The descriptors [K, 128] of the ``count`` features with the largest scales of an image,
+    largest first."""
     image_id = image_ids(path)[name]
     with pycolmap.Database.open(path) as database:
-        keypoints, descriptors = database.read_keypoints(image_id), database.read_descriptors(image_id).data
+        keypoints, descriptors = (
+            database.read_keypoints(image_id),
+            database.read_descriptors(image_id).data,
+        )
     if len(keypoints) == 0:
         return np.zeros((0, descriptors.shape[1]), dtype=np.uint8)
     # The determinant of a keypoint's affine shape orders keypoints as their scales do.
@@ -254,7 +281,8 @@ def strongest_descriptors(path: Path, name: str, count: int) -> NDArray[np.uint8
 def database_counts(path: Path) -> dict[str, int]:
     """Count the features, matched and verified pairs and inlier matches of the database."""
     with pycolmap.Database.open(path) as database:
-        _, inliers = database.read_two_view_geometry_num_inliers()  # includes rejected pairs, with 0 inliers
+        # includes rejected pairs, with 0 inliers
+        _, inliers = database.read_two_view_geometry_num_inliers()
         return {
             "features": database.num_keypoints(),
             "pairs_matched": database.num_matched_image_pairs(),

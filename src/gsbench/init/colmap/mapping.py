@@ -1,8 +1,10 @@
-"""Making a COLMAP model with its report: triangulation, or mapping by the first of several strategies that succeeds.
+"""Making a COLMAP model with its report: triangulation, or mapping by the first of several
+strategies that succeeds.
 
-COLMAP's defaults need an initial pair that sees points under 16 degrees. Forward-facing captures with a small baseline
-have no such pair; COLMAP's global mapper, smaller angles or assumed focal lengths can still place them. Everything here
-calls native code that can abort the process: run it isolated.
+COLMAP's defaults need an initial pair that sees points under 16 degrees. Forward-facing captures
+with a small baseline have no such pair; COLMAP's global mapper, smaller angles or assumed focal
+lengths can still place them. Everything here calls native code that can abort the process: run it
+isolated.
 """
 
 from __future__ import annotations
@@ -31,22 +33,27 @@ if TYPE_CHECKING:
     from gsbench.init.sfm import ColmapInitializer
 
 SMALL_ANGLE_DEG = 2.0  # triangulation angle of the initial pair; COLMAP's default is 16
-FOCAL_FACTORS = (0.75, 1.0, 1.4)  # focal length over the longest side: lenses of 27, 36 and 50 mm on 35 mm film
-MIN_ANGLE_DEG = 0.5  # median over points of the widest triangulation angle; below it depth is not determined
+# focal length over the longest side: lenses of 27, 36 and 50 mm on 35 mm film
+FOCAL_FACTORS = (0.75, 1.0, 1.4)
+# median over points of the widest triangulation angle; below it depth is not determined
+MIN_ANGLE_DEG = 0.5
 NO_PAIR = (
-    "structure from motion found no pair of images to start from: the photos need more overlap (60 % and more "
+    "structure from motion found no pair of images to start from: the photos need more overlap "
+    "(60 % and more "
     "between neighbours), more texture, or a focal length (init.focal_length, px)"
 )
 
 
 @dataclass(frozen=True)
 class MappingResult:
-    """The best model, its strategy, the number of models of that strategy, and the images that each strategy placed."""
+    """The best model, its strategy, the number of models of that strategy, and the images that each
+    strategy placed."""
 
     model: pycolmap.Reconstruction
     models: int
     strategy: str
-    tried: tuple[tuple[str, int], ...]  # strategies in order, each with the number of images that it placed
+    # strategies in order, each with the number of images that it placed
+    tried: tuple[tuple[str, int], ...]
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -55,18 +62,20 @@ class MappingResult:
             return ()
         counts = ", ".join(f"{strategy} {count}" for strategy, count in self.tried)
         return (
-            f"cameras come from the way {self.strategy!r}, since COLMAP's defaults placed too few (images: {counts})",
+            f"cameras come from the way {self.strategy!r}, since COLMAP's defaults placed too few "
+            f"(images: {counts})",
         )
 
 
 def map_images(
     database: Path, images: Path, output: Path, options: ColmapInitializer, progress: Progress
 ) -> MappingResult:
-    """Estimate cameras and points from the matches in ``database``; returns the model with the most images.
+    """Estimate cameras and points from the matches in ``database``; returns the model with the most
+    images.
 
-    With ``mapper=auto``, the strategies are COLMAP's incremental mapper, the same from a smaller initial angle, the
-    global mapper, and assumed focal lengths. The first that places `REGISTERED_SHARE` of the images ends the search,
-    and the best model so far wins.
+    With ``mapper=auto``, the strategies are COLMAP's incremental mapper, the same from a smaller
+    initial angle, the global mapper, and assumed focal lengths. The first that places
+    `REGISTERED_SHARE` of the images ends the search, and the best model so far wins.
 
     Raises InputError if no model has at least `MIN_IMAGES` images.
     """
@@ -86,7 +95,8 @@ def map_images(
         raise InputError(NO_PAIR)
     if best[0].num_reg_images() < MIN_IMAGES:
         raise InputError(
-            f"structure from motion placed only {best[0].num_reg_images()} of {total} images: the photos need more "
+            f"structure from motion placed only {best[0].num_reg_images()} of {total} images: the "
+            "photos need more "
             "overlap, more texture, or a focal length (init.focal_length, px)"
         )
     return MappingResult(*best, tuple(tried))
@@ -107,7 +117,8 @@ class _Mapper:
     total: int
 
     def strategies(self) -> Iterator[tuple[str, Callable[[], Models]]]:
-        """The strategies that ``init.mapper`` allows, in the order of trying: names and functions."""
+        """The strategies that ``init.mapper`` allows, in the order of trying: names and
+        functions."""
         mapper = self.options.mapper
         if mapper in ("auto", "incremental"):
             yield "incremental", lambda: self.incremental(self.database)
@@ -120,10 +131,14 @@ class _Mapper:
             yield "global", self.global_mapping
         if mapper == "auto" and colmap_database.cameras_without_prior(self.database):
             for factor in FOCAL_FACTORS:
-                yield f"focal length {factor:g} x the longest side", partial(self.with_assumed_focal_lengths, factor)
+                yield (
+                    f"focal length {factor:g} x the longest side",
+                    partial(self.with_assumed_focal_lengths, factor),
+                )
 
     def incremental(self, database: Path, initial_angle: float | None = None) -> Models:
-        """Map image by image, from a pair that sees points under ``initial_angle`` degrees (None: COLMAP's default)."""
+        """Map image by image, from a pair that sees points under ``initial_angle`` degrees (None:
+        COLMAP's default)."""
         registered = 0
 
         def count_image() -> None:
@@ -149,17 +164,22 @@ class _Mapper:
         return self._run(partial(pycolmap.global_mapping, self.database), options)
 
     def with_assumed_focal_lengths(self, factor: float) -> Models:
-        """Map image by image after setting unknown focal lengths to ``factor`` times the longest side.
+        """Map image by image after setting unknown focal lengths to ``factor`` times the longest
+        side.
 
         The pairs are verified again under these focal lengths.
         """
         copy = self.database.with_name(f"assumed-{factor:g}.db")
         shutil.copy(self.database, copy)
         pairs = colmap_database.assume_focal_lengths(copy, factor)
-        colmap_database.verify_pairs(copy, pairs, reconstruct.verification_options(self.options), self.progress)
+        colmap_database.verify_pairs(
+            copy, pairs, reconstruct.verification_options(self.options), self.progress
+        )
         return self.incremental(copy, SMALL_ANGLE_DEG)
 
-    def _run(self, mapping: Callable[..., dict[int, pycolmap.Reconstruction]], options: Any) -> Models:
+    def _run(
+        self, mapping: Callable[..., dict[int, pycolmap.Reconstruction]], options: Any
+    ) -> Models:
         self.progress("map", 0, self.total)
         pycolmap.set_random_seed(self.options.seed)
         models = mapping(self.images, _empty(self.output), options=options)
@@ -178,15 +198,26 @@ def _model_size(model: pycolmap.Reconstruction) -> tuple[int, int]:
 
 
 def _is_plausible(model: pycolmap.Reconstruction) -> bool:
-    """Return whether triangulation angles determine the depth of points; copies of one photograph have none."""
-    centers = {image.image_id: image.projection_center() for image in model.images.values() if image.has_pose}
-    angles = [_widest_angle(point, centers) for point in model.points3D.values() if point.track.length() > 1]
+    """Return whether triangulation angles determine the depth of points; copies of one photograph
+    have none."""
+    centers = {
+        image.image_id: image.projection_center()
+        for image in model.images.values()
+        if image.has_pose
+    }
+    angles = [
+        _widest_angle(point, centers)
+        for point in model.points3D.values()
+        if point.track.length() > 1
+    ]
     return bool(angles) and float(np.median(angles)) >= MIN_ANGLE_DEG
 
 
 def _widest_angle(point: pycolmap.Point3D, centers: dict[int, np.ndarray]) -> float:
     """The widest angle between two rays from a point to its cameras, in degrees."""
-    rays = np.array([centers[element.image_id] for element in point.track.elements]) - point.xyz  # [T, 3]
+    rays = (
+        np.array([centers[element.image_id] for element in point.track.elements]) - point.xyz
+    )  # [T, 3]
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     return float(np.degrees(np.arccos(np.clip(rays @ rays.T, -1, 1)).max()))
 
@@ -204,13 +235,16 @@ class ReconstructionJob:
 
 
 def build_model(job: ReconstructionJob, progress: Progress) -> InitReport:
-    """Make cameras, features, matches, model and report. Calls native code that can abort: run it isolated."""
+    """Make cameras, features, matches, model and report. Calls native code that can abort: run it
+    isolated."""
     pycolmap.logging.minloglevel = int(pycolmap.logging.Level.WARNING)
     options, capture = job.options, job.capture
     timer = Timer(dict(job.preparation.seconds))
     reference = reconstruct.load_reference(capture, job.reference)
     database = job.work_dir / "database.db"
-    used = capture.train_names if options.ignores_test_photographs(reference) else capture.image_names
+    used = (
+        capture.train_names if options.ignores_test_photographs(reference) else capture.image_names
+    )
     images = colmap_database.readable_images(capture.images, used, job.work_dir)
     if reference is not None and options.uses_reference_cameras:
         groups = colmap_database.reference_camera_groups(reference)
@@ -226,13 +260,16 @@ def build_model(job: ReconstructionJob, progress: Progress) -> InitReport:
     counts = {**job.preparation.counts, **counts, **colmap_database.database_counts(database)}
     if counts["pairs_verified"] == 0:
         raise InputError(
-            f"{options.name}: no pair of images shares enough matches: the photos need more overlap or texture"
+            f"{options.name}: no pair of images shares enough matches: the photos need more "
+            "overlap or texture"
         )
     scratch = job.work_dir / "mapping"
     shutil.rmtree(scratch, ignore_errors=True)
     if options.poses == "shared" and reference is not None:
         with timer.phase("triangulate"):
-            model = reconstruct.triangulate(database, images, scratch, reference, names, options, progress)
+            model = reconstruct.triangulate(
+                database, images, scratch, reference, names, options, progress
+            )
         points = None
         if options.ignores_test_photographs(reference):
             points = TrainingPoints(options.points_from, model.num_points3D(), None, None)
@@ -263,7 +300,9 @@ def _finish(
     warnings = [*job.preparation.warnings, *(() if mapped is None else mapped.warnings)]
     pose_errors, own_gauge, scale = None, None, 1.0 if poses == "shared" else None
     if poses == "own" and reference is not None and similarity is None:
-        warnings.append("too few common cameras with the reference: poses are neither aligned nor compared")
+        warnings.append(
+            "too few common cameras with the reference: poses are neither aligned nor compared"
+        )
     if reference is not None and similarity is not None:
         exact = capture.exact_poses and job.reference is None
         reference_extent = report.training_extent(reference, capture)

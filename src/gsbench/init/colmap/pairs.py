@@ -1,9 +1,11 @@
-"""Pairs of images to match: all pairs, neighbours in the order of names, or pairs proposed by a preview.
+"""Pairs of images to match: all pairs, neighbours in the order of names, or pairs proposed by a
+preview.
 
-The preview matches only the strongest features of each image, after Wu, "Towards Linear-time Incremental Structure from
-Motion" (3DV 2013), who skips pairs in which few of the largest features match. Here the number of such matches ranks
-the partners of each image, and the best partners are kept. Pairs of distant views are dropped with little loss, because
-nearer views already contain most of their tracks.
+The preview matches only the strongest features of each image, after Wu, "Towards Linear-time
+Incremental Structure from Motion" (3DV 2013), who skips pairs in which few of the largest features
+match. Here the number of such matches ranks the partners of each image, and the best partners are
+kept. Pairs of distant views are dropped with little loss, because nearer views already contain most
+of their tracks.
 """
 
 from collections.abc import Callable, Sequence
@@ -19,11 +21,12 @@ Pairing = Literal["exhaustive", "auto", "sequential"]
 
 
 def sequential_pairs(count: int, overlap: int) -> list[Pair]:
-    """Pair each image with the next ``overlap`` images and those 1, 2, 4, … 2^(overlap - 1) further on, as COLMAP does.
+    """Pair each image with the next ``overlap`` images and those 1, 2, 4, … 2^(overlap - 1) further
+    on, as COLMAP does.
 
     Examples:
-        >>> sequential_pairs(6, 3)
-        [(0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (1, 3), (1, 4), (1, 5), (2, 3), (2, 4), (2, 5), (3, 4), (3, 5), (4, 5)]
+        >>> sequential_pairs(6, 2)
+        [(0, 1), (0, 2), (1, 2), (1, 3), (2, 3), (2, 4), (3, 4), (3, 5), (4, 5)]
     """
     steps = {*range(1, overlap + 1), *(2**power for power in range(overlap))}
     return sorted((i, i + step) for i in range(count) for step in steps if i + step < count)
@@ -31,16 +34,20 @@ def sequential_pairs(count: int, overlap: int) -> list[Pair]:
 
 ALL_PAIRS_UP_TO = 30  # images, 435 pairs: a preview would not pay off
 STRONGEST = 256  # features of an image in the preview
-PARTNERS = 24  # of each image: gave at least 98 % of the points of all pairs on the dense captures that were tried
+# of each image: gave at least 98 % of the points of all pairs on the dense captures that were tried
+PARTNERS = 24
 SQUARED_RATIO = 0.8**2  # of the distances to the best and the second-best match
-QUANTUM = 512.0  # scale that turns descriptors of unit length into whole numbers, as in COLMAP's SIFT
+# scale that turns descriptors of unit length into whole numbers, as in COLMAP's SIFT
+QUANTUM = 512.0
 
 
 def best_pairs(descriptors: Sequence[NDArray[np.generic]], partners: int = PARTNERS) -> list[Pair]:
-    """Pair each image with the ``partners`` images with the most matches; returns sorted pairs (i, j), i < j.
+    """Pair each image with the ``partners`` images with the most matches; returns sorted pairs (i,
+    j), i < j.
 
-    ``descriptors`` [K, D] belong to each image's strongest features, of which at most `STRONGEST` are used. They are
-    whole numbers, or floats of unit length. Among equal partners, those nearer in the order of images come first.
+    ``descriptors`` [K, D] belong to each image's strongest features, of which at most `STRONGEST`
+    are used. They are whole numbers, or floats of unit length. Among equal partners, those nearer
+    in the order of images come first.
     """
     agreement = count_agreements(descriptors)
     agreement += agreement.T
@@ -52,26 +59,34 @@ def best_pairs(descriptors: Sequence[NDArray[np.generic]], partners: int = PARTN
     return sorted(pairs)
 
 
-def proposed_pairs(names: Sequence[str], strongest: Callable[[str], NDArray[np.generic]]) -> list[tuple[str, str]]:
-    """The pairs that ``pairs=auto`` matches: all pairs of up to `ALL_PAIRS_UP_TO` images, else the `best_pairs`.
+def proposed_pairs(
+    names: Sequence[str], strongest: Callable[[str], NDArray[np.generic]]
+) -> list[tuple[str, str]]:
+    """The pairs that ``pairs=auto`` matches: all pairs of up to `ALL_PAIRS_UP_TO` images, else the
+    `best_pairs`.
 
     ``strongest`` returns the descriptors of an image's strongest features.
     """
     if len(names) <= ALL_PAIRS_UP_TO:
         return list(combinations(names, 2))
-    return [(names[first], names[second]) for first, second in best_pairs([strongest(name) for name in names])]
+    return [
+        (names[first], names[second])
+        for first, second in best_pairs([strongest(name) for name in names])
+    ]
 
 
 def count_agreements(descriptors: Sequence[NDArray[np.generic]]) -> NDArray[np.int64]:
-    """Count mutual nearest neighbours that pass the ratio test between images i < j; [N, N], upper triangle.
+    """Count mutual nearest neighbours that pass the ratio test between images i < j; [N, N], upper
+    triangle.
 
-    Descriptors are whole numbers here, and their products stay below 2^24. They are exact in float32, so the counts are
-    the same on every machine and with any number of threads.
+    Descriptors are whole numbers here, and their products stay below 2^24. They are exact in
+    float32, so the counts are the same on every machine and with any number of threads.
     """
     count = len(descriptors)
     width = max(part.shape[1] for part in descriptors)
     table = np.zeros((count, STRONGEST, width), dtype=np.float32)
-    squares = np.full((count, STRONGEST), np.inf, dtype=np.float32)  # infinite for empty rows: never the nearest
+    # infinite for empty rows: never the nearest
+    squares = np.full((count, STRONGEST), np.inf, dtype=np.float32)
     for index, part in enumerate(descriptors):
         strongest = part[:STRONGEST].astype(np.float32)
         if part.dtype.kind == "f":
@@ -81,7 +96,8 @@ def count_agreements(descriptors: Sequence[NDArray[np.generic]]) -> NDArray[np.i
     agreements = np.zeros((count, count), dtype=np.int64)
     rows = np.arange(STRONGEST)
     for i in range(count - 1):
-        products = table[i] @ table[i + 1 :].reshape(-1, width).T  # one large product is faster than many small ones
+        # one large product is faster than many small ones
+        products = table[i] @ table[i + 1 :].reshape(-1, width).T
         distances = squares[i][:, None] + squares[i + 1 :].reshape(-1) - 2 * products
         distances = distances.reshape(STRONGEST, -1, STRONGEST)  # [S, J, S]
         nearest = distances.argmin(axis=2)  # [S, J]

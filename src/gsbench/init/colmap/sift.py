@@ -1,10 +1,12 @@
-"""COLMAP's SIFT: extraction, and matching on several cores by processes instead of threads. Run it isolated.
+"""COLMAP's SIFT: extraction, and matching on several cores by processes instead of threads. Run it
+isolated.
 
-COLMAP's matcher is not safe with two threads in one process. Its nearest-neighbour search (faiss) calls a BLAS that
-pycolmap's wheels build for one thread and without locks. Two simultaneous calls can corrupt each other's numbers:
-rarely, and mostly on a busy machine, a pair loses some or most of its matches. With one thread for each process,
-matches are repeatable to the bit. Each call builds a search index for each of its images, which costs more than
-matching a pair, so the pairs are divided into parts with few images.
+COLMAP's matcher is not safe with two threads in one process. Its nearest-neighbour search (faiss)
+calls a BLAS that pycolmap's wheels build for one thread and without locks. Two simultaneous calls
+can corrupt each other's numbers: rarely, and mostly on a busy machine, a pair loses some or most of
+its matches. With one thread for each process, matches are repeatable to the bit. Each call builds a
+search index for each of its images, which costs more than matching a pair, so the pairs are divided
+into parts with few images.
 """
 
 from __future__ import annotations
@@ -29,7 +31,8 @@ from gsbench.system.isolate import run_with_progress
 if TYPE_CHECKING:
     from gsbench.init.sfm import Sfm
 
-IMAGES_PER_CALL = 8  # COLMAP reports no progress within a call, so it is called for a few images at a time
+# COLMAP reports no progress within a call, so it is called for a few images at a time
+IMAGES_PER_CALL = 8
 IMAGES_PER_THREAD = 2  # least number in a call, so that all threads have work
 
 
@@ -82,10 +85,12 @@ IdPair = tuple[int, int]
 
 @dataclass(frozen=True)
 class MatchingJob:
-    """Inputs of one matching process: ``parts`` are lists of pairs of image ids, whose matches go into ``result``.
+    """Inputs of one matching process: ``parts`` are lists of pairs of image ids, whose matches go
+    into ``result``.
 
-    ``features`` is the database with keypoints and descriptors. ``template`` is a copy without them, whose images are
-    named by their ids, because COLMAP splits the lines of its pair lists at spaces.
+    ``features`` is the database with keypoints and descriptors. ``template`` is a copy without
+    them, whose images are named by their ids, because COLMAP splits the lines of its pair lists at
+    spaces.
     """
 
     features: Path
@@ -95,17 +100,21 @@ class MatchingJob:
     sift: Sfm
 
 
-def match_sift(database: Path, pairs: Sequence[tuple[str, str]], sift: Sfm, processes: int, progress: Progress) -> None:
+def match_sift(
+    database: Path, pairs: Sequence[tuple[str, str]], sift: Sfm, processes: int, progress: Progress
+) -> None:
     """Match ``pairs`` of image names and verify them.
 
-    The result does not depend on the number of processes or on the division into parts: a pair's matches depend on its
-    descriptors alone, and its RANSAC starts from the seed.
+    The result does not depend on the number of processes or on the division into parts: a pair's
+    matches depend on its descriptors alone, and its RANSAC starts from the seed.
     """
     folder = database.parent / "matching"
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir()
     ids = image_ids(database)
-    parts = divide_pairs([(ids[first], ids[second]) for first, second in pairs], _block_size(len(ids), processes))
+    parts = divide_pairs(
+        [(ids[first], ids[second]) for first, second in pairs], _block_size(len(ids), processes)
+    )
     _copy_without_features(database, folder / "empty.db")
     jobs = [
         MatchingJob(database, folder / "empty.db", folder / f"matches-{index}.db", share, sift)
@@ -122,7 +131,8 @@ def match_sift(database: Path, pairs: Sequence[tuple[str, str]], sift: Sfm, proc
 
 
 def match_parts(job: MatchingJob, progress: Progress) -> None:
-    """Match and verify the parts of ``job`` one after another. Calls native code that can abort: run it isolated."""
+    """Match and verify the parts of ``job`` one after another. Calls native code that can abort:
+    run it isolated."""
     pycolmap.logging.minloglevel = int(pycolmap.logging.Level.WARNING)
     options = pycolmap.FeatureMatchingOptions()
     options.use_gpu = False
@@ -137,7 +147,12 @@ def match_parts(job: MatchingJob, progress: Progress) -> None:
     part_database = job.result.with_suffix(".part.db")
     for part in job.parts:
         shutil.copyfile(job.template, part_database)
-        _insert(part_database, job.features, FEATURE_TABLES, sorted({image for pair in part for image in pair}))
+        _insert(
+            part_database,
+            job.features,
+            FEATURE_TABLES,
+            sorted({image for pair in part for image in pair}),
+        )
         write_pairs(pairing.match_list_path, [(str(first), str(second)) for first, second in part])
         pycolmap.match_image_pairs(
             part_database,
@@ -153,7 +168,8 @@ def match_parts(job: MatchingJob, progress: Progress) -> None:
 
 
 def divide_pairs(pairs: Sequence[IdPair], block: int) -> list[list[IdPair]]:
-    """Divide ``pairs`` into parts with few images: pairs between ``block`` neighbours and ``block`` neighbours.
+    """Divide ``pairs`` into parts with few images: pairs between ``block`` neighbours and ``block``
+    neighbours.
 
     Small parts are merged up to the size of a full part.
 
@@ -174,7 +190,8 @@ def divide_pairs(pairs: Sequence[IdPair], block: int) -> list[list[IdPair]]:
 
 
 def distribute_parts(parts: Sequence[list[IdPair]], processes: int) -> list[list[list[IdPair]]]:
-    """Distribute parts over processes, with about equal numbers of pairs; a process gets at least one part."""
+    """Distribute parts over processes, with about equal numbers of pairs; a process gets at least
+    one part."""
     shares: list[list[list[IdPair]]] = [[] for _ in range(max(1, min(processes, len(parts))))]
     for part in sorted(parts, key=len, reverse=True):
         min(shares, key=lambda share: sum(map(len, share))).append(part)
@@ -182,8 +199,10 @@ def distribute_parts(parts: Sequence[list[IdPair]], processes: int) -> list[list
 
 
 def _block_size(images: int, processes: int) -> int:
-    """Images on each side of a part such that all pairs of ``images`` make `PARTS_PER_PROCESS` parts per process."""
-    blocks = math.ceil(math.sqrt(2 * PARTS_PER_PROCESS * processes))  # k blocks of images make k (k + 1) / 2 parts
+    """Images on each side of a part such that all pairs of ``images`` make `PARTS_PER_PROCESS`
+    parts per process."""
+    # k blocks of images make k (k + 1) / 2 parts
+    blocks = math.ceil(math.sqrt(2 * PARTS_PER_PROCESS * processes))
     return min(max(math.ceil(images / blocks), 2), MAX_BLOCK)
 
 
@@ -211,11 +230,16 @@ def _copy_without_features(database: Path, target: Path) -> None:
     rename_images(target, {image_id: str(image_id) for image_id in image_ids(target).values()})
 
 
-def _insert(target: Path, source: Path, tables: Sequence[str], images: Sequence[int] | None = None) -> None:
-    """Copy the rows of ``tables`` from one database to another, of all images or only of the ids ``images``."""
+def _insert(
+    target: Path, source: Path, tables: Sequence[str], images: Sequence[int] | None = None
+) -> None:
+    """Copy the rows of ``tables`` from one database to another, of all images or only of the ids
+    ``images``."""
     condition = "" if images is None else f" WHERE image_id IN ({', '.join(map(str, images))})"
     with closing(sqlite3.connect(target)) as connection:
         connection.execute("ATTACH DATABASE ? AS source", (str(source),))
         with connection:
             for table in tables:
-                connection.execute(f"INSERT INTO main.{table} SELECT * FROM source.{table}{condition}")
+                connection.execute(
+                    f"INSERT INTO main.{table} SELECT * FROM source.{table}{condition}"
+                )

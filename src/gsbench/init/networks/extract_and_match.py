@@ -1,4 +1,5 @@
-"""The networks' part of deep image matching: the features of all images and the matches of all pairs.
+"""The networks' part of deep image matching: the features of all images and the matches of all
+pairs.
 
 Extractors and matchers are built by name with their weights.
 """
@@ -35,11 +36,12 @@ if TYPE_CHECKING:
 
 GPU_MEMORY_HINT = "lower init.max_image_size or init.max_keypoints, or set init.device=cpu"
 SUPERPOINT_BORDER = 4  # px without keypoints, as in deep-image-matching
-LIGHTGLUE_DETECTOR_PREFIX = "keypoint_detector."  # of SuperPoint's tensors in a LightGlue checkpoint of transformers
+# of SuperPoint's tensors in a LightGlue checkpoint of transformers
+LIGHTGLUE_DETECTOR_PREFIX = "keypoint_detector."
 
 
-# Finds features in an image [1, 3, H, W], RGB in [0, 1]: keypoints [K, 2] in px with the centre of the first pixel at
-# (0, 0), descriptors [K, D] and scores [K].
+# Finds features in an image [1, 3, H, W], RGB in [0, 1]: keypoints [K, 2] in px with the centre of
+# the first pixel at (0, 0), descriptors [K, D] and scores [K].
 Extractor = Callable[[torch.Tensor], tuple[torch.Tensor, torch.Tensor, torch.Tensor]]
 # Matches two images: indices [M, 2] of keypoints in the first and the second.
 Matcher = Callable[[Features, Features], NDArray[np.uint32]]
@@ -48,7 +50,8 @@ Matcher = Callable[[Features, Features], NDArray[np.uint32]]
 def extract_features(
     path: Path, extractor: Extractor, max_image_size: int, max_keypoints: int, device: torch.device
 ) -> Features:
-    """The ``max_keypoints`` strongest features of an image file, shrunk to ``max_image_size`` px for the network.
+    """The ``max_keypoints`` strongest features of an image file, shrunk to ``max_image_size`` px
+    for the network.
 
     Raises ``InputError`` if the image cannot be read or the device runs out of memory.
     """
@@ -56,21 +59,34 @@ def extract_features(
     height, width = pixels.shape[:2]
     network_size = downscaled_size(width, height, max_size=max_image_size)
     pixels = resize_image(pixels, *network_size)
-    image = torch.from_numpy(pixels.astype(np.float32) / 255.0).permute(2, 0, 1)[None]  # [1, 3, h, w]
+    image = torch.from_numpy(pixels.astype(np.float32) / 255.0).permute(2, 0, 1)[
+        None
+    ]  # [1, 3, h, w]
     try:
         with torch.inference_mode():
-            keypoints, descriptors, scores = (part.float().cpu() for part in extractor(image.to(device)))
+            keypoints, descriptors, scores = (
+                part.float().cpu() for part in extractor(image.to(device))
+            )
     except torch.OutOfMemoryError as error:
         size = f"{network_size[0]}x{network_size[1]}"
-        raise InputError(f"{path.name}: {device} ran out of memory at {size} px: {GPU_MEMORY_HINT}") from error
+        raise InputError(
+            f"{path.name}: {device} ran out of memory at {size} px: {GPU_MEMORY_HINT}"
+        ) from error
     order = torch.sort(scores, descending=True, stable=True).indices[:max_keypoints]
     return Features(
-        keypoints[order].numpy(), descriptors[order].numpy(), scores[order].numpy(), network_size, (width, height)
+        keypoints[order].numpy(),
+        descriptors[order].numpy(),
+        scores[order].numpy(),
+        network_size,
+        (width, height),
     )
 
 
-def load_into(network: torch.nn.Module, state: Mapping[str, torch.Tensor], path: Path, device: torch.device) -> None:
-    """Load ``state`` into ``network``, for use on ``device``. It must hold every parameter; buffers may be absent."""
+def load_into(
+    network: torch.nn.Module, state: Mapping[str, torch.Tensor], path: Path, device: torch.device
+) -> None:
+    """Load ``state`` into ``network``, for use on ``device``. It must hold every parameter; buffers
+    may be absent."""
     try:
         missing, unexpected = network.load_state_dict(dict(state), strict=False)
     except RuntimeError as error:
@@ -82,7 +98,8 @@ def load_into(network: torch.nn.Module, state: Mapping[str, torch.Tensor], path:
     if missing or unexpected:
         example = (missing or unexpected)[0]
         raise MissingWeightsError(
-            f"weights file {path} is for another network ({len(missing)} tensors missing, {len(unexpected)} foreign, "
+            f"weights file {path} is for another network ({len(missing)} tensors missing, "
+            f"{len(unexpected)} foreign, "
             f"for example {example}): replace it"
         )
     network.to(device).eval()
@@ -109,18 +126,26 @@ def _superpoint(settings: FeatureSettings, weights: Path | None, device: torch.d
     state = load_state(weights)
     prefix = LIGHTGLUE_DETECTOR_PREFIX
     if any(name.startswith(prefix) for name in state):
-        state = {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}
+        state = {
+            name.removeprefix(prefix): value
+            for name, value in state.items()
+            if name.startswith(prefix)
+        }
     load_into(network, state, weights, device)
 
     def extract(image: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         height, width = image.shape[-2:]
         output = network(_gray(image))  # reads the first channel only
         size = torch.tensor([width, height], device=image.device)
-        # The output is relative to the size, and keypoints are whole px, so rounding restores them. The processor of
-        # transformers truncates instead, and is one px too low in 5 % of the columns of some widths.
+        # The output is relative to the size, and keypoints are whole px, so rounding restores them.
+        # The processor of transformers truncates instead, and is one px too low in 5 % of the
+        # columns of some widths.
         keypoints = (output.keypoints[0] * size).round()  # [K, 2]
-        # The network's own border removal is off, because it tests the right and bottom borders in the wrong unit.
-        inside = ((keypoints >= SUPERPOINT_BORDER) & (keypoints < size - SUPERPOINT_BORDER)).all(dim=1)
+        # The network's own border removal is off, because it tests the right and bottom borders in
+        # the wrong unit.
+        inside = ((keypoints >= SUPERPOINT_BORDER) & (keypoints < size - SUPERPOINT_BORDER)).all(
+            dim=1
+        )
         keep = inside & output.mask[0].bool()
         return keypoints[keep], output.descriptors[0][keep], output.scores[0][keep]
 
@@ -166,10 +191,14 @@ def _disk(settings: FeatureSettings, weights: Path | None, device: torch.device)
     return extract
 
 
-def _sift_kornia(settings: FeatureSettings, weights: Path | None, device: torch.device) -> Extractor:
+def _sift_kornia(
+    settings: FeatureSettings, weights: Path | None, device: torch.device
+) -> Extractor:
     from kornia.feature import SIFTFeatureScaleSpace, laf_is_filled
 
-    network = SIFTFeatureScaleSpace(settings.max_keypoints, device=device, descriptor_backend="pyramid").eval()
+    network = SIFTFeatureScaleSpace(
+        settings.max_keypoints, device=device, descriptor_backend="pyramid"
+    ).eval()
 
     def extract(image: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         frames, responses, descriptors = network(_gray(image)[:, :1])
@@ -185,8 +214,8 @@ def _gray(image: torch.Tensor) -> torch.Tensor:
     return (image * weights).sum(dim=1, keepdim=True).expand(-1, 3, -1, -1)
 
 
-# Each makes an extractor with its network on a device; the path is the checked file of weights, None if it needs none.
-# They raise ``MissingWeightsError`` if the file does not fit the network.
+# Each makes an extractor with its network on a device; the path is the checked file of weights,
+# None if it needs none. They raise ``MissingWeightsError`` if the file does not fit the network.
 EXTRACTORS: dict[str, Callable[[FeatureSettings, Path | None, torch.device], Extractor]] = {
     "superpoint": _superpoint,
     "aliked": _aliked,
@@ -207,11 +236,14 @@ def build_matcher(settings: FeatureSettings, weights: Path | None, device: torch
 
 
 def mutual_nearest_matcher(max_ratio: float, device: torch.device) -> Matcher:
-    """Match descriptors that are each other's nearest neighbour and pass the ratio test in both directions."""
+    """Match descriptors that are each other's nearest neighbour and pass the ratio test in both
+    directions."""
     from kornia.feature import match_smnn
 
     def match_features(first: Features, second: Features) -> NDArray[np.uint32]:
-        ours, theirs = (torch.from_numpy(features.descriptors).to(device) for features in (first, second))  # [K, D]
+        ours, theirs = (
+            torch.from_numpy(features.descriptors).to(device) for features in (first, second)
+        )  # [K, D]
         with torch.inference_mode():
             _, indices = match_smnn(ours, theirs, max_ratio)
         return indices.cpu().numpy().astype(np.uint32).reshape(-1, 2)
@@ -219,27 +251,36 @@ def mutual_nearest_matcher(max_ratio: float, device: torch.device) -> Matcher:
     return match_features
 
 
-def lightglue_matcher(extractor: str, filter_threshold: float, weights: Path, device: torch.device) -> Matcher:
+def lightglue_matcher(
+    extractor: str, filter_threshold: float, weights: Path, device: torch.device
+) -> Matcher:
     """kornia's LightGlue, with weights for the features of one extractor."""
     from kornia.feature import LightGlue
 
     # Without a name of features, kornia does not download weights.
     no_name: Any = None
-    layout = {key: value for key, value in LightGlue.features[extractor].items() if key != "weights"}
+    layout = {
+        key: value for key, value in LightGlue.features[extractor].items() if key != "weights"
+    }
     network = LightGlue(no_name, filter_threshold=filter_threshold, **layout)
     state = load_state(weights)
     # The published files name a layer "self_attn.0", kornia's network "transformers.0.self_attn".
     for layer in range(network.conf.n_layers):
         for kind in ("self_attn", "cross_attn"):
             old, new = f"{kind}.{layer}.", f"transformers.{layer}.{kind}."
-            state = {name.replace(old, new) if name.startswith(old) else name: tensor for name, tensor in state.items()}
+            state = {
+                name.replace(old, new) if name.startswith(old) else name: tensor
+                for name, tensor in state.items()
+            }
     load_into(network, state, weights, device)
 
     def inputs(features: Features) -> dict[str, torch.Tensor]:
         return {
             "keypoints": torch.from_numpy(features.keypoints)[None].to(device),  # [1, K, 2]
             "descriptors": torch.from_numpy(features.descriptors)[None].to(device),  # [1, K, D]
-            "image_size": torch.tensor([features.network_size], dtype=torch.float32, device=device),  # [1, 2]
+            "image_size": torch.tensor(
+                [features.network_size], dtype=torch.float32, device=device
+            ),  # [1, 2]
         }
 
     def match_features(first: Features, second: Features) -> NDArray[np.uint32]:
@@ -258,11 +299,14 @@ def match(matcher: Matcher, first: Features, second: Features) -> NDArray[np.uin
         return matcher(first, second)
     except torch.OutOfMemoryError as error:
         count = max(len(first.keypoints), len(second.keypoints))
-        raise InputError(f"matching of {count} keypoints ran out of memory: {GPU_MEMORY_HINT}") from error
+        raise InputError(
+            f"matching of {count} keypoints ran out of memory: {GPU_MEMORY_HINT}"
+        ) from error
 
 
 CACHE_BYTES = 1 << 30  # of descriptors kept in memory while pairs are matched
-# deep-image-matching's `matching_lowres`, its default choice of pairs (pairs_generator.py, state of December 2024)
+# deep-image-matching's `matching_lowres`, its default choice of pairs (pairs_generator.py, state of
+# December 2024)
 LOWRES_SIZE = 1000  # px
 LOWRES_KEYPOINTS = 2048
 LOWRES_FILTER = 0.3  # lowest score of a match
@@ -271,7 +315,8 @@ LOWRES_MATCHES = 20  # pairs with more matches are matched at full size
 
 @dataclass(frozen=True)
 class NetworkJob:
-    """Inputs of the isolated process. The weights are checked files, or None if a network needs none."""
+    """Inputs of the isolated process. The weights are checked files, or None if a network needs
+    none."""
 
     options: FeatureInitializer
     settings: FeatureSettings
@@ -304,7 +349,10 @@ def extract_and_match(job: NetworkJob, progress: Progress) -> Preparation:
     with timer.phase("extract"):
         empty = _extract_all(job, names, device, progress)
     if len(empty) == len(names):
-        raise InputError(f"{options.name}: no keypoint in any image: lower init.keypoint_threshold or check the photos")
+        raise InputError(
+            f"{options.name}: no keypoint in any image: lower init.keypoint_threshold or check "
+            "the photos"
+        )
     if options.pairs == "lowres":
         with timer.phase("preselect"):
             small = at_low_resolution(job)
@@ -314,7 +362,10 @@ def extract_and_match(job: NetworkJob, progress: Progress) -> Preparation:
     with timer.phase("match"):
         without = _match_all(job, pairs, device, progress)
     if len(without) == len(pairs):  # also true if no pair was selected
-        raise InputError(f"{options.name}: no pair of images has a match: the photos need more overlap or texture")
+        raise InputError(
+            f"{options.name}: no pair of images has a match: the photos need more overlap or "
+            "texture"
+        )
     warnings = []
     if empty:
         warnings.append(f"no keypoint in {some_of(empty)}: no point comes from these images")
@@ -323,7 +374,11 @@ def extract_and_match(job: NetworkJob, progress: Progress) -> Preparation:
         seconds=timer.seconds,
         counts={
             "pairs_selected": len(pairs),
-            **({"pairs_left_out": candidates - len(pairs)} if options.pairs in ("auto", "lowres") else {}),
+            **(
+                {"pairs_left_out": candidates - len(pairs)}
+                if options.pairs in ("auto", "lowres")
+                else {}
+            ),
             "pairs_without_matches": len(without),
             "images_without_keypoints": len(empty),
         },
@@ -336,11 +391,15 @@ def extract_and_match(job: NetworkJob, progress: Progress) -> Preparation:
     )
 
 
-def choose_pairs(job: NetworkJob, names: Sequence[str], pairs: list[tuple[str, str]]) -> list[tuple[str, str]]:
+def choose_pairs(
+    job: NetworkJob, names: Sequence[str], pairs: list[tuple[str, str]]
+) -> list[tuple[str, str]]:
     """The pairs to match, chosen by the stored features of the images ``names``."""
     if job.options.pairs == "auto":
         store = open_store(job)
-        return proposed_pairs(names, lambda name: store.require_features(name).descriptors[:STRONGEST])
+        return proposed_pairs(
+            names, lambda name: store.require_features(name).descriptors[:STRONGEST]
+        )
     if job.options.pairs == "lowres":
         small = open_store(at_low_resolution(job))
         return [pair for pair in pairs if len(small.require_matches(*pair)) > LOWRES_MATCHES]
@@ -358,16 +417,22 @@ def at_low_resolution(job: NetworkJob) -> NetworkJob:
     return replace(job, settings=settings)
 
 
-def _extract_all(job: NetworkJob, names: Sequence[str], device: torch.device, progress: Progress) -> list[str]:
+def _extract_all(
+    job: NetworkJob, names: Sequence[str], device: torch.device, progress: Progress
+) -> list[str]:
     """Store the features of all images; returns the names of images without features."""
     store, settings, empty, extractor = open_store(job), job.settings, [], None
     progress("extract", 0, len(names))
     for done, name in enumerate(names, start=1):
         features = store.read_features(name)
         if features is None:
-            extractor = extractor or EXTRACTORS[settings.extractor](settings, job.extractor_weights, device)
+            extractor = extractor or EXTRACTORS[settings.extractor](
+                settings, job.extractor_weights, device
+            )
             path = job.capture.images / name
-            features = extract_features(path, extractor, settings.max_image_size, settings.max_keypoints, device)
+            features = extract_features(
+                path, extractor, settings.max_image_size, settings.max_keypoints, device
+            )
             if name in job.capture.masks:
                 features = features.within(read_mask(job.capture.masks[name]))
             store.write_features(name, features)
@@ -396,12 +461,16 @@ def _match_all(
     return without
 
 
-def _cached_reader(store: FeatureStore, pairs: Sequence[tuple[str, str]]) -> Callable[[str], Features]:
+def _cached_reader(
+    store: FeatureStore, pairs: Sequence[tuple[str, str]]
+) -> Callable[[str], Features]:
     """`FeatureStore.require_features` with a cache of about `CACHE_BYTES` of descriptors."""
     if not pairs:
         return store.require_features
     example = store.require_features(pairs[0][0])
-    return lru_cache(maxsize=2 + CACHE_BYTES // max(example.descriptors.nbytes, 1))(store.require_features)
+    return lru_cache(maxsize=2 + CACHE_BYTES // max(example.descriptors.nbytes, 1))(
+        store.require_features
+    )
 
 
 def _digest(path: Path | None) -> str | None:

@@ -1,7 +1,9 @@
-"""Local features of an image, the settings that they depend on, and a store of features and matches on disk.
+"""Local features of an image, the settings that they depend on, and a store of features and matches
+on disk.
 
-The store has one file for each image and each pair, so that an interrupted run continues from there. A file's name is
-a hash of everything that its content depends on: the image's bytes, the mask, the settings and the weights.
+The store has one file for each image and each pair, so that an interrupted run continues from
+there. A file's name is a hash of everything that its content depends on: the image's bytes, the
+mask, the settings and the weights.
 """
 
 from __future__ import annotations
@@ -26,8 +28,9 @@ from gsbench.files import atomic, file_sha256
 class Features:
     """Features of one image, strongest first.
 
-    ``keypoints`` [K, 2] float32 are in px of the image at the network's size, with the centre of the first pixel at
-    (0, 0). `colmap_keypoints` are in px of the file. ``descriptors`` are [K, D] float32, ``scores`` [K] float32.
+    ``keypoints`` [K, 2] float32 are in px of the image at the network's size, with the centre of
+    the first pixel at (0, 0). `colmap_keypoints` are in px of the file. ``descriptors`` are [K, D]
+    float32, ``scores`` [K] float32.
     """
 
     keypoints: NDArray[np.float32]
@@ -38,7 +41,8 @@ class Features:
 
     @property
     def colmap_keypoints(self) -> NDArray[np.float32]:
-        """Keypoints [K, 2] in px of the file, with the centre of the first pixel at (0.5, 0.5), as in COLMAP."""
+        """Keypoints [K, 2] in px of the file, with the centre of the first pixel at (0.5, 0.5), as
+        in COLMAP."""
         scale = np.array(self.file_size, dtype=np.float64) / self.network_size
         return ((self.keypoints.astype(np.float64) + 0.5) * scale).astype(np.float32)
 
@@ -57,7 +61,8 @@ class Features:
 
 @dataclass(frozen=True, kw_only=True)
 class FeatureSettings:
-    """Names and settings of an extractor and a matcher, each of which ignores the fields that it does not read."""
+    """Names and settings of an extractor and a matcher, each of which ignores the fields that it
+    does not read."""
 
     extractor: str
     matcher: str
@@ -72,7 +77,10 @@ class FeatureSettings:
     def extraction(self) -> dict[str, object]:
         """The settings that features depend on."""
         names = ["extractor", "max_image_size", "max_keypoints", "keypoint_threshold", "nms_radius"]
-        return {name: getattr(self, name) for name in names + ["aliked_model"] * (self.extractor == "aliked")}
+        return {
+            name: getattr(self, name)
+            for name in names + ["aliked_model"] * (self.extractor == "aliked")
+        }
 
     def matching(self) -> dict[str, object]:
         """The settings that matches depend on, in addition to the features."""
@@ -86,10 +94,11 @@ FORMAT_VERSION = 1  # to be raised when the same settings give different feature
 
 
 class FeatureStore:
-    """Store of features and matches below ``folder``: ``features/<key>.npz`` and ``matches/<key>.npy``.
+    """Store of features and matches below ``folder``: ``features/<key>.npz`` and
+    ``matches/<key>.npy``.
 
-    ``extraction`` and ``matching`` are the settings (plain values) that features and matches depend on. ``masks`` are
-    mask files by image name.
+    ``extraction`` and ``matching`` are the settings (plain values) that features and matches depend
+    on. ``masks`` are mask files by image name.
     """
 
     def __init__(
@@ -112,7 +121,9 @@ class FeatureStore:
 
     def matches_path(self, first: str, second: str) -> Path:
         """The matches file of a pair of images."""
-        key = _key([FORMAT_VERSION, self._image_key(first), self._image_key(second), self._matching])
+        key = _key(
+            [FORMAT_VERSION, self._image_key(first), self._image_key(second), self._matching]
+        )
         return self.folder / "matches" / f"{key}.npy"
 
     def read_features(self, name: str) -> Features | None:
@@ -127,7 +138,10 @@ class FeatureStore:
 
     def write_features(self, name: str, features: Features) -> None:
         """Store the features of the image ``name``."""
-        with atomic(self.features_path(name), sync=False) as temporary, temporary.open("wb") as file:
+        with (
+            atomic(self.features_path(name), sync=False) as temporary,
+            temporary.open("wb") as file,
+        ):
             np.savez(
                 file,
                 keypoints=features.keypoints,
@@ -146,21 +160,28 @@ class FeatureStore:
 
     def write_matches(self, first: str, second: str, matches: NDArray[np.uint32]) -> None:
         """Store the matches [M, 2] of a pair."""
-        with atomic(self.matches_path(first, second), sync=False) as temporary, temporary.open("wb") as file:
+        with (
+            atomic(self.matches_path(first, second), sync=False) as temporary,
+            temporary.open("wb") as file,
+        ):
             np.save(file, matches)
 
     def require_features(self, name: str) -> Features:
         """The stored features; raises ``GsbenchError`` if they are missing."""
         features = self.read_features(name)
         if features is None:
-            raise GsbenchError(f"the stored features of {name} are gone from {self.folder}: run again")
+            raise GsbenchError(
+                f"the stored features of {name} are gone from {self.folder}: run again"
+            )
         return features
 
     def require_matches(self, first: str, second: str) -> NDArray[np.uint32]:
         """The stored matches [M, 2] of a pair; raises ``GsbenchError`` if they are missing."""
         matches = self.read_matches(first, second)
         if matches is None:
-            raise GsbenchError(f"the stored matches of {first} and {second} are gone from {self.folder}: run again")
+            raise GsbenchError(
+                f"the stored matches of {first} and {second} are gone from {self.folder}: run again"
+            )
         return matches
 
     def _hash_image(self, name: str) -> str:

@@ -1,4 +1,5 @@
-"""Evaluation: renders the test views at 8 bits, as the PNGs hold them, and measures them by the protocol."""
+"""Evaluation: renders the test views at 8 bits, as the PNGs hold them, and measures them by the
+protocol."""
 
 from __future__ import annotations
 
@@ -31,7 +32,15 @@ from gsbench.pipeline.steps.scene import Views
 from gsbench.raster import Rasterizer
 from gsbench.raster.reference import project
 from gsbench.runs.keys import EVALUATE, Step, options_of, rasterizer_inputs, step_of
-from gsbench.runs.layout import ELLIPSOIDS, FIGURES, LINEAGE, METRICS, PER_VIEW, POINT_CLOUD, RENDERS
+from gsbench.runs.layout import (
+    ELLIPSOIDS,
+    FIGURES,
+    LINEAGE,
+    METRICS,
+    PER_VIEW,
+    POINT_CLOUD,
+    RENDERS,
+)
 from gsbench.runs.trial_record import Earlier, Evaluation
 from gsbench.scene.images import png_name, read_image
 from gsbench.scene.types import COUNTED, Camera, Scene, nearest_training_cameras
@@ -45,25 +54,37 @@ TIMED_RENDERS = 5  # of each view, to measure the speed
 
 
 def evaluate_step(views: Views, trained: Step, parts: Parts) -> Step:
-    """The step that renders and measures the model of ``trained`` and its snapshots of earlier iterations.
+    """The step that renders and measures the model of ``trained`` and its snapshots of earlier
+    iterations.
 
-    Where another program left renders instead of a model, the step measures those. ``eval.maps`` adds a picture of the
-    large Gaussians; ``eval.fps`` is the image size at which the speed of rendering is measured.
+    Where another program left renders instead of a model, the step measures those. ``eval.maps``
+    adds a picture of the large Gaussians; ``eval.fps`` is the image size at which the speed of
+    rendering is measured.
     """
     evaluator, user = parts.evaluator, parts.user_code
     inputs: dict[str, Any] = {
         "protocol": evaluator.protocol.id,
-        "unavailable": sorted(evaluator.unavailable),  # part of the key: weights that arrive later give a new result
+        # part of the key: weights that arrive later give a new result
+        "unavailable": sorted(evaluator.unavailable),
     }
-    own = {name: options_of("eval", metric, user, f"{EXTRA}.{name}") for name, metric in evaluator.extra.items()}
+    own = {
+        name: options_of("eval", metric, user, f"{EXTRA}.{name}")
+        for name, metric in evaluator.extra.items()
+    }
     further = {"extra": own, "more": list(evaluator.more), "fps": parts.eval.fps}
     inputs |= {name: value for name, value in further.items() if value}
     if parts.program is not None and not parts.program.leaves_model:
-        return step_of(EVALUATE, {"renders": trained.key} | inputs, _build_from_renders(views, trained, parts), user)
+        return step_of(
+            EVALUATE,
+            {"renders": trained.key} | inputs,
+            _build_from_renders(views, trained, parts),
+            user,
+        )
     inputs |= {"train": trained.key, "maps": parts.eval.maps}
     if parts.measured_earlier:
         inputs["earlier"] = parts.measured_earlier
-    if parts.program is not None:  # the key of `trained` covers the rendering only if gsbench trained
+    # the key of `trained` covers the rendering only if gsbench trained
+    if parts.program is not None:
         background = list(parts.train.background)
         inputs |= {"raster": rasterizer_inputs(parts.rasterizer, user), "background": background}
     return step_of(EVALUATE, inputs, _build_from_model(views, trained, parts), user)
@@ -79,7 +100,9 @@ def _build_from_model(views: Views, trained: Step, parts: Parts) -> Callable[[Pa
         color = torch.tensor(list(parts.train.background), device=device)  # [3]
         (folder / RENDERS).mkdir(exist_ok=True)
 
-        def measure(model: Gaussians, phase: str, renders: Path | None) -> dict[str, dict[str, float]]:
+        def measure(
+            model: Gaussians, phase: str, renders: Path | None
+        ) -> dict[str, dict[str, float]]:
             per_view = {}
             for done, view in enumerate(scene.test, 1):
                 with torch.no_grad():
@@ -95,21 +118,30 @@ def _build_from_model(views: Views, trained: Step, parts: Parts) -> Callable[[Pa
         with progress("evaluate") as report:
             per_view = measure(gaussians, "views", folder / RENDERS)
             for step in parts.measured_earlier:
-                if (snapshot := training / snapshot_file(step)).exists():  # else train.max_seconds ended it before
+                # else train.max_seconds ended it before
+                if (snapshot := training / snapshot_file(step)).exists():
                     model = read_ply(snapshot, device)
-                    means = summarize(measure(model, f"iteration {step}", None), evaluator.unavailable)
+                    means = summarize(
+                        measure(model, f"iteration {step}", None), evaluator.unavailable
+                    )
                     at[str(step)] = Earlier(metrics=means, num_gaussians=len(model))
         if parts.eval.maps:
             with np.load(training / LINEAGE) as lineage:
                 causes = torch.from_numpy(lineage["causes"][lineage["ids"]])  # [N]
             first = scene.test[0]
             picture = draw_ellipsoids(
-                read_image(folder / RENDERS / png_name(first.name)), gaussians, causes, first.camera, VOLUME_THRESHOLD
+                read_image(folder / RENDERS / png_name(first.name)),
+                gaussians,
+                causes,
+                first.camera,
+                VOLUME_THRESHOLD,
             )
             (folder / FIGURES).mkdir(exist_ok=True)
             picture.save(folder / FIGURES / ELLIPSOIDS)
         if parts.eval.fps is not None:
-            for view, speed in measure_speed(rasterizer, gaussians, scene, color, parts.eval.fps).items():
+            for view, speed in measure_speed(
+                rasterizer, gaussians, scene, color, parts.eval.fps
+            ).items():
                 per_view[view]["fps"] = speed
         _write_metrics(folder, evaluator, per_view, scene, at=at)
 
@@ -128,16 +160,25 @@ def _build_from_renders(views: Views, trained: Step, parts: Parts) -> Callable[[
                 image = read_image(folder / RENDERS / png_name(view.name))
                 per_view[view.name] = evaluator.evaluate_view(image, view.image, view.mask)
                 report("views", done, len(scene.test))
-        unknown = {} if parts.eval.fps is None else {"fps": "another program's renders are known, not its model"}
+        unknown = (
+            {}
+            if parts.eval.fps is None
+            else {"fps": "another program's renders are known, not its model"}
+        )
         _write_metrics(folder, evaluator, per_view, scene, unknown)
 
     return build
 
 
 def measure_speed(
-    rasterizer: Rasterizer, gaussians: Gaussians, scene: Scene, background: torch.Tensor, size: Sequence[int]
+    rasterizer: Rasterizer,
+    gaussians: Gaussians,
+    scene: Scene,
+    background: torch.Tensor,
+    size: Sequence[int],
 ) -> dict[str, float]:
-    """The renders per second of each test view at ``size`` (width, height) px, after one render that is not timed."""
+    """The renders per second of each test view at ``size`` (width, height) px, after one render
+    that is not timed."""
     speeds = {}
 
     def now() -> float:
@@ -146,7 +187,8 @@ def measure_speed(
         return time.perf_counter()
 
     for view in scene.test:
-        # The whole picture is scaled, and stretched if `size` has another shape: the same Gaussians stay in view.
+        # The whole picture is scaled, and stretched if `size` has another shape: the same Gaussians
+        # stay in view.
         camera = view.camera.resized(*size)
         with torch.no_grad():
             rasterizer.render(gaussians, camera, MAX_SH_DEGREE, background)
@@ -167,15 +209,19 @@ def _write_metrics(
 ) -> None:
     """Write the metrics of each view and their means.
 
-    Each view's row also says how near the training views are, and which share of its pixels counts under masks.
+    Each view's row also says how near the training views are, and which share of its pixels counts
+    under masks.
     """
     cameras, training = ([view.camera for view in views] for views in (scene.test, scene.train))
     near = nearest_training_cameras(cameras, training, scene.extent)
-    # These columns are no metrics, so they are kept apart from `per_view`, of which the means are taken.
+    # These columns are no metrics, so they are kept apart from `per_view`, of which the means are
+    # taken.
     facts = {view.name: distances for view, distances in zip(scene.test, near, strict=True)}
     if any(view.mask is not None for view in [*scene.train, *scene.test]):
         facts = {view.name: facts[view.name] | {COUNTED: view.counted} for view in scene.test}
-    write_per_view(folder / PER_VIEW, {view: dict(row) | facts.get(view, {}) for view, row in per_view.items()})
+    write_per_view(
+        folder / PER_VIEW, {view: dict(row) | facts.get(view, {}) for view, row in per_view.items()}
+    )
     summary = summary_of(evaluator, per_view)
     summary = replace(
         summary,
@@ -187,7 +233,8 @@ def _write_metrics(
 
 
 def one_color_psnr(scene: Scene, protocol: Protocol) -> float | None:
-    """The mean PSNR in dB of a picture in the training views' mean colour; a trained model must beat it.
+    """The mean PSNR in dB of a picture in the training views' mean colour; a trained model must
+    beat it.
 
     None without test views.
     """
@@ -200,14 +247,17 @@ def one_color_psnr(scene: Scene, protocol: Protocol) -> float | None:
     color = np.rint(sums / count).astype(np.uint8)
     evaluator = Evaluator(protocol, lpips=(), flip=False)
     values = [
-        evaluator.evaluate_view(np.broadcast_to(color, view.image.shape).copy(), view.image, view.mask)["psnr"]
+        evaluator.evaluate_view(
+            np.broadcast_to(color, view.image.shape).copy(), view.image, view.mask
+        )["psnr"]
         for view in scene.test
     ]
     return float(np.mean(values))
 
 
 def summary_of(evaluator: Evaluator, per_view: Mapping[str, Mapping[str, float]]) -> Evaluation:
-    """Summary of an evaluation: the means, the missing metrics and why, and the facts about a user's metrics."""
+    """Summary of an evaluation: the means, the missing metrics and why, and the facts about a
+    user's metrics."""
     return Evaluation(
         metrics=summarize(per_view, evaluator.unavailable),
         unavailable=dict(evaluator.unavailable),
@@ -236,18 +286,26 @@ TEXT_COLOR = (255, 255, 255)
 
 
 def draw_ellipsoids(
-    render: NDArray[np.uint8], gaussians: Gaussians, causes: torch.Tensor, camera: Camera, volume_threshold: float
+    render: NDArray[np.uint8],
+    gaussians: Gaussians,
+    causes: torch.Tensor,
+    camera: Camera,
+    volume_threshold: float,
 ) -> Image.Image:
-    """The view ``render`` [H, W, 3] with the outlines of the Gaussians above ``volume_threshold`` (cubed scene units).
+    """The view ``render`` [H, W, 3] with the outlines of the Gaussians above ``volume_threshold``
+    (cubed scene units).
 
-    An outline is the projected ellipsoid of one standard deviation. Its colour tells the rule that made the Gaussian
-    (``causes`` [N], see ``Cause``). At most the 1500 most voluminous are drawn. A legend stands below the view.
+    An outline is the projected ellipsoid of one standard deviation. Its colour tells the rule that
+    made the Gaussian (``causes`` [N], see ``Cause``). At most the 1500 most voluminous are drawn. A
+    legend stands below the view.
     """
     volumes = log_volume(gaussians.log_scales)  # [N]
     large = (volumes > math.log(volume_threshold)) & (gaussians.opacities > MIN_OPACITY)
     index = large.nonzero().flatten()
     index = index[torch.argsort(volumes[index], descending=True)][:MAX_OUTLINES]
-    projected = project(gaussians.select(index).map(lambda tensor: tensor.detach().double().cpu()), camera)
+    projected = project(
+        gaussians.select(index).map(lambda tensor: tensor.detach().double().cpu()), camera
+    )
     image = Image.fromarray(render).convert("RGB")
     canvas = ImageDraw.Draw(image)
     angles = np.linspace(0, math.tau, OUTLINE_POINTS)
@@ -260,13 +318,18 @@ def draw_ellipsoids(
         canvas.line([tuple(point) for point in outline.T.round().astype(int).tolist()], fill=color)
     drawn = [cause for cause in Cause if (causes[index[projected.index]] == int(cause)).any()]
     condition = f"with a volume above {volume_threshold:g}"
-    title = f"Gaussians {condition}, by what made them:" if drawn else f"no Gaussian {condition} here"
+    title = (
+        f"Gaussians {condition}, by what made them:" if drawn else f"no Gaussian {condition} here"
+    )
     return _with_legend(image, title, drawn)
 
 
 def _with_legend(image: Image.Image, title: str, causes: Sequence[Cause]) -> Image.Image:
-    """The image with a legend below: the title, and each cause in its colour, wrapped to the image's width."""
-    words = [(word, TEXT_COLOR) for word in title.split()] + [(cause.words, cause.color) for cause in causes]
+    """The image with a legend below: the title, and each cause in its colour, wrapped to the
+    image's width."""
+    words = [(word, TEXT_COLOR) for word in title.split()] + [
+        (cause.words, cause.color) for cause in causes
+    ]
     font = ImageFont.load_default(FONT_SIZE)
     places: list[tuple[int, int]] = []
     x, row = 0, 0

@@ -1,6 +1,7 @@
 """The photographs of a trial and its initial cloud.
 
-Photographs are read from the user's folder, masked, and resized to views; the test views are kept as PNG.
+Photographs are read from the user's folder, masked, and resized to views; the test views are kept
+as PNG.
 """
 
 from concurrent.futures import ThreadPoolExecutor
@@ -35,7 +36,15 @@ from gsbench.runs.layout import MASKS, VIEWS
 from gsbench.runs.store import Store
 from gsbench.scene.colmap import normalize_capture, write_frames
 from gsbench.scene.courtyard.render import render_courtyard
-from gsbench.scene.images import IMAGES, image_size, png_name, prepare_photograph, prepared_mask, read_image, write_mask
+from gsbench.scene.images import (
+    IMAGES,
+    image_size,
+    png_name,
+    prepare_photograph,
+    prepared_mask,
+    read_image,
+    write_mask,
+)
 from gsbench.scene.load import load_scene
 from gsbench.scene.options import Backdrop, SceneConfig, check_final_size
 from gsbench.scene.readers import (
@@ -62,7 +71,8 @@ class CaptureSource:
 
     @cached_property
     def step(self) -> Step | None:
-        """The step that makes the photographs, or that makes a COLMAP model of the cameras in ``transforms.json``.
+        """The step that makes the photographs, or that makes a COLMAP model of the cameras in
+        ``transforms.json``.
 
         None for a scene whose folder can be read directly.
         """
@@ -80,11 +90,15 @@ class CaptureSource:
         path, selection["masks"] = str(options.path), options.masks
         if options.kind == "transforms":
             assert made is not None
-            capture = read_transforms(self.name, path, self._transforms, made / SPARSE_FOLDERS[0], **selection)
+            capture = read_transforms(
+                self.name, path, self._transforms, made / SPARSE_FOLDERS[0], **selection
+            )
         elif options.kind == "photos":
             capture = read_photos(self.name, path, images=options.images, **selection)
         else:
-            capture = read_colmap(self.name, path, images=options.images, sparse=options.sparse, **selection)
+            capture = read_colmap(
+                self.name, path, images=options.images, sparse=options.sparse, **selection
+            )
         for name in capture.image_names:
             file = capture.images / name
             check_final_size(image_size(file), options.downscale, options.max_size, str(file))
@@ -107,7 +121,9 @@ def _courtyard_step(options: SceneConfig) -> Step:
 
 def _transforms_step(transforms: Transforms) -> Step:
     """The step that writes the cameras and points of ``transforms.json`` as a COLMAP model."""
-    sizes = {name: [camera.width, camera.height] for name, (camera, *_) in transforms.images.items()}
+    sizes = {
+        name: [camera.width, camera.height] for name, (camera, *_) in transforms.images.items()
+    }
     inputs = {"transforms": [file_sha256(file) for file in transforms.sources], "sizes": sizes}
 
     def build(target: Path) -> None:
@@ -124,7 +140,8 @@ def _transforms_step(transforms: Transforms) -> Step:
 def masking_step(capture: Capture, backdrop: Backdrop) -> Step | None:
     """The step that replaces masked and transparent pixels before any other step sees them.
 
-    None for a capture without masks whose transparent pixels become black: images are read so anyway.
+    None for a capture without masks whose transparent pixels become black: images are read so
+    anyway.
     """
     if not capture.masks and backdrop == "black":
         return None
@@ -137,9 +154,15 @@ def masking_step(capture: Capture, backdrop: Backdrop) -> Step | None:
 
     def build(folder: Path) -> None:
         names = capture.image_names
-        with progress("scene") as report, ThreadPoolExecutor(max_workers=available_threads()) as pool:
+        with (
+            progress("scene") as report,
+            ThreadPoolExecutor(max_workers=available_threads()) as pool,
+        ):
             made = pool.map(
-                lambda name: prepare_photograph(folder, capture.images, capture.masks, name, backdrop), names
+                lambda name: prepare_photograph(
+                    folder, capture.images, capture.masks, name, backdrop
+                ),
+                names,
             )
             for done, _ in enumerate(made, 1):
                 report("pixels replaced", done, len(names))
@@ -154,13 +177,17 @@ def masked_capture(capture: Capture, folder: Path) -> Capture:
 
 
 def normalizing_step(capture: Capture) -> Step | None:
-    """The step that moves the capture's model to the coordinates of the training; None if it stays where it is.
+    """The step that moves the capture's model to the coordinates of the training; None if it stays
+    where it is.
 
     It comes before the initialisation, so triangulation and the reading of points work there too.
     """
     if capture.advised_normalization.is_identity:
         return None
-    inputs = {"capture": capture.fingerprint, "normalization": asdict(capture.advised_normalization)}
+    inputs = {
+        "capture": capture.fingerprint,
+        "normalization": asdict(capture.advised_normalization),
+    }
 
     def build(folder: Path) -> None:
         normalize_capture(capture, folder / MODEL_FOLDER)
@@ -195,7 +222,8 @@ class Views:
 
     @cached_property
     def scene(self) -> Scene:
-        """The undistorted and shrunk views without copies of test views in training; ``init`` must be built.
+        """The undistorted and shrunk views without copies of test views in training; ``init`` must
+        be built.
 
         Prepared images are cached in the store.
         """
@@ -213,11 +241,15 @@ class Views:
 
 @cache
 def view_versions() -> dict[str, str | None]:
-    """The versions of the code that makes the views' pixels: edited parts of gsbench's source, and packages.
+    """The versions of the code that makes the views' pixels: edited parts of gsbench's source, and
+    packages.
 
     Pillow reads and shrinks images, pycolmap undistorts them.
     """
-    return {**edited(states_of(VIEWS_ROOMS)), **{package: version_of(package) for package in ("pycolmap", "pillow")}}
+    return {
+        **edited(states_of(VIEWS_ROOMS)),
+        **{package: version_of(package) for package in ("pycolmap", "pillow")},
+    }
 
 
 def ground_truth_step(views: Views) -> Step:
@@ -243,7 +275,8 @@ def init_step(
     reference: Step | None = None,
     user: UserCode = NO_USER_CODE,
 ) -> Step:
-    """The initialiser's step. ``reference`` is the step that reconstructs cameras for a capture without them."""
+    """The initialiser's step. ``reference`` is the step that reconstructs cameras for a capture
+    without them."""
     inputs = {
         "capture": capture.fingerprint,
         "test": sha256_of(list(capture.test_names)),
@@ -264,7 +297,8 @@ def init_step(
 
 
 def check_readable(capture: Capture, report: Progress) -> None:
-    """Decode every photograph once, so that a damaged file is named before hours of work. Raises InputError."""
+    """Decode every photograph once, so that a damaged file is named before hours of work. Raises
+    InputError."""
     with ThreadPoolExecutor(max_workers=available_threads()) as pool:
         made = pool.map(lambda name: read_image(capture.images / name).shape, capture.image_names)
         for done, _ in enumerate(made, 1):

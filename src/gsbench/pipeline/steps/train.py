@@ -20,9 +20,21 @@ from numpy.typing import NDArray
 from gsbench.densify import Densifier, Lineage
 from gsbench.densify.volumetric import Volumetric
 from gsbench.errors import InputError, TrainingError
-from gsbench.external.exchange import collect_model, collect_renders, write_test_cameras, write_training_views
+from gsbench.external.exchange import (
+    collect_model,
+    collect_renders,
+    write_test_cameras,
+    write_training_views,
+)
 from gsbench.external.program import run_program
-from gsbench.external.settings import DATA, OUTPUT, TEST_CAMERAS, External, fill_placeholders, split_command
+from gsbench.external.settings import (
+    DATA,
+    OUTPUT,
+    TEST_CAMERAS,
+    External,
+    fill_placeholders,
+    split_command,
+)
 from gsbench.files import write_json
 from gsbench.gaussians.initial import gaussians_from_cloud
 from gsbench.gaussians.model import Gaussians, dc_to_rgb
@@ -54,13 +66,16 @@ log = logging.getLogger(__name__)
 def train_step(views: Views, parts: Parts) -> Step:
     """The step that trains on the training views, from the initialiser's cloud.
 
-    It also keeps snapshots of the model at the earlier iterations of ``eval.at``, for `evaluate_step`.
+    It also keeps snapshots of the model at the earlier iterations of ``eval.at``, for
+    `evaluate_step`.
     """
     densifier, rasterizer, options, seed = parts.trainer, parts.rasterizer, parts.train, parts.seed
     assert isinstance(densifier, Densifier)
     device, snapshot_at, user = parts.device, parts.measured_earlier, parts.user_code
     values = dataclasses.asdict(options)
-    train_options = {key: value for key, value in values.items() if key not in WITHOUT_EFFECT_ON_MODEL}
+    train_options = {
+        key: value for key, value in values.items() if key not in WITHOUT_EFFECT_ON_MODEL
+    }
     inputs: dict[str, Any] = {
         "scene": views.inputs,
         "init": views.init.key,
@@ -101,50 +116,79 @@ def train_step(views: Views, parts: Parts) -> Step:
     return step_of(TRAIN, inputs, build, user)
 
 
-def check_gaussians(initial: Gaussians, scene: Scene, parts: Parts, normalization: Normalization) -> InitialCloud:
+def check_gaussians(
+    initial: Gaussians, scene: Scene, parts: Parts, normalization: Normalization
+) -> InitialCloud:
     """Check the Gaussians that training starts from against the training views (`check_start`)."""
     colors = (dc_to_rgb(initial.sh_dc).clamp(0, 1) * 255).round().byte()  # [N, 3]
-    return check_points(initial.means.double().cpu().numpy(), colors.cpu().numpy(), scene, parts, normalization)
+    return check_points(
+        initial.means.double().cpu().numpy(), colors.cpu().numpy(), scene, parts, normalization
+    )
 
 
 def check_points(
-    points: NDArray[np.float64], colors: NDArray[np.uint8], scene: Scene, parts: Parts, normalization: Normalization
+    points: NDArray[np.float64],
+    colors: NDArray[np.uint8],
+    scene: Scene,
+    parts: Parts,
+    normalization: Normalization,
 ) -> InitialCloud:
     """Check the points that training starts from against the training views (`check_start`)."""
     # A user's initialiser may be of any class.
-    return check_start(points, colors, scene, getattr(parts.initializer, "random_points", False), normalization)
+    return check_start(
+        points, colors, scene, getattr(parts.initializer, "random_points", False), normalization
+    )
 
 
 def _log_normalization(capture: Capture, densifier: Densifier) -> None:
-    """Log the coordinates of the training if they are not those of the scene, and V_th in the scene's own units."""
+    """Log the coordinates of the training if they are not those of the scene, and V_th in the
+    scene's own units."""
     normalization = capture.normalization
     if normalization.is_identity:
         return
     log.info(
-        "scene %s: training has its cameras around the origin, at %.6g times the scale (the given centre is %s); "
+        "scene %s: training has its cameras around the origin, at %.6g times the scale (the given "
+        "centre is %s); "
         "results get the given coordinates",
-        capture.name, normalization.scale, ", ".join(f"{value:.10g}" for value in normalization.center),
-    )  # fmt: skip
+        capture.name,
+        normalization.scale,
+        ", ".join(f"{value:.10g}" for value in normalization.center),
+    )
     if isinstance(densifier, Volumetric) and densifier.threshold_mode == "absolute":
         own = densifier.volume_threshold / normalization.scale**3
-        log.info("densify.volume_threshold=%g is %.4g cubed units of the scene", densifier.volume_threshold, own)
+        log.info(
+            "densify.volume_threshold=%g is %.4g cubed units of the scene",
+            densifier.volume_threshold,
+            own,
+        )
 
 
 def _write_training(
-    folder: Path, summary: Mapping[str, Any], lineage: Lineage | None, device: torch.device, start: InitialCloud
+    folder: Path,
+    summary: Mapping[str, Any],
+    lineage: Lineage | None,
+    device: torch.device,
+    start: InitialCloud,
 ) -> None:
-    """Write the lineage of a trained model, and the ``summary`` of the training with further facts."""
+    """Write the lineage of a trained model, and the ``summary`` of the training with further
+    facts."""
     causes: dict[str, int] = {}
     if lineage is not None:
         causes = lineage.causes_of_living()
-        arrays: dict[str, Any] = {name: tensor.numpy() for name, tensor in lineage.state_dict().items()}
+        arrays: dict[str, Any] = {
+            name: tensor.numpy() for name, tensor in lineage.state_dict().items()
+        }
         np.savez_compressed(folder / LINEAGE, **arrays)
     machine = {"machine": describe_machine(device), "checkout": own_checkout()}
-    write_json(folder / TRAINING, {**summary, "causes": causes, "initial_cloud": start.to_json(), **machine})
+    write_json(
+        folder / TRAINING,
+        {**summary, "causes": causes, "initial_cloud": start.to_json(), **machine},
+    )
 
 
 def initial_gaussians(init: Path, device: torch.device) -> Gaussians:
-    """The Gaussians that training starts from: the initialiser's own in the folder ``init``, or one per point."""
+    """The Gaussians that training starts from: the initialiser's own in the folder ``init``, or one
+    per point."""
     if (init / GAUSSIANS_FILE).exists():
         return read_ply(init / GAUSSIANS_FILE, device)
     cloud = read_cloud(init / MODEL_FOLDER)
@@ -161,16 +205,23 @@ OWN_VARIABLES = "GSBENCH_"  # prefix of gsbench's own settings, which the progra
 
 
 def external_step(views: Views, trainer: External, parts: Parts) -> Step:
-    """The step in which ``trainer`` trains on the training views, from the cloud of the initialiser.
+    """The step in which ``trainer`` trains on the training views, from the cloud of the
+    initialiser.
 
     Raises InputError for a capture with masks.
     """
     if views.capture.masks:
         raise InputError(
-            f"densify={parts.values['densify']['name']}: another program gets no masks, so it would train on "
+            f"densify={parts.values['densify']['name']}: another program gets no masks, so it "
+            "would train on "
             "ignored pixels: leave scene.masks out, or train with gsbench"
         )
-    iterations, seed, device, threads = parts.train.iterations, parts.seed, parts.device, parts.threads
+    iterations, seed, device, threads = (
+        parts.train.iterations,
+        parts.seed,
+        parts.device,
+        parts.threads,
+    )
     inputs: dict[str, Any] = {
         "contract": CONTRACT,
         "scene": views.inputs,
@@ -187,9 +238,18 @@ def external_step(views: Views, trainer: External, parts: Parts) -> Step:
         executable, work, log_file = trainer.executable(), folder / WORK, folder / TRAINER_LOG
         places = {name: work / name for name in (DATA, TEST_CAMERAS, OUTPUT)}
         values = {name: str(place.resolve()) for name, place in places.items()} | trainer.options
-        values |= {"iterations": iterations, "seed": seed, "device": str(device), "threads": threads}
-        placeholders = {name: f"{{{name}}}" for name in places}  # for the record: the build's folders vanish
-        command = [executable, *(fill_placeholders(word, values, "densify.command") for word in trainer.words[1:])]
+        values |= {
+            "iterations": iterations,
+            "seed": seed,
+            "device": str(device),
+            "threads": threads,
+        }
+        # for the record: the build's folders vanish
+        placeholders = {name: f"{{{name}}}" for name in places}
+        command = [
+            executable,
+            *(fill_placeholders(word, values, "densify.command") for word in trainer.words[1:]),
+        ]
         environment = environment_of(trainer, values)
         version_output = check_version(trainer, values, environment)
         places[OUTPUT].mkdir(parents=True)
@@ -208,12 +268,19 @@ def external_step(views: Views, trainer: External, parts: Parts) -> Step:
         count, lineage = None, None
         try:
             if trainer.leaves_model:
-                count = len(collect_model(places[OUTPUT], pattern, folder / POINT_CLOUD, normalization))
-                lineage = Lineage(count)  # without causes: which rule made a Gaussian is unknown here
+                count = len(
+                    collect_model(places[OUTPUT], pattern, folder / POINT_CLOUD, normalization)
+                )
+                # without causes: which rule made a Gaussian is unknown here
+                lineage = Lineage(count)
             else:
-                collect_renders(places[OUTPUT], pattern, trainer.by_order, scene.test, folder / RENDERS)
+                collect_renders(
+                    places[OUTPUT], pattern, trainer.by_order, scene.test, folder / RENDERS
+                )
         except TrainingError as error:
-            raise TrainingError(f"{Path(trainer.program).name} ended well, but {error}; log: {log_file}") from error
+            raise TrainingError(
+                f"{Path(trainer.program).name} ended well, but {error}; log: {log_file}"
+            ) from error
         shutil.rmtree(work)
         (folder / EVENTS).write_text("")
         summary = {
@@ -230,19 +297,22 @@ def external_step(views: Views, trainer: External, parts: Parts) -> Step:
                 "version": trainer.version,
                 "said": version_output,
                 "command": [
-                    fill_placeholders(word, values | placeholders, "densify.command") for word in trainer.words
+                    fill_placeholders(word, values | placeholders, "densify.command")
+                    for word in trainer.words
                 ],
             },
         }
         _write_training(folder, summary, lineage, device, start)
 
-    # Its own version: changes of gsbench's trainer do not concern it. A stopped program starts from the beginning.
+    # Its own version: changes of gsbench's trainer do not concern it. A stopped program starts from
+    # the beginning.
     stage = replace(TRAIN, version=1, resumable=False)
     return step_of(stage, inputs, build)
 
 
 def environment_of(trainer: External, values: Mapping[str, object]) -> dict[str, str]:
-    """The program's environment: gsbench's without its own variables, and what ``densify.environment`` adds."""
+    """The program's environment: gsbench's without its own variables, and what
+    ``densify.environment`` adds."""
     # Without SAFE_PATH, too: a train.py must find the modules beside it.
     inherited = {
         name: value
@@ -255,15 +325,20 @@ def environment_of(trainer: External, values: Mapping[str, object]) -> dict[str,
     }
 
 
-def check_version(trainer: External, values: Mapping[str, object], environment: Mapping[str, str]) -> str | None:
-    """Run ``densify.version_command`` and return its output on one line; None if there is no such command.
+def check_version(
+    trainer: External, values: Mapping[str, object], environment: Mapping[str, str]
+) -> str | None:
+    """Run ``densify.version_command`` and return its output on one line; None if there is no such
+    command.
 
     Raises `InputError` unless the output contains ``densify.version``.
     """
     if trainer.version_command is None:
         return None
     key = "densify.version_command"
-    command = [fill_placeholders(word, values, key) for word in split_command(trainer.version_command, key)]
+    command = [
+        fill_placeholders(word, values, key) for word in split_command(trainer.version_command, key)
+    ]
     try:
         # In an empty folder: `python -c` would import modules that lie in the current one.
         with tempfile.TemporaryDirectory(prefix="gsbench-version-") as empty:
@@ -283,7 +358,8 @@ def check_version(trainer: External, values: Mapping[str, object], environment: 
     output = " ".join((done.stdout + done.stderr).split())
     if trainer.version not in output:
         raise InputError(
-            f"densify.version is {trainer.version!r}, but `{' '.join(command)}` says {output[:MAX_OUTPUT]!r}: results "
+            f"densify.version is {trainer.version!r}, but `{' '.join(command)}` says "
+            f"{output[:MAX_OUTPUT]!r}: results "
             "are kept by the version, so set densify.version to what it is"
         )
     return output

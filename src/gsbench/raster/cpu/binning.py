@@ -1,8 +1,8 @@
 """Lists of the records that each tile composites, front to back.
 
-The records are sorted once by depth. Then shards of the sorted order are counted and written to the lists in that
-order, so the list of each tile is sorted, too. Tiles that the contour alpha = 1/255 does not reach are left out,
-because the Gaussian is invisible there.
+The records are sorted once by depth. Then shards of the sorted order are counted and written to the
+lists in that order, so the list of each tile is sorted, too. Tiles that the contour alpha = 1/255
+does not reach are left out, because the Gaussian is invisible there.
 """
 
 import math
@@ -26,10 +26,12 @@ PASSES = 3  # over the 31 bits of a positive float32
 
 @kernel
 def sort_by_depth(begins, visible, keys, order, spare, counts):
-    """Sort the ``keys`` of all shards by depth into ``order``; shard s has ``visible[s]`` keys from ``begins[s]`` on.
+    """Sort the ``keys`` of all shards by depth into ``order``; shard s has ``visible[s]`` keys from
+    ``begins[s]`` on.
 
-    The sort is stable. ``spare`` is as long as ``order``; ``counts`` [PASSES, BUCKETS] is scratch. It is a radix sort,
-    lowest digit first (Knuth, TAOCP 3, 5.2.5), 3 to 8 times as fast as numpy's sort.
+    The sort is stable. ``spare`` is as long as ``order``; ``counts`` [PASSES, BUCKETS] is scratch.
+    It is a radix sort, lowest digit first (Knuth, TAOCP 3, 5.2.5), 3 to 8 times as fast as numpy's
+    sort.
     """
     for digit in range(PASSES):
         for bucket in range(BUCKETS):
@@ -64,15 +66,16 @@ def _put(key, digit, counts, target):
 
 @inlined
 def _columns(records, base, tile_y, first, past, reach, flatness):
-    """The tiles of row ``tile_y``, within ``first`` to ``past``, that the contour reaches: first, past-the-last.
+    """The tiles of row ``tile_y``, within ``first`` to ``past``, that the contour reaches: first,
+    past-the-last.
 
     The contour is t^2 = ``reach`` - ``flatness`` dy^2, with t = dx + shear dy.
     """
     shear, mean_y = np.float64(records[base + at.SHEAR]), np.float64(records[base + at.MEAN_Y])
     top = tile_y * at.TILE - mean_y - PIXEL_MARGIN
     bottom = top + (at.TILE - 1) + 2 * PIXEL_MARGIN
-    # As a function of y, the contour's right side is concave and its left side convex. So the extremes within the row
-    # are at the rightmost and the leftmost point, clamped to the row.
+    # As a function of y, the contour's right side is concave and its left side convex. So the
+    # extremes within the row are at the rightmost and the leftmost point, clamped to the row.
     rightmost = np.float64(records[base + at.RIGHTMOST_Y])
     y_right = min(max(rightmost, top), bottom)
     y_left = min(max(-rightmost, top), bottom)
@@ -85,15 +88,21 @@ def _columns(records, base, tile_y, first, past, reach, flatness):
 
 
 @kernel
-def pair_shards(first, past, edges, keys, records, record_ints, tiles_x, cutoff, counts, pairs, made):
-    """Write all pairs of tile (high word) and record, for the shards ``first`` to ``past`` of the sorted ``keys``.
+def pair_shards(
+    first, past, edges, keys, records, record_ints, tiles_x, cutoff, counts, pairs, made
+):
+    """Write all pairs of tile (high word) and record, for the shards ``first`` to ``past`` of the
+    sorted ``keys``.
 
-    Shard s has the keys from ``edges[s]`` to ``edges[s + 1]`` and writes to ``pairs[s]``. ``counts[s]`` [tiles] gets
-    the number of pairs of each tile, ``made[s]`` the total. Pairs for which ``pairs`` has no room are only counted.
+    Shard s has the keys from ``edges[s]`` to ``edges[s + 1]`` and writes to ``pairs[s]``.
+    ``counts[s]`` [tiles] gets the number of pairs of each tile, ``made[s]`` the total. Pairs for
+    which ``pairs`` has no room are only counted.
     """
     for shard in range(first, past):
         begin, end = edges[shard], edges[shard + 1]
-        made[shard] = _pair(begin, end, keys, records, record_ints, tiles_x, cutoff, counts[shard], pairs[shard])
+        made[shard] = _pair(
+            begin, end, keys, records, record_ints, tiles_x, cutoff, counts[shard], pairs[shard]
+        )
 
 
 @inlined
@@ -109,7 +118,9 @@ def _pair(begin, end, keys, records, record_ints, tiles_x, cutoff, counts, pairs
         spans_x, spans_y = record_ints[base + at.TILES_X], record_ints[base + at.TILES_Y]
         first, past = spans_x & 0xFFFF, spans_x >> 16
         inverse = -1.0 / np.float64(records[base + at.CURVE_T])
-        reach = (np.float64(records[base + at.LOG2_OPACITY]) - cutoff + LOG2_ALPHA_MIN_MARGIN) * inverse
+        reach = (
+            np.float64(records[base + at.LOG2_OPACITY]) - cutoff + LOG2_ALPHA_MIN_MARGIN
+        ) * inverse
         flatness = np.float64(records[base + at.CURVE_Y]) * -inverse
         for tile_y in range(spans_y & 0xFFFF, spans_y >> 16):
             low, high = first, past
@@ -125,7 +136,8 @@ def _pair(begin, end, keys, records, record_ints, tiles_x, cutoff, counts, pairs
 
 @kernel
 def start_tiles(counts, starts):
-    """Replace ``counts`` [shards, tiles] by places of first entries; fill ``starts`` [tiles + 1], those of tiles."""
+    """Replace ``counts`` [shards, tiles] by places of first entries; fill ``starts`` [tiles + 1],
+    those of tiles."""
     shards, tiles = counts.shape
     place = 0
     for tile in range(tiles):
@@ -141,7 +153,8 @@ def start_tiles(counts, starts):
 def fill_shards(first, past, made, pairs, places, entries):
     """Write the records of the shards ``first`` to ``past`` to the lists of their tiles.
 
-    Shard s has ``made[s]`` of ``pairs[s]``; ``places[s]`` [tiles] is where its next entry of each tile goes.
+    Shard s has ``made[s]`` of ``pairs[s]``; ``places[s]`` [tiles] is where its next entry of each
+    tile goes.
     """
     for shard in range(first, past):
         own_pairs, own_places = pairs[shard], places[shard]
@@ -153,13 +166,16 @@ def fill_shards(first, past, made, pairs, places, entries):
 
 @kernel
 def balance_tiles(starts, shards, bounds, tile_shard):
-    """Divide the tiles into ``shards`` runs of similar work; fill ``bounds`` [shards + 1] and ``tile_shard``."""
+    """Divide the tiles into ``shards`` runs of similar work; fill ``bounds`` [shards + 1] and
+    ``tile_shard``."""
     tiles = len(tile_shard)
     total = starts[tiles] + TILE_WORK * tiles
     tile = 0
     bounds[0] = 0
     for shard in range(shards):
-        while tile < tiles and (starts[tile + 1] + TILE_WORK * (tile + 1)) * shards <= total * (shard + 1):
+        while tile < tiles and (starts[tile + 1] + TILE_WORK * (tile + 1)) * shards <= total * (
+            shard + 1
+        ):
             tile_shard[tile] = shard
             tile += 1
         bounds[shard + 1] = tile

@@ -1,7 +1,7 @@
 """Compositing of tiles, forward and backward, 4x4 pixels at a time; and footprints.
 
-A tile is 16 blocks of 4x4 pixels. The state of a block is one vector per quantity. A bit mask has the blocks that a
-record may touch; the forward pass stores it in ``masks`` for the backward pass.
+A tile is 16 blocks of 4x4 pixels. The state of a block is one vector per quantity. A bit mask has
+the blocks that a record may touch; the forward pass stores it in ``masks`` for the backward pass.
 """
 
 import math
@@ -40,29 +40,39 @@ LOG2_BLOCK_MIN = np.float32(math.log2(CONSTANTS.alpha_min) - 0.01)
 ONE = np.float32(1)
 ZERO = np.float32(0)
 BLOCK_SPAN = np.float32(BLOCK - 1)
-TO_PRECISION = np.float32(2 * math.log(2.0))  # -curve to entry of the inverse covariance, up to sign
-BATCH = 64  # entries that the forward pass blends at a time, block by block: the number of bits of a word
+# -curve to entry of the inverse covariance, up to sign
+TO_PRECISION = np.float32(2 * math.log(2.0))
+# entries that the forward pass blends at a time, block by block: the number of bits of a word
+BATCH = 64
 BATCH_AHEAD = 24  # entries ahead that the forward pass prefetches
 AHEAD = 6  # entries ahead that the backward pass prefetches; it works longer on each
 NEVER_STOPPED = np.float32(1e9)  # larger than the number of entries of any tile
-# Lanes of a footprint's row: number of pixels, sum of values, sum of distances; in the order of ``lane_sums``.
+# Lanes of a footprint's row: number of pixels, sum of values, sum of distances; in the order of
+# ``lane_sums``.
 COVERED, VALUES, DISTANCES = at.SUM_H, at.SUM_H_T, at.SUM_H_Y
 
 LANE_X = (np.arange(LANES) % BLOCK).astype(np.float32)  # px within a block
 LANE_Y = (np.arange(LANES) // BLOCK).astype(np.float32)
 # px within a tile, by block and lane
-PIXEL_X = np.concatenate([block % BLOCK * BLOCK + LANE_X for block in range(LANES)]).astype(np.float32)
-PIXEL_Y = np.concatenate([block // BLOCK * BLOCK + LANE_Y for block in range(LANES)]).astype(np.float32)
+PIXEL_X = np.concatenate([block % BLOCK * BLOCK + LANE_X for block in range(LANES)]).astype(
+    np.float32
+)
+PIXEL_Y = np.concatenate([block // BLOCK * BLOCK + LANE_Y for block in range(LANES)]).astype(
+    np.float32
+)
 
 
 @inlined
 def _touched_blocks(records, base, tile_x, tile_y, column, row):
     """Bit b: block b of the tile at pixel (tile_x, tile_y) may have a pixel with alpha >= 1/255.
 
-    Within a block, alpha is largest at the mean or, if the mean is outside, on an edge that faces the mean. The maximum
-    on a vertical or horizontal line has a closed form, which is clamped to the block. Lane b is block b.
+    Within a block, alpha is largest at the mean or, if the mean is outside, on an edge that faces
+    the mean. The maximum on a vertical or horizontal line has a closed form, which is clamped to
+    the block. Lane b is block b.
     """
-    left = column + (tile_x - records[base + at.MEAN_X])  # [16] dx of the first column of each block
+    left = column + (
+        tile_x - records[base + at.MEAN_X]
+    )  # [16] dx of the first column of each block
     top = row + (tile_y - records[base + at.MEAN_Y])
     right, bottom = left + BLOCK_SPAN, top + BLOCK_SPAN
     shear = records[base + at.SHEAR]
@@ -71,8 +81,10 @@ def _touched_blocks(records, base, tile_x, tile_y, column, row):
 
     edge_x = maximum(left, minimum(right, splat(ZERO)))
     edge_y = maximum(top, minimum(bottom, splat(ZERO)))
-    on_x = maximum(top, minimum(bottom, edge_x * records[base + at.SLOPE]))  # dy of the best point on the vertical edge
-    on_y = maximum(left, minimum(right, edge_y * (-shear)))  # dx of the best point on the horizontal edge
+    # dy of the best point on the vertical edge
+    on_x = maximum(top, minimum(bottom, edge_x * records[base + at.SLOPE]))
+    # dx of the best point on the horizontal edge
+    on_y = maximum(left, minimum(right, edge_y * (-shear)))
     t_x = fma(on_x, shear, edge_x)
     t_y = fma(edge_y, shear, on_y)
     best_x = fma(curve_t * t_x, t_x, curve_y * on_x * on_x)
@@ -84,8 +96,8 @@ def _touched_blocks(records, base, tile_x, tile_y, column, row):
 def composite_tiles(memory, first, past, frame, image, alpha):
     """Blend the tiles ``first`` to ``past`` into ``image`` [H * W * 3] and ``alpha`` [H * W].
 
-    It fills ``masks``, ``processed``, ``transmittance`` and ``last`` of ``frame`` for the backward pass. ``last`` is
-    `NEVER_STOPPED` for pixels that no entry stopped, and 0 outside the image.
+    It fills ``masks``, ``processed``, ``transmittance`` and ``last`` of ``frame`` for the backward
+    pass. ``last`` is `NEVER_STOPPED` for pixels that no entry stopped, and 0 outside the image.
     """
     entries, masks, records = frame.entries, frame.masks, frame.records
     transmittance, last = frame.transmittance, frame.last
@@ -93,9 +105,16 @@ def composite_tiles(memory, first, past, frame, image, alpha):
     lane_x, lane_y = load(LANE_X, 0), load(LANE_Y, 0)
     column, row = lane_x * np.float32(BLOCK), lane_y * np.float32(BLOCK)
     floats, integers = memory
-    red, green, blue = floats[: at.TILE_PIXELS], floats[at.TILE_PIXELS :], floats[2 * at.TILE_PIXELS :]
+    red, green, blue = (
+        floats[: at.TILE_PIXELS],
+        floats[at.TILE_PIXELS :],
+        floats[2 * at.TILE_PIXELS :],
+    )
     batch = floats[3 * at.TILE_PIXELS :]  # [BATCH * RECORD]
-    live, touched = integers[:LANES], integers[LANES:].view(np.uint16)  # [16] pixels by block, [BATCH] blocks by entry
+    live, touched = (
+        integers[:LANES],
+        integers[LANES:].view(np.uint16),
+    )  # [16] pixels by block, [BATCH] blocks by entry
     for tile in range(first, past):
         left, top = tile % tiles_x * at.TILE, tile // tiles_x * at.TILE
         tile_x, tile_y = np.float32(left), np.float32(top)
@@ -108,15 +127,20 @@ def composite_tiles(memory, first, past, frame, image, alpha):
             store(blue, place, splat(ZERO))
             store(transmittance, state + place, splat(ONE))
             x, y = left + block % 4 * BLOCK, top + block // 4 * BLOCK
-            live[block] = mask_bits((lane_x < np.float32(width - x)) & (lane_y < np.float32(height - y)))
-            store(last, state + place, select(mask_from_bits(live[block]), splat(NEVER_STOPPED), ZERO))
+            live[block] = mask_bits(
+                (lane_x < np.float32(width - x)) & (lane_y < np.float32(height - y))
+            )
+            store(
+                last, state + place, select(mask_from_bits(live[block]), splat(NEVER_STOPPED), ZERO)
+            )
             if live[block] != 0:
                 alive |= np.uint64(1) << np.uint64(block)
 
-        # Entries are blended in batches, and within a batch block by block. So the state of a block stays in registers
-        # for a whole batch; entry by entry, it would be loaded and stored for every entry, and each load would wait for
-        # the store before it. The first loop has no branch that depends on a record, so no branch is mispredicted. It
-        # also brings the records into the first-level cache, where the second loop reads them up to 16 times.
+        # Entries are blended in batches, and within a batch block by block. So the state of a block
+        # stays in registers for a whole batch; entry by entry, it would be loaded and stored for
+        # every entry, and each load would wait for the store before it. The first loop has no
+        # branch that depends on a record, so no branch is mispredicted. It also brings the records
+        # into the first-level cache, where the second loop reads them up to 16 times.
         begin, end = frame.starts[tile], frame.starts[tile + 1]
         entry = begin
         while entry < end and alive != 0:
@@ -128,7 +152,8 @@ def composite_tiles(memory, first, past, frame, image, alpha):
                 touched[k] = blocks
                 masks[entry + k] = blocks
                 store(batch, k * at.RECORD, load(records, base))
-                batch[k * at.RECORD + at.MEAN_X] = tile_x - records[base + at.MEAN_X]  # from mean to tile
+                # from mean to tile
+                batch[k * at.RECORD + at.MEAN_X] = tile_x - records[base + at.MEAN_X]
                 batch[k * at.RECORD + at.MEAN_Y] = tile_y - records[base + at.MEAN_Y]
             for k in range(count, BATCH):
                 touched[k] = 0
@@ -137,7 +162,8 @@ def composite_tiles(memory, first, past, frame, image, alpha):
                 block = lowest_bit(blocks)
                 bit = np.uint64(1) << block
                 blocks &= blocks - np.uint64(1)
-                todo = lanes_with_bit(touched, 0, bit)  # bit k: entry k of the batch touches this block
+                # bit k: entry k of the batch touches this block
+                todo = lanes_with_bit(touched, 0, bit)
                 if todo == 0:
                     continue
                 place = block * np.uint64(LANES)
@@ -152,8 +178,13 @@ def composite_tiles(memory, first, past, frame, image, alpha):
                     dx = pixel_x + batch[base + np.uint64(at.MEAN_X)]
                     dy = pixel_y + batch[base + np.uint64(at.MEAN_Y)]
                     t = fma(dy, batch[base + np.uint64(at.SHEAR)], dx)
-                    along_t = fma(t * batch[base + np.uint64(at.CURVE_T)], t, batch[base + np.uint64(at.LOG2_OPACITY)])
-                    power = fma(dy * batch[base + np.uint64(at.CURVE_Y)], dy, along_t)  # log2(alpha)
+                    along_t = fma(
+                        t * batch[base + np.uint64(at.CURVE_T)],
+                        t,
+                        batch[base + np.uint64(at.LOG2_OPACITY)],
+                    )
+                    # log2(alpha)
+                    power = fma(dy * batch[base + np.uint64(at.CURVE_Y)], dy, along_t)
                     blend = (power >= LOG2_ALPHA_MIN) & lanes
                     weight = before * minimum(exp2(power), splat(ALPHA_MAX))
                     after = before - weight
@@ -161,13 +192,18 @@ def composite_tiles(memory, first, past, frame, image, alpha):
                     stopped = mask_bits(stop)
                     if stopped != 0:
                         number = np.float32(entry - begin + np.int64(k))
-                        store(last, state + place, select(stop, splat(number), load(last, state + place)))
+                        store(
+                            last,
+                            state + place,
+                            select(stop, splat(number), load(last, state + place)),
+                        )
                         live[block] &= ~np.int64(stopped)
                         lanes = mask_from_bits(live[block])
                         blend = blend & ~stop
                         if live[block] == 0:
                             alive &= ~bit
-                            while todo != 0:  # later entries do not change this block: the backward pass skips them
+                            # later entries do not change this block: the backward pass skips them
+                            while todo != 0:
                                 masks[entry + np.int64(lowest_bit(todo))] &= ~bit
                                 todo &= todo - np.uint64(1)
                     weight = select(blend, weight, ZERO)
@@ -214,21 +250,27 @@ def place_in_tile(x, y):
 
 @kernel
 def composite_backward_tiles(memory, first, past, frame, g_image, g_alpha, all_rows, want_absolute):
-    """Add the gradient sums of the tiles ``first`` to ``past``, back to front, to the rows of their shards in
-    ``all_rows`` [shards, N * 16].
+    """Add the gradient sums of the tiles ``first`` to ``past``, back to front, to the rows of their
+    shards in ``all_rows`` [shards, N * 16].
 
-    c is the colour of a record, g the gradient of the pixel, T the transmittance before the record. U is the sum over
-    the later records and the background of (c . g) alpha T, divided by the transmittance behind the record. The
-    derivative of the loss by the record's alpha is T (c . g - U), and U for the previous record is U + alpha (c . g -
-    U). So, back to front, U is a sequence of weighted means that starts with the background: nothing cancels, and the
-    only division per record is that for T. An empty ``g_alpha`` stands for zero. ``want_absolute`` is True or None, so
-    that numba removes its branch at compilation.
+    c is the colour of a record, g the gradient of the pixel, T the transmittance before the record.
+    U is the sum over the later records and the background of (c . g) alpha T, divided by the
+    transmittance behind the record. The derivative of the loss by the record's alpha is T (c . g -
+    U), and U for the previous record is U + alpha (c . g - U). So, back to front, U is a sequence
+    of weighted means that starts with the background: nothing cancels, and the only division per
+    record is that for T. An empty ``g_alpha`` stands for zero. ``want_absolute`` is True or None,
+    so that numba removes its branch at compilation.
     """
     entries, masks, records = frame.entries, frame.masks, frame.records
     tiles_x, width, height = frame.camera.tiles_x, frame.camera.width, frame.camera.height
     floats, _ = memory
-    red, green, blue = floats[: at.TILE_PIXELS], floats[at.TILE_PIXELS :], floats[2 * at.TILE_PIXELS :]
-    behind, through = floats[3 * at.TILE_PIXELS :], floats[4 * at.TILE_PIXELS :]  # U, and T behind the current record
+    red, green, blue = (
+        floats[: at.TILE_PIXELS],
+        floats[at.TILE_PIXELS :],
+        floats[2 * at.TILE_PIXELS :],
+    )
+    # U, and T behind the current record
+    behind, through = floats[3 * at.TILE_PIXELS :], floats[4 * at.TILE_PIXELS :]
     for tile in range(first, past):
         rows = all_rows[frame.tile_shard[tile]]
         left, top = tile % tiles_x * at.TILE, tile // tiles_x * at.TILE
@@ -276,7 +318,10 @@ def composite_backward_tiles(memory, first, past, frame, g_image, g_alpha, all_r
             if todo == 0:
                 continue
             base = entries[entry] * at.RECORD
-            offset_x, offset_y = tile_x - records[base + at.MEAN_X], tile_y - records[base + at.MEAN_Y]
+            offset_x, offset_y = (
+                tile_x - records[base + at.MEAN_X],
+                tile_y - records[base + at.MEAN_Y],
+            )
             number = splat(np.float32(entry - begin + 1))
             sum_r, sum_g, sum_b = splat(ZERO), splat(ZERO), splat(ZERO)
             sum_h, sum_ht, sum_hy = splat(ZERO), splat(ZERO), splat(ZERO)
@@ -316,26 +361,41 @@ def composite_backward_tiles(memory, first, past, frame, g_image, g_alpha, all_r
                 sum_hyy = fma(hy, dy, sum_hyy)
                 if want_absolute is not None:
                     sum_abs_t += absolute(ht)
-                    # d power / d mean_y = shear a t + e dy, with a and e from the curves: curve = -log2(e)/2 a
+                    # d power / d mean_y = shear a t + e dy, with a and e from the curves: curve =
+                    # -log2(e)/2 a
                     shear_a = records[base + at.SHEAR] * records[base + at.CURVE_T]
                     slope = fma(ht, shear_a, hy * records[base + at.CURVE_Y])
                     sum_abs_y += absolute(slope) * TO_PRECISION
             if want_absolute is not None:
                 sums = lane_sums(
-                    (sum_h, sum_ht, sum_hy, sum_htt, sum_hty, sum_hyy, sum_r, sum_g, sum_b, sum_abs_t, sum_abs_y)
+                    (
+                        sum_h,
+                        sum_ht,
+                        sum_hy,
+                        sum_htt,
+                        sum_hty,
+                        sum_hyy,
+                        sum_r,
+                        sum_g,
+                        sum_b,
+                        sum_abs_t,
+                        sum_abs_y,
+                    )
                 )
             else:
-                sums = lane_sums((sum_h, sum_ht, sum_hy, sum_htt, sum_hty, sum_hyy, sum_r, sum_g, sum_b))
+                sums = lane_sums(
+                    (sum_h, sum_ht, sum_hy, sum_htt, sum_hty, sum_hyy, sum_r, sum_g, sum_b)
+                )
             store(rows, base, load(rows, base) + sums)
 
 
 @kernel
 def cover_tiles(memory, first, past, frame, values, covered, sums, distances):
-    """Add the footprints of the tiles ``first`` to ``past`` to ``covered`` [N] int32, ``sums`` and ``distances`` [N] of
-    their shards.
+    """Add the footprints of the tiles ``first`` to ``past`` to ``covered`` [N] int32, ``sums`` and
+    ``distances`` [N] of their shards.
 
-    An empty ``values`` [H * W] stands for zero. The arithmetic is that of the compositing kernels, so that the same
-    pixels count as blended.
+    An empty ``values`` [H * W] stands for zero. The arithmetic is that of the compositing kernels,
+    so that the same pixels count as blended.
     """
     entries, masks, records = frame.entries, frame.masks, frame.records
     tiles_x, width, height = frame.camera.tiles_x, frame.camera.width, frame.camera.height
@@ -360,7 +420,10 @@ def cover_tiles(memory, first, past, frame, values, covered, sums, distances):
             shear = splat(records[base + at.SHEAR])
             curve_t, curve_y = splat(records[base + at.CURVE_T]), splat(records[base + at.CURVE_Y])
             log2_opacity = splat(records[base + at.LOG2_OPACITY])
-            offset_x, offset_y = tile_x - records[base + at.MEAN_X], tile_y - records[base + at.MEAN_Y]
+            offset_x, offset_y = (
+                tile_x - records[base + at.MEAN_X],
+                tile_y - records[base + at.MEAN_Y],
+            )
             number = splat(np.float32(entry - begin + 1))
             count, total, reach = splat(ZERO), splat(ZERO), splat(ZERO)
             while todo != 0:

@@ -1,4 +1,5 @@
-"""The compiled CPU rasterizer: the stages of the forward and the backward pass, run on several threads."""
+"""The compiled CPU rasterizer: the stages of the forward and the backward pass, run on several
+threads."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -20,15 +21,27 @@ from gsbench.raster.cpu.binning import (
     sort_by_depth,
     start_tiles,
 )
-from gsbench.raster.cpu.composite import LOG2_ALPHA_MIN, composite_backward_tiles, composite_tiles, cover_tiles
+from gsbench.raster.cpu.composite import (
+    LOG2_ALPHA_MIN,
+    composite_backward_tiles,
+    composite_tiles,
+    cover_tiles,
+)
 from gsbench.raster.cpu.projection import BAD_VALUE, VISIBLE, backproject_shards, project_shards
 from gsbench.raster.cpu.shuffle import REST
 from gsbench.raster.cpu.workspace import HEADROOM, Arena, ArenaPool, ShardRunner, TensorPool
-from gsbench.raster.staged import Gradients, Lifetime, RenderRequest, StagedRasterizer, raise_for_values
+from gsbench.raster.staged import (
+    Gradients,
+    Lifetime,
+    RenderRequest,
+    StagedRasterizer,
+    raise_for_values,
+)
 from gsbench.system.resources import available_cores
 
-# Fixed numbers, so that results have the same bits for any number of threads. Each shard of tiles sums gradients in its
-# own rows (64 bytes per Gaussian); other numbers of shards would change the order of additions.
+# Fixed numbers, so that results have the same bits for any number of threads. Each shard of tiles
+# sums gradients in its own rows (64 bytes per Gaussian); other numbers of shards would change the
+# order of additions.
 GAUSSIAN_SHARDS = 16
 TILE_SHARDS = 8
 
@@ -42,10 +55,11 @@ class ForwardPass:
 
 
 class CpuRasterizer(StagedRasterizer[ForwardPass]):
-    """float32 on the CPU, compiled by numba at first use. Same bits on every run and for any number of ``threads``.
+    """float32 on the CPU, compiled by numba at first use. Same bits on every run and for any number
+    of ``threads``.
 
-    Each render keeps its intermediate results until its graph is freed; then their memory is reused. Several threads
-    may call it at once.
+    Each render keeps its intermediate results until its graph is freed; then their memory is
+    reused. Several threads may call it at once.
     """
 
     name = "cpu"
@@ -54,7 +68,9 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
         if threads is not None and threads < 1:
             raise ValueError(f"threads: must be at least 1, got {threads}")
         if CONSTANTS.tile != at.TILE:
-            raise ValueError(f"the compiled rasterizer has tiles of {at.TILE} px, the contract {CONSTANTS.tile}")
+            raise ValueError(
+                f"the compiled rasterizer has tiles of {at.TILE} px, the contract {CONSTANTS.tile}"
+            )
         self.threads = threads or available_cores()
         self._runner = ShardRunner(self.threads)
         self._tensors = TensorPool()
@@ -66,12 +82,19 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
         """Raise ValueError if tensors are not float32 on the CPU."""
         means = gaussians.means
         if means.dtype != torch.float32 or means.device.type != "cpu":
-            raise ValueError(f"means: raster=cpu needs float32 on the cpu, got {means.dtype} on {means.device}")
+            raise ValueError(
+                f"means: raster=cpu needs float32 on the cpu, got {means.dtype} on {means.device}"
+            )
 
-    def forward(self, gaussians: Gaussians, request: RenderRequest) -> tuple[Tensor, Tensor, Tensor, ForwardPass]:
+    def forward(
+        self, gaussians: Gaussians, request: RenderRequest
+    ) -> tuple[Tensor, Tensor, Tensor, ForwardPass]:
         """Project, sort, bin, composite; see `StagedRasterizer`."""
         count, view = len(gaussians), CameraNumbers.of(request.camera)
-        image, alpha = self._tensors.empty((view.height, view.width, 3)), self._tensors.empty((view.height, view.width))
+        image, alpha = (
+            self._tensors.empty((view.height, view.width, 3)),
+            self._tensors.empty((view.height, view.width)),
+        )
         radii = torch.empty(count, dtype=torch.int32)
         arena = self._frames.lease(request.lifetime)
         records = arena.take("records", (count * at.RECORD,), np.float32)
@@ -82,14 +105,23 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
         projected = (records, record_ints, keys, radii.numpy(), flags)
 
         def project(first: int, past: int) -> None:
-            project_shards(at.kernel_memory(), first, past, edges, arrays, request.degree, view, *projected)
+            project_shards(
+                at.kernel_memory(), first, past, edges, arrays, request.degree, view, *projected
+            )
 
         self._runner.run(GAUSSIAN_SHARDS, project)
         if flags[:, BAD_VALUE].any():
             raise_for_values(gaussians)
         order = arena.take("order", (int(flags[:, VISIBLE].sum()),), np.uint64)
         spare = arena.take("spare", order.shape, np.uint64)
-        sort_by_depth(edges[:-1], flags[:, VISIBLE].copy(), keys, order, spare, np.empty((PASSES, BUCKETS), np.int64))
+        sort_by_depth(
+            edges[:-1],
+            flags[:, VISIBLE].copy(),
+            keys,
+            order,
+            spare,
+            np.empty((PASSES, BUCKETS), np.int64),
+        )
         starts, entries = self._list_tiles(arena, view, order, records)
         tiles, total = view.tiles_x * view.tiles_y, len(entries)
         frame = at.CpuFrame(
@@ -116,9 +148,14 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
         return image, alpha, radii, ForwardPass(frame, flags[:, VISIBLE])
 
     def _list_tiles(
-        self, arena: Arena, view: CameraNumbers, order: NDArray[np.uint64], records: NDArray[np.float32]
+        self,
+        arena: Arena,
+        view: CameraNumbers,
+        order: NDArray[np.uint64],
+        records: NDArray[np.float32],
     ) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
-        """Starts of the lists of tiles, [tiles + 1], and the records of all lists, front to back."""
+        """Starts of the lists of tiles, [tiles + 1], and the records of all lists, front to
+        back."""
         tiles = view.tiles_x * view.tiles_y
         counts = arena.take("counts", (GAUSSIAN_SHARDS, tiles), np.int64)
         starts = arena.take("starts", (tiles + 1,), np.int64)
@@ -162,13 +199,16 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
         want_absolute = None if request.absolute is None else True
 
         def composite_backward(first: int, past: int) -> None:
-            composite_backward_tiles(*_tiles(passed.frame, first, past), g_pixels, g_alphas, rows, want_absolute)
+            composite_backward_tiles(
+                *_tiles(passed.frame, first, past), g_pixels, g_alphas, rows, want_absolute
+            )
 
         try:
             self._runner.run(TILE_SHARDS, composite_backward)
             return self._backproject(passed, gaussians, request, rows, want_splitting)
         except BaseException:
-            arena.drop("rows")  # kernels expect zeros and clear what they add; an interrupt may have left sums
+            # kernels expect zeros and clear what they add; an interrupt may have left sums
+            arena.drop("rows")
             raise
 
     def _backproject(
@@ -179,7 +219,8 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
         rows: NDArray[np.float32],
         want_splitting: bool,
     ) -> Gradients:
-        """Compute all gradients from the gradient sums in ``rows``; fill ``request.absolute``, if given."""
+        """Compute all gradients from the gradient sums in ``rows``; fill ``request.absolute``, if
+        given."""
         count, take = len(gaussians), self._tensors.empty
         gradients = gaussians.map(lambda tensor: take(tuple(tensor.shape)))
         g_screen = take((count, 2))
@@ -194,7 +235,9 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
             _arrays(gradients),
             g_screen.numpy(),
             np.empty((0, 2), np.float32) if request.absolute is None else request.absolute.numpy(),
-            np.empty((0, 9), np.float32) if g_splitting is None else g_splitting.numpy().reshape(-1, 9),
+            np.empty((0, 9), np.float32)
+            if g_splitting is None
+            else g_splitting.numpy().reshape(-1, 9),
         )
 
         def backproject(first: int, past: int) -> None:
@@ -204,19 +247,30 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
         return Gradients(list(gradients.tensors().values()), g_screen, g_splitting)
 
     def footprint(
-        self, passed: ForwardPass, gaussians: Gaussians, request: RenderRequest, values: Tensor | None = None
+        self,
+        passed: ForwardPass,
+        gaussians: Gaussians,
+        request: RenderRequest,
+        values: Tensor | None = None,
     ) -> Footprint:
         """See ``raster.base.RenderOutput``."""
         count = len(gaussians)
         covered = np.zeros((TILE_SHARDS, count), np.int32)
         sums, distances = np.zeros((2, TILE_SHARDS, count), np.float32)
-        given = np.empty(0, np.float32) if values is None else values.detach().float().contiguous().numpy().reshape(-1)
+        given = (
+            np.empty(0, np.float32)
+            if values is None
+            else values.detach().float().contiguous().numpy().reshape(-1)
+        )
 
         def cover(first: int, past: int) -> None:
             cover_tiles(*_tiles(passed.frame, first, past), given, covered, sums, distances)
 
         self._runner.run(TILE_SHARDS, cover)
-        totals = (torch.from_numpy(shards.sum(0, dtype=shards.dtype)) for shards in (covered, sums, distances))
+        totals = (
+            torch.from_numpy(shards.sum(0, dtype=shards.dtype))
+            for shards in (covered, sums, distances)
+        )
         return Footprint(next(totals), view_depths(gaussians, request.camera), *totals)
 
 
@@ -231,5 +285,9 @@ def _tiles(frame: at.CpuFrame, first: int, past: int) -> tuple[Any, ...]:
 
 
 def _arrays(gaussians: Gaussians) -> at.Parameters:
-    means, log_scales, quaternions, logits, sh_dc, sh_rest = (t.detach().numpy() for t in gaussians.tensors().values())
-    return at.Parameters(means, log_scales, quaternions, logits.reshape(-1, 1), sh_dc, sh_rest.reshape(-1, REST))
+    means, log_scales, quaternions, logits, sh_dc, sh_rest = (
+        t.detach().numpy() for t in gaussians.tensors().values()
+    )
+    return at.Parameters(
+        means, log_scales, quaternions, logits.reshape(-1, 1), sh_dc, sh_rest.reshape(-1, REST)
+    )

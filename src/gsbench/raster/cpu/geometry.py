@@ -1,8 +1,8 @@
 """Projection geometry and spherical harmonics for 16 Gaussians at a time, float32, for both passes.
 
-Matrices are tuples of rows, and vectors are tuples. No formula subtracts large numbers (see ``spread``). The harmonics
-of 16 Gaussians are a 16x16 matrix with one row per basis function. The kernels transpose it into one row per Gaussian
-and multiply that by the coefficients.
+Matrices are tuples of rows, and vectors are tuples. No formula subtracts large numbers (see
+``spread``). The harmonics of 16 Gaussians are a 16x16 matrix with one row per basis function. The
+kernels transpose it into one row per Gaussian and multiply that by the coefficients.
 """
 
 import math
@@ -12,12 +12,23 @@ import numpy as np
 from gsbench.gaussians.model import C0, C1, C2, C3
 from gsbench.raster.base import CONSTANTS
 from gsbench.raster.cpu.shuffle import transpose
-from gsbench.raster.cpu.simd import LANES, exp2, gather, load, maximum, minimum, splat, square_root, store
+from gsbench.raster.cpu.simd import (
+    LANES,
+    exp2,
+    gather,
+    load,
+    maximum,
+    minimum,
+    splat,
+    square_root,
+    store,
+)
 from gsbench.system.jit import inlined
 
 LOG2_E = 1.0 / math.log(2.0)
 BLUR = CONSTANTS.blur
-MAX_LOG2 = 126.0  # beyond, exp2 is undefined. The variance of a scale of 2^126 is not finite, so it is culled
+# beyond, exp2 is undefined. The variance of a scale of 2^126 is not finite, so it is culled
+MAX_LOG2 = 126.0
 F0, F1 = np.float32(C0), np.float32(C1)
 D0, D1, D2, D3, D4 = (np.float32(value) for value in C2)
 T0, T1, T2, T3, T4, T5, T6 = (np.float32(value) for value in C3)
@@ -45,7 +56,8 @@ def rotation_matrix(w, x, y, z):
 def from_camera(mean, v):
     """The vector from the camera centre to the mean, in world axes.
 
-    It is computed first: rotating the difference loses no digits, even if the scene is far from the origin.
+    It is computed first: rotating the difference loses no digits, even if the scene is far from the
+    origin.
     """
     return mean[0] - v.center_x, mean[1] - v.center_y, mean[2] - v.center_z
 
@@ -60,7 +72,8 @@ def to_view(offset, v):
 
 @inlined
 def image_axes(slope_x, slope_y, inverse_z, v):
-    """A = J W, the derivative of the pixel by the world position, as two rows; and the clamped slopes."""
+    """A = J W, the derivative of the pixel by the world position, as two rows; and the clamped
+    slopes."""
     slope_x = minimum(maximum(slope_x, v.slope_x_min), v.slope_x_max)
     slope_y = minimum(maximum(slope_y, v.slope_y_min), v.slope_y_max)
     first, second = image_rows(slope_x, slope_y, inverse_z, v)
@@ -71,8 +84,16 @@ def image_axes(slope_x, slope_y, inverse_z, v):
 def image_rows(slope_x, slope_y, inverse_z, v):
     """The derivative of the pixel by the world position at given slopes x/z, y/z, as two rows."""
     jx, jy = inverse_z * v.fx, inverse_z * v.fy
-    first = (jx * (v.r00 - slope_x * v.r20), jx * (v.r01 - slope_x * v.r21), jx * (v.r02 - slope_x * v.r22))
-    second = (jy * (v.r10 - slope_y * v.r20), jy * (v.r11 - slope_y * v.r21), jy * (v.r12 - slope_y * v.r22))
+    first = (
+        jx * (v.r00 - slope_x * v.r20),
+        jx * (v.r01 - slope_x * v.r21),
+        jx * (v.r02 - slope_x * v.r22),
+    )
+    second = (
+        jy * (v.r10 - slope_y * v.r20),
+        jy * (v.r11 - slope_y * v.r21),
+        jy * (v.r12 - slope_y * v.r22),
+    )
     return first, second
 
 
@@ -115,13 +136,17 @@ def gather_quaternions(quaternions, indices):
 def spread(m0, m1):
     """xx, xy, yy of the covariance C = M M^T + BLUR I, for the rows of M; and a = yy / det C.
 
-    1/a is the variance of x given y. det(M M^T) is the squared cross product of the rows. Dividing one row by sqrt(yy)
-    first gives 1/a without cancellation and overflow.
+    1/a is the variance of x given y. det(M M^T) is the squared cross product of the rows. Dividing
+    one row by sqrt(yy) first gives 1/a without cancellation and overflow.
     """
     xx, xy, yy = dot(m0, m0), dot(m0, m1), dot(m1, m1) + BLUR
     inverse = 1 / square_root(yy)
     n1 = (m1[0] * inverse, m1[1] * inverse, m1[2] * inverse)
-    cross = (m0[1] * n1[2] - m0[2] * n1[1], m0[2] * n1[0] - m0[0] * n1[2], m0[0] * n1[1] - m0[1] * n1[0])
+    cross = (
+        m0[1] * n1[2] - m0[2] * n1[1],
+        m0[2] * n1[0] - m0[0] * n1[2],
+        m0[0] * n1[1] - m0[1] * n1[0],
+    )
     given = dot(cross, cross) + BLUR * (xx + yy) / yy
     return xx + BLUR, xy, yy, 1 / given
 
@@ -135,9 +160,11 @@ def normalized(offset):
 
 @inlined
 def fill_basis(degree, x, y, z, matrix):
-    """Write basis function k + 1 at the unit directions (x, y, z) to column k of ``matrix`` [16 * 16].
+    """Write basis function k + 1 at the unit directions (x, y, z) to column k of ``matrix`` [16 *
+    16].
 
-    Each row is one Gaussian. The columns of functions above ``degree`` and the last column are zero.
+    Each row is one Gaussian. The columns of functions above ``degree`` and the last column are
+    zero.
     """
     for k in range((degree + 1) * (degree + 1) - 1, LANES):
         store(matrix, k * LANES, splat(ZERO))
@@ -165,7 +192,8 @@ def fill_basis(degree, x, y, z, matrix):
 
 @inlined
 def direction_gradient(degree, x, y, z, matrix):
-    """The gradient of ``sum_k g[k] basis[k + 1]`` by (x, y, z), not yet projected to the tangent of the unit sphere.
+    """The gradient of ``sum_k g[k] basis[k + 1]`` by (x, y, z), not yet projected to the tangent of
+    the unit sphere.
 
     ``matrix`` [16 * 16] has g of one Gaussian in each row; this function transposes it.
     """

@@ -8,12 +8,14 @@ from numpy.typing import NDArray
 from gsbench.raster.base import CameraNumbers
 from gsbench.raster.cpu.simd import LANES, SUM_LANES
 
-TILE = 16  # px; a tile is 4x4 blocks, row by row. Fixed by the 16-bit masks; must equal RasterConstants.tile
+# px; a tile is 4x4 blocks, row by row. Fixed by the 16-bit masks; must equal RasterConstants.tile
+TILE = 16
 TILE_PIXELS = TILE * TILE
 
-# A record has what compositing needs of one visible Gaussian: 16 float32, one cache line. With d = pixel - mean and
-# t = dx + SHEAR dy, log2(alpha) = LOG2_OPACITY + CURVE_T t^2 + CURVE_Y dy^2. The conic is a sum of squares here: unlike
-# a dx^2 + 2b dx dy + c dy^2, it has no cancellation for needles, and the exponent is never positive.
+# A record has what compositing needs of one visible Gaussian: 16 float32, one cache line. With d =
+# pixel - mean and t = dx + SHEAR dy, log2(alpha) = LOG2_OPACITY + CURVE_T t^2 + CURVE_Y dy^2. The
+# conic is a sum of squares here: unlike a dx^2 + 2b dx dy + c dy^2, it has no cancellation for
+# needles, and the exponent is never positive.
 RECORD = LANES
 MEAN_X, MEAN_Y = 0, 1  # px, integer pixel centres
 SHEAR = 2  # b / a
@@ -28,7 +30,8 @@ TILES_X, TILES_Y = 12, 13  # tiles that the contour can touch: first + 65536 pas
 INDEX = 14  # of the Gaussian
 CLAMPED = 15  # bit c: colour channel c was below 0
 
-# A row has the gradient sums of one Gaussian over the pixels of one shard of tiles, with h = d loss / d log(alpha).
+# A row has the gradient sums of one Gaussian over the pixels of one shard of tiles, with h = d loss
+# / d log(alpha).
 ROW = LANES
 SUM_H, SUM_H_T, SUM_H_Y, SUM_H_TT, SUM_H_TY, SUM_H_YY = SUM_LANES[:6]
 SUM_RED, SUM_GREEN, SUM_BLUE = SUM_LANES[6:9]
@@ -36,7 +39,8 @@ SUM_ABS_T, SUM_ABS_Y = SUM_LANES[9:11]  # |h t|, |h (d power / d dy)|
 
 
 def kernel_memory() -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """Scratch memory for one call of a kernel. Kernels cannot allocate memory (see `gsbench.system.jit.kernel`)."""
+    """Scratch memory for one call of a kernel. Kernels cannot allocate memory (see
+    `gsbench.system.jit.kernel`)."""
     return np.empty(8 * TILE_PIXELS, np.float32), np.empty(2 * LANES, np.int64)
 
 
@@ -52,7 +56,8 @@ class Parameters(NamedTuple):
 
 
 class CpuFrame(NamedTuple):
-    """Arrays of one render: kernels of the forward pass fill them, kernels of the backward pass read them."""
+    """Arrays of one render: kernels of the forward pass fill them, kernels of the backward pass
+    read them."""
 
     camera: CameraNumbers
     background: NDArray[np.float32]  # [3]
@@ -63,6 +68,8 @@ class CpuFrame(NamedTuple):
     masks: NDArray[np.uint16]  # [pairs] bit b: the record may touch block b of the tile
     processed: NDArray[np.int64]  # [tiles] end of the entries that compositing has read
     transmittance: NDArray[np.float32]  # [tiles * TILE_PIXELS] final, by tile, block and lane
-    last: NDArray[np.float32]  # [tiles * TILE_PIXELS] number of entries before the one that stopped the pixel
+    last: NDArray[
+        np.float32
+    ]  # [tiles * TILE_PIXELS] number of entries before the one that stopped the pixel
     bounds: NDArray[np.int64]  # [shards + 1] first tile of each shard
     tile_shard: NDArray[np.uint8]  # [tiles] shard of each tile

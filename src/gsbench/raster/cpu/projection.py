@@ -1,7 +1,7 @@
 """Projection of Gaussians to records, and its gradients, derived by hand; 16 Gaussians at a time.
 
-A shard has the Gaussians ``begin`` to ``end``. Its visible Gaussians become the records ``begin``, ``begin + 1``, …, in
-the order of their indices.
+A shard has the Gaussians ``begin`` to ``end``. Its visible Gaussians become the records ``begin``,
+``begin + 1``, …, in the order of their indices.
 """
 
 import math
@@ -63,37 +63,60 @@ from gsbench.raster.cpu.simd import (
 from gsbench.raster.staged import MIN_QUATERNION_NORM
 from gsbench.system.jit import inlined, kernel
 
-NEAR, SIGMA_EXTENT, EIGENVALUE_FLOOR = CONSTANTS.near, CONSTANTS.sigma_extent, CONSTANTS.eigenvalue_floor
+NEAR, SIGMA_EXTENT, EIGENVALUE_FLOOR = (
+    CONSTANTS.near,
+    CONSTANTS.sigma_extent,
+    CONSTANTS.eigenvalue_floor,
+)
 ALPHA_MIN, LOG2_ALPHA_MIN = CONSTANTS.alpha_min, math.log2(CONSTANTS.alpha_min)
 MAX_RADIUS = 2.0**24  # px; keeps the radius of a huge Gaussian within int32
 MAX_CENTER = 1e9  # px; so far outside the image, float32 cannot resolve a pixel
 MAX_VARIANCE = 1e18  # px^2; the same for standard deviations; also keeps squares finite
-CONTOUR_MARGIN = 0.01  # px, and relative: rounding must not lose a pixel of the contour alpha = 1/255
+# px, and relative: rounding must not lose a pixel of the contour alpha = 1/255
+CONTOUR_MARGIN = 0.01
 ZERO, HALF, ONE, TWO, FOUR = (np.float32(value) for value in (0, 0.5, 1, 2, 4))
 
 AHEAD = 16  # records ahead that the backward pass prefetches
 ALL_LANES = np.uint64((1 << LANES) - 1)
-VISIBLE, BAD_VALUE = 0, 1  # entries of a shard's flags: number of visible Gaussians; 1 if a value is bad
+# entries of a shard's flags: number of visible Gaussians; 1 if a value is bad
+VISIBLE, BAD_VALUE = 0, 1
 
 
 @inlined
 def _tile_range(low, high, tiles):
     """First and past-the-last tile for the pixels ``low`` to ``high`` - 1, within the grid."""
     first = floor(minimum(maximum(low * (1.0 / at.TILE), ZERO), np.float32(tiles)))
-    past = floor(minimum(maximum((high + (at.TILE - 1)) * (1.0 / at.TILE), ZERO), np.float32(tiles)))
+    past = floor(
+        minimum(maximum((high + (at.TILE - 1)) * (1.0 / at.TILE), ZERO), np.float32(tiles))
+    )
     return first, past
 
 
 @kernel
-def project_shards(memory, first, past, edges, gaussians, degree, v, records, record_ints, keys, radii, flags):
-    """Project the shards ``first`` to ``past``; shard s has the Gaussians from ``edges[s]`` to ``edges[s + 1]``.
+def project_shards(
+    memory, first, past, edges, gaussians, degree, v, records, record_ints, keys, radii, flags
+):
+    """Project the shards ``first`` to ``past``; shard s has the Gaussians from ``edges[s]`` to
+    ``edges[s + 1]``.
 
-    Fills ``records`` [N * 16], ``keys`` [N] (depth in the high word, record in the low word), ``radii`` [N] and
-    ``flags`` [shards, 2].
+    Fills ``records`` [N * 16], ``keys`` [N] (depth in the high word, record in the low word),
+    ``radii`` [N] and ``flags`` [shards, 2].
     """
     for shard in range(first, past):
         begin, end = edges[shard], edges[shard + 1]
-        _project(memory, begin, end, gaussians, degree, v, records, record_ints, keys, radii, flags[shard])
+        _project(
+            memory,
+            begin,
+            end,
+            gaussians,
+            degree,
+            v,
+            records,
+            record_ints,
+            keys,
+            radii,
+            flags[shard],
+        )
 
 
 @inlined
@@ -107,7 +130,10 @@ def _project(memory, begin, end, gaussians, degree, v, records, record_ints, key
         count = min(LANES, end - start)
         for lane in range(LANES):
             indices[lane] = min(start + lane, end - 1)
-        mean, log_scale = gather_vectors(gaussians.means, indices), gather_vectors(gaussians.log_scales, indices)
+        mean, log_scale = (
+            gather_vectors(gaussians.means, indices),
+            gather_vectors(gaussians.log_scales, indices),
+        )
         dc = gather_vectors(gaussians.sh_dc, indices)
         quaternion, _, squared_norm = gather_quaternions(gaussians.quaternions, indices)
         logit = gather(gaussians.logits, indices, 1, 0)
@@ -147,11 +173,14 @@ def _project(memory, begin, end, gaussians, degree, v, records, record_ints, key
         # Of the tiles of the 3 sigma square, keep those that the contour alpha = 1/255 can touch.
         opacity = ONE / (exponential(-logit) + ONE)
         log2_opacity = log2(maximum(opacity, ALPHA_MIN))
-        reach = (log2_opacity - LOG2_ALPHA_MIN) * (2 / LOG2_E)  # squared Mahalanobis distance of the contour
+        # squared Mahalanobis distance of the contour
+        reach = (log2_opacity - LOG2_ALPHA_MIN) * (2 / LOG2_E)
         reach = maximum(reach, ZERO)
         half_x = square_root(reach * xx) * (1 + CONTOUR_MARGIN) + CONTOUR_MARGIN
         half_y = square_root(reach * yy) * (1 + CONTOUR_MARGIN) + CONTOUR_MARGIN
-        inner_x, outer_x = _tile_range(ceil(column - half_x), floor(column + half_x) + ONE, v.tiles_x)
+        inner_x, outer_x = _tile_range(
+            ceil(column - half_x), floor(column + half_x) + ONE, v.tiles_x
+        )
         inner_y, outer_y = _tile_range(ceil(row - half_y), floor(row + half_y) + ONE, v.tiles_y)
         first_x, past_x = maximum(first_x, inner_x), minimum(past_x, outer_x)
         first_y, past_y = maximum(first_y, inner_y), minimum(past_y, outer_y)
@@ -169,7 +198,9 @@ def _project(memory, begin, end, gaussians, degree, v, records, record_ints, key
                 lane = lowest_bit(left)
                 left &= left - np.uint64(1)
                 own = load(basis, lane * np.uint64(LANES))
-                by_red, by_green, by_blue = by_channel(load_rest(gaussians.sh_rest, (start + np.int64(lane)) * REST))
+                by_red, by_green, by_blue = by_channel(
+                    load_rest(gaussians.sh_rest, (start + np.int64(lane)) * REST)
+                )
                 store(rows, lane * np.uint64(LANES), own * by_red)
                 store(scratch, lane * np.uint64(LANES), own * by_green)
                 store(scratch, MATRIX + lane * np.uint64(LANES), own * by_blue)
@@ -201,8 +232,11 @@ def _project(memory, begin, end, gaussians, degree, v, records, record_ints, key
             lane = lowest_bit(todo)
             todo &= todo - np.uint64(1)
             store(records, out * at.RECORD, load(rows, lane * np.uint64(LANES)))
-            # The bits of positive float32 numbers sort like the numbers. Equal depths sort by index.
-            keys[out] = (np.uint64(record_ints[out * at.RECORD + at.DEPTH]) << np.uint64(32)) | np.uint64(out)
+            # The bits of positive float32 numbers sort like the numbers. Equal depths sort by
+            # index.
+            keys[out] = (
+                np.uint64(record_ints[out * at.RECORD + at.DEPTH]) << np.uint64(32)
+            ) | np.uint64(out)
             out += 1
     flags[VISIBLE] = out - begin
     sound = mask_bits(absolute(bad) <= ZERO)  # False for NaN
@@ -228,12 +262,14 @@ def _first_shard(record_ints, base, v, tile_shard):
 
 @inlined
 def _take_rows(record, count, past, v, record_ints, tile_shard, rows, indices, sums):
-    """Sum the gradient rows of ``count`` records over the shards of their tiles, and clear the rows.
+    """Sum the gradient rows of ``count`` records over the shards of their tiles, and clear the
+    rows.
 
-    ``sums`` [16 * 16] gets one row per entry of a gradient row; ``indices`` [16] gets the Gaussians. If there are fewer
-    than 16 records, the last one is repeated.
+    ``sums`` [16 * 16] gets one row per entry of a gradient row; ``indices`` [16] gets the
+    Gaussians. If there are fewer than 16 records, the last one is repeated.
     """
-    # Rows are cleared here, while they are in the cache; clearing them before the backward pass would load them again.
+    # Rows are cleared here, while they are in the cache; clearing them before the backward pass
+    # would load them again.
     shard_rows = len(record_ints)  # a row is as long as a record
     for lane in range(count):
         ahead = min(record + lane + AHEAD, past - 1) * at.RECORD
@@ -258,13 +294,25 @@ def _take_rows(record, count, past, v, record_ints, tile_shard, rows, indices, s
 
 @kernel
 def backproject_shards(
-    memory, first, past, edges, visible, gaussians, degree, frame, rows, gradients, g_screen, g_absolute, g_splitting
+    memory,
+    first,
+    past,
+    edges,
+    visible,
+    gaussians,
+    degree,
+    frame,
+    rows,
+    gradients,
+    g_screen,
+    g_absolute,
+    g_splitting,
 ):
-    """Write all ``gradients`` of the shards ``first`` to ``past``; shard s has the Gaussians from ``edges[s]`` to
-    ``edges[s + 1]``, of which ``visible[s]`` have records.
+    """Write all ``gradients`` of the shards ``first`` to ``past``; shard s has the Gaussians from
+    ``edges[s]`` to ``edges[s + 1]``, of which ``visible[s]`` have records.
 
-    Reads and clears their ``rows`` [shards of tiles * N * 16]. ``g_absolute`` [N, 2] and ``g_splitting`` [N, 9] are
-    empty if not requested.
+    Reads and clears their ``rows`` [shards of tiles * N * 16]. ``g_absolute`` [N, 2] and
+    ``g_splitting`` [N, 9] are empty if not requested.
     """
     for shard in range(first, past):
         begin, end = edges[shard], edges[shard + 1]
@@ -276,7 +324,11 @@ def backproject_shards(
 def _backproject(memory, begin, end, visible, gaussians, degree, frame, rows, outputs):
     gradients, g_screen, g_absolute, g_splitting = outputs
     v, record_ints, tile_shard = frame.camera, frame.record_ints, frame.tile_shard
-    g_means, g_log_scales, g_quaternions = gradients.means, gradients.log_scales, gradients.quaternions
+    g_means, g_log_scales, g_quaternions = (
+        gradients.means,
+        gradients.log_scales,
+        gradients.quaternions,
+    )
     g_logits, g_sh_dc, g_sh_rest = gradients.logits, gradients.sh_dc, gradients.sh_rest
     unseen = begin  # the first Gaussian whose gradients are not written yet
     for record in range(begin, begin + visible + 1):
@@ -300,7 +352,10 @@ def _backproject(memory, begin, end, visible, gaussians, degree, frame, rows, ou
     for record in range(begin, begin + visible, LANES):
         count = min(LANES, begin + visible - record)
         _take_rows(record, count, begin + visible, v, record_ints, tile_shard, rows, indices, sums)
-        mean, log_scale = gather_vectors(gaussians.means, indices), gather_vectors(gaussians.log_scales, indices)
+        mean, log_scale = (
+            gather_vectors(gaussians.means, indices),
+            gather_vectors(gaussians.log_scales, indices),
+        )
         offset = from_camera(mean, v)
 
         # Colour. A channel below 0 was clamped and has no gradient.
@@ -314,7 +369,9 @@ def _backproject(memory, begin, end, visible, gaussians, degree, frame, rows, ou
             for lane in range(LANES):
                 place = lane * LANES
                 r, g, b = colors[lane], colors[LANES + lane], colors[2 * LANES + lane]
-                by_red, by_green, by_blue = by_channel(load_rest(gaussians.sh_rest, indices[lane] * REST))
+                by_red, by_green, by_blue = by_channel(
+                    load_rest(gaussians.sh_rest, indices[lane] * REST)
+                )
                 store(pulled, place, by_red * r + by_green * g + by_blue * b)
                 store_rest(g_sh_rest, indices[lane] * REST, outer_rest(load(basis, place), r, g, b))
         else:
@@ -346,16 +403,18 @@ def _backproject(memory, begin, end, visible, gaussians, degree, frame, rows, ou
             absolute_y = load(sums, at.SUM_ABS_Y * LANES)
             scatter(g_absolute, indices, 2, 1, absolute_y * (0.5 * v.height))
 
-        # Covariance: M = N S and N = A R. d loss / d M = U^T Q U M with Q = D G D, D = diag(a, e), U = [[1, shear], [0,
-        # 1]] and G the second moments of h over (t, dy). For a needle the first row of U M is small, so U N is computed
-        # first, before large numbers can cancel.
+        # Covariance: M = N S and N = A R. d loss / d M = U^T Q U M with Q = D G D, D = diag(a, e),
+        # U = [[1, shear], [0, 1]] and G the second moments of h over (t, dy). For a needle the
+        # first row of U M is small, so U N is computed first, before large numbers can cancel.
         q00 = a * a * load(sums, at.SUM_H_TT * LANES)
         q01 = a * e * load(sums, at.SUM_H_TY * LANES)
         q11 = e * e * load(sums, at.SUM_H_YY * LANES)
         if len(g_splitting) > 0:
             of_h = load(sums, at.SUM_H * LANES)
             free = image_rows(x * inverse_z, y * inverse_z, inverse_z, v)
-            _scatter_splitting(g_splitting, indices, q00 - a * of_h, q01, q11 - e * of_h, shear, free)
+            _scatter_splitting(
+                g_splitting, indices, q00 - a * of_h, q01, q11 - e * of_h, shear, free
+            )
         u0 = (n0[0] + shear * n1[0], n0[1] + shear * n1[1], n0[2] + shear * n1[2])
         g0 = (q00 * u0[0] + q01 * n1[0], q00 * u0[1] + q01 * n1[1], q00 * u0[2] + q01 * n1[2])
         g1 = (q01 * u0[0] + q11 * n1[0], q01 * u0[1] + q11 * n1[1], q01 * u0[2] + q11 * n1[2])
@@ -364,10 +423,10 @@ def _backproject(memory, begin, end, visible, gaussians, degree, frame, rows, ou
         scatter(g_log_scales, indices, 3, 1, (u0[1] * g0[1] + n1[1] * g1[1]) * variances[1])
         scatter(g_log_scales, indices, 3, 2, (u0[2] * g0[2] + n1[2] * g1[2]) * variances[2])
 
-        # Rotation by small angles w about the Gaussian's own axes changes R S^2 R^T by a commutator, so the gradient by
-        # w has differences of variances as factors. Computing these differences first makes the gradient of a sphere
-        # exactly 0; otherwise rounding errors would remain, which Adam scales to full steps. The quaternion changes by
-        # q (0, w) / 2.
+        # Rotation by small angles w about the Gaussian's own axes changes R S^2 R^T by a
+        # commutator, so the gradient by w has differences of variances as factors. Computing these
+        # differences first makes the gradient of a sphere exactly 0; otherwise rounding errors
+        # would remain, which Adam scales to full steps. The quaternion changes by q (0, w) / 2.
         w_x = (u0[1] * g0[2] + n1[1] * g1[2]) * _difference(scales[1], scales[2])
         w_y = (u0[2] * g0[0] + n1[2] * g1[0]) * _difference(scales[2], scales[0])
         w_z = (u0[0] * g0[1] + n1[0] * g1[1]) * _difference(scales[0], scales[1])
@@ -382,8 +441,14 @@ def _backproject(memory, begin, end, visible, gaussians, degree, frame, rows, ou
         s1 = (s1[0] + shear * s0[0], s1[1] + shear * s0[1], s1[2] + shear * s0[2])
         a0 = (dot(s0, matrix[0]), dot(s0, matrix[1]), dot(s0, matrix[2]))
         a1 = (dot(s1, matrix[0]), dot(s1, matrix[1]), dot(s1, matrix[2]))
-        j00, j02 = a0[0] * v.r00 + a0[1] * v.r01 + a0[2] * v.r02, a0[0] * v.r20 + a0[1] * v.r21 + a0[2] * v.r22
-        j11, j12 = a1[0] * v.r10 + a1[1] * v.r11 + a1[2] * v.r12, a1[0] * v.r20 + a1[1] * v.r21 + a1[2] * v.r22
+        j00, j02 = (
+            a0[0] * v.r00 + a0[1] * v.r01 + a0[2] * v.r02,
+            a0[0] * v.r20 + a0[1] * v.r21 + a0[2] * v.r22,
+        )
+        j11, j12 = (
+            a1[0] * v.r10 + a1[1] * v.r11 + a1[2] * v.r12,
+            a1[0] * v.r20 + a1[1] * v.r21 + a1[2] * v.r22,
+        )
         fx_z, fy_z = inverse_z * v.fx, inverse_z * v.fy
         free_x, free_y = x * inverse_z, y * inverse_z
         # The clamp of a slope passes the gradient only within the limits.
@@ -394,7 +459,8 @@ def _backproject(memory, begin, end, visible, gaussians, degree, frame, rows, ou
         through_focal = fx_z * (j00 - slope_x * j02) + fy_z * (j11 - slope_y * j12)
         view_z = -(through_focal * inverse_z + view_x * free_x + view_y * free_y)
 
-        # Mean: its gradient through the image position, and through the view direction of the colour.
+        # Mean: its gradient through the image position, and through the view direction of the
+        # colour.
         radial = dot(through, to)
         from_x = (through[0] - radial * to[0]) * inverse_distance
         from_y = (through[1] - radial * to[1]) * inverse_distance
@@ -404,23 +470,33 @@ def _backproject(memory, begin, end, visible, gaussians, degree, frame, rows, ou
         scatter(g_means, indices, 3, 2, view_x * v.r02 + view_y * v.r12 + view_z * v.r22 + from_z)
 
         # d log(alpha) / d logit = 1 - opacity
-        g_logit = load(sums, at.SUM_H * LANES) / (exponential(gather(gaussians.logits, indices, 1, 0)) + ONE)
+        g_logit = load(sums, at.SUM_H * LANES) / (
+            exponential(gather(gaussians.logits, indices, 1, 0)) + ONE
+        )
         scatter(g_logits, indices, 1, 0, g_logit)
 
 
 @inlined
 def _scatter_splitting(g_splitting, indices, d00, d01, d11, shear, rows):
-    """Write the splitting matrices F^T U^T (D G D - h D) U F. F = ``rows`` is the derivative of the projected mean;
-    ``d00``, ``d01`` and ``d11`` are the entries of D G D - h D.
+    """Write the splitting matrices F^T U^T (D G D - h D) U F. F = ``rows`` is the derivative of the
+    projected mean; ``d00``, ``d01`` and ``d11`` are the entries of D G D - h D.
 
-    The second derivative of alpha by the projected mean is alpha (u u^T - C), with u = C (dx, dy) and the conic C = U^T
-    D U. Its sum with weights h / alpha is U^T (D G D - h D) U.
+    The second derivative of alpha by the projected mean is alpha (u u^T - C), with u = C (dx, dy)
+    and the conic C = U^T D U. Its sum with weights h / alpha is U^T (D G D - h D) U.
     """
-    r0 = (rows[0][0] + shear * rows[1][0], rows[0][1] + shear * rows[1][1], rows[0][2] + shear * rows[1][2])
+    r0 = (
+        rows[0][0] + shear * rows[1][0],
+        rows[0][1] + shear * rows[1][1],
+        rows[0][2] + shear * rows[1][2],
+    )
     r1 = rows[1]
     s0 = (d00 * r0[0] + d01 * r1[0], d00 * r0[1] + d01 * r1[1], d00 * r0[2] + d01 * r1[2])
     s1 = (d01 * r0[0] + d11 * r1[0], d01 * r0[1] + d11 * r1[1], d01 * r0[2] + d11 * r1[2])
-    xy, xz, yz = r0[0] * s0[1] + r1[0] * s1[1], r0[0] * s0[2] + r1[0] * s1[2], r0[1] * s0[2] + r1[1] * s1[2]
+    xy, xz, yz = (
+        r0[0] * s0[1] + r1[0] * s1[1],
+        r0[0] * s0[2] + r1[0] * s1[2],
+        r0[1] * s0[2] + r1[1] * s1[2],
+    )
     scatter(g_splitting, indices, 9, 0, r0[0] * s0[0] + r1[0] * s1[0])
     scatter(g_splitting, indices, 9, 1, xy)
     scatter(g_splitting, indices, 9, 2, xz)
@@ -440,7 +516,8 @@ def _difference(a, b):
 
 @inlined
 def _unclamped(record, count, record_ints, sums, colors):
-    """The gradients by red, green and blue, 0 if the channel was clamped; also written to ``colors`` [3 * 16]."""
+    """The gradients by red, green and blue, 0 if the channel was clamped; also written to
+    ``colors`` [3 * 16]."""
     for lane in range(LANES):
         clamped = record_ints[(record + min(lane, count - 1)) * at.RECORD + at.CLAMPED]
         colors[lane] = ZERO if clamped & 1 else sums[at.SUM_RED * LANES + lane]

@@ -1,7 +1,8 @@
-"""Rearrangement of vectors: 16x16 transposition, blocks of pixels, integers in the bits of lanes, harmonics.
+"""Rearrangement of vectors: 16x16 transposition, blocks of pixels, integers in the bits of lanes,
+harmonics.
 
-Kernels hold one quantity of 16 Gaussians in a vector, but in memory the values of one Gaussian (record, gradient row,
-coefficients) are adjacent. These functions convert between the two layouts.
+Kernels hold one quantity of 16 Gaussians in a vector, but in memory the values of one Gaussian
+(record, gradient row, coefficients) are adjacent. These functions convert between the two layouts.
 """
 
 from typing import Any
@@ -15,7 +16,8 @@ from gsbench.raster.cpu.simd import LANES, VECTOR, address, broadcast, intrinsic
 CHANNELS = 3
 BLOCK = 4  # px, the sides of the 16 pixels of a vector
 REST = CHANNELS * NUM_SH_REST  # numbers of one Gaussian in ``sh_rest``: r g b of each coefficient
-REST_STARTS = (0, LANES, REST - LANES)  # starts of the three vectors that hold them; the last two overlap by three
+# starts of the three vectors that hold them; the last two overlap by three
+REST_STARTS = (0, LANES, REST - LANES)
 
 
 def _load(builder: Any, pointer: Any, place: int) -> Any:
@@ -53,17 +55,21 @@ def transpose(typing_context, array, index):
 
 
 def _row_pointers(context: Any, builder: Any, sig: Any, args: Any, numbers: int) -> list[Any]:
-    """Pointers to the four rows of a block: ``numbers`` float32 each, the first at ``args[1]``, ``args[2]`` apart."""
+    """Pointers to the four rows of a block: ``numbers`` float32 each, the first at ``args[1]``,
+    ``args[2]`` apart."""
     first = address(context, builder, sig, args)
     stride = context.cast(builder, args[2], sig.args[2], types.intp)
     kind = ir.VectorType(ir.FloatType(), numbers).as_pointer()
-    places = [builder.mul(stride, ir.Constant(ir.IntType(64), row)) for row in range(LANES // BLOCK)]
+    places = [
+        builder.mul(stride, ir.Constant(ir.IntType(64), row)) for row in range(LANES // BLOCK)
+    ]
     return [builder.bitcast(builder.gep(first, [place]), kind) for place in places]
 
 
 @intrinsic
 def store_block(typing_context, array, index, stride, values):
-    """Write the 16 pixels of a block to an image with one number per pixel and rows ``stride`` apart."""
+    """Write the 16 pixels of a block to an image with one number per pixel and rows ``stride``
+    apart."""
 
     def codegen(context, builder, sig, args):
         for row, pointer in enumerate(_row_pointers(context, builder, sig, args, BLOCK)):
@@ -76,7 +82,8 @@ def store_block(typing_context, array, index, stride, values):
 
 @intrinsic
 def store_colors(typing_context, array, index, stride, red, green, blue):
-    """Write the 16 pixels of a block to an image with three numbers per pixel and rows ``stride`` numbers apart."""
+    """Write the 16 pixels of a block to an image with three numbers per pixel and rows ``stride``
+    numbers apart."""
 
     def codegen(context, builder, sig, args):
         red, green, blue = args[3:]
@@ -84,8 +91,12 @@ def store_colors(typing_context, array, index, stride, red, green, blue):
             lanes = list(range(BLOCK * row, BLOCK * (row + 1)))
             both = [*lanes, *(LANES + lane for lane in lanes), *[0] * (LANES - 2 * BLOCK)]
             red_green = builder.shuffle_vector(red, green, lane_indices(both))
-            mixed = [place for k, lane in enumerate(lanes) for place in (k, BLOCK + k, LANES + lane)]
-            builder.store(builder.shuffle_vector(red_green, blue, lane_indices(mixed)), pointer, align=4)
+            mixed = [
+                place for k, lane in enumerate(lanes) for place in (k, BLOCK + k, LANES + lane)
+            ]
+            builder.store(
+                builder.shuffle_vector(red_green, blue, lane_indices(mixed)), pointer, align=4
+            )
         return context.get_dummy_value()
 
     return types.void(array, index, stride, red, green, blue), codegen
@@ -100,7 +111,8 @@ def load_colors(typing_context, array, index, stride):
         rows = [builder.load(pointer, align=4) for pointer in pointers]
         channels = []
         for channel in range(CHANNELS):
-            places = lane_indices([CHANNELS * k + channel for k in range(2 * BLOCK)])  # of two rows side by side
+            # of two rows side by side
+            places = lane_indices([CHANNELS * k + channel for k in range(2 * BLOCK)])
             upper, lower = (builder.shuffle_vector(rows[k], rows[k + 1], places) for k in (0, 2))
             channels.append(builder.shuffle_vector(upper, lower, lane_indices(range(LANES))))
         return context.make_tuple(builder, sig.return_type, channels)
@@ -110,7 +122,8 @@ def load_colors(typing_context, array, index, stride):
 
 @intrinsic
 def as_integers(typing_context, value):
-    """Convert whole numbers to int32, kept as the bits of float32 lanes: only store them, or read them as int32."""
+    """Convert whole numbers to int32, kept as the bits of float32 lanes: only store them, or read
+    them as int32."""
 
     def codegen(context, builder, sig, args):
         return builder.bitcast(builder.fptosi(args[0], VECTOR.bits_ir), VECTOR.ir)
@@ -136,7 +149,8 @@ def index_bits(typing_context, start):
     def codegen(context, builder, sig, args):
         first = context.cast(builder, args[0], sig.args[0], types.int32)
         return builder.bitcast(
-            builder.add(broadcast(builder, first, VECTOR.bits_ir), lane_indices(range(LANES))), VECTOR.ir
+            builder.add(broadcast(builder, first, VECTOR.bits_ir), lane_indices(range(LANES))),
+            VECTOR.ir,
         )
 
     return VECTOR(start), codegen
@@ -144,11 +158,14 @@ def index_bits(typing_context, start):
 
 @intrinsic
 def load_rest(typing_context, array, index):
-    """Load the 45 numbers ``array.flat[index : index + 45]`` as three vectors that start at ``REST_STARTS``."""
+    """Load the 45 numbers ``array.flat[index : index + 45]`` as three vectors that start at
+    ``REST_STARTS``."""
 
     def codegen(context, builder, sig, args):
         pointer = address(context, builder, sig, args)
-        return context.make_tuple(builder, sig.return_type, [_load(builder, pointer, start) for start in REST_STARTS])
+        return context.make_tuple(
+            builder, sig.return_type, [_load(builder, pointer, start) for start in REST_STARTS]
+        )
 
     return types.UniTuple(VECTOR, CHANNELS)(array, index), codegen
 
@@ -168,7 +185,8 @@ def store_rest(typing_context, array, index, values):
 
 @intrinsic
 def by_channel(typing_context, rest):
-    """Red, green and blue of the result of ``load_rest``: coefficient k in lane k; lane 15 repeats lane 14."""
+    """Red, green and blue of the result of ``load_rest``: coefficient k in lane k; lane 15 repeats
+    lane 14."""
 
     def codegen(context, builder, sig, args):
         first, second, third = (builder.extract_value(args[0], k) for k in range(CHANNELS))
@@ -176,7 +194,9 @@ def by_channel(typing_context, rest):
         for channel in range(CHANNELS):
             places = [CHANNELS * min(k, NUM_SH_REST - 1) + channel for k in range(LANES)]
             front = [place if place < 2 * LANES else 0 for place in places]
-            whole = [k if p < 2 * LANES else p - REST_STARTS[2] + LANES for k, p in enumerate(places)]
+            whole = [
+                k if p < 2 * LANES else p - REST_STARTS[2] + LANES for k, p in enumerate(places)
+            ]
             joined = builder.shuffle_vector(first, second, lane_indices(front))
             channels.append(builder.shuffle_vector(joined, third, lane_indices(whole)))
         return context.make_tuple(builder, sig.return_type, channels)
@@ -186,7 +206,8 @@ def by_channel(typing_context, rest):
 
 @intrinsic
 def outer_rest(typing_context, basis, red, green, blue):
-    """``basis[k]`` times a colour, in the layout of ``load_rest``; ``basis`` has coefficient k in lane k."""
+    """``basis[k]`` times a colour, in the layout of ``load_rest``; ``basis`` has coefficient k in
+    lane k."""
 
     def codegen(context, builder, sig, args):
         row, *colors = args
@@ -203,7 +224,9 @@ def outer_rest(typing_context, basis, red, green, blue):
         for start in REST_STARTS:
             numbers = range(start, start + LANES)
             factor = spread(row, [number // CHANNELS for number in numbers])
-            products.append(builder.fmul(factor, spread(color, [number % CHANNELS for number in numbers])))
+            products.append(
+                builder.fmul(factor, spread(color, [number % CHANNELS for number in numbers]))
+            )
         return context.make_tuple(builder, sig.return_type, products)
 
     return types.UniTuple(VECTOR, CHANNELS)(basis, red, green, blue), codegen

@@ -1,10 +1,11 @@
 """Explicit SIMD in numba kernels: vectors of 16 float32, and masks of 16 truth values.
 
-The auto-vectorisation of numba loops is fragile: one unsuitable index type makes an inner loop scalar. Here a vector is
-an ordinary value. ``load`` and ``store`` move it; ``+ - * /``, ``-x`` and comparisons work lane by lane, and Python or
-numpy numbers are broadcast. Comparisons give a mask for ``&``, ``|``, ``~`` and ``select``. LLVM maps a vector to one
-AVX-512 register, two of AVX2, or four of SSE or NEON. Results do not depend on this, except that ``fma`` is fused only
-on hosts with that instruction.
+The auto-vectorisation of numba loops is fragile: one unsuitable index type makes an inner loop
+scalar. Here a vector is an ordinary value. ``load`` and ``store`` move it; ``+ - * /``, ``-x`` and
+comparisons work lane by lane, and Python or numpy numbers are broadcast. Comparisons give a mask
+for ``&``, ``|``, ``~`` and ``select``. LLVM maps a vector to one AVX-512 register, two of AVX2, or
+four of SSE or NEON. Results do not depend on this, except that ``fma`` is fused only on hosts with
+that instruction.
 
 Indices count array elements; they are not checked and must not be negative. Arrays are contiguous.
 """
@@ -20,7 +21,8 @@ from numba.core import extending as numba_extending
 from numba.core.extending import lower_builtin, models, register_model
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
 
-intrinsic: Any = numba_extending.intrinsic  # kernels call its functions without the first argument, typing_context
+# kernels call its functions without the first argument, typing_context
+intrinsic: Any = numba_extending.intrinsic
 
 LANES = 16  # of float32
 
@@ -62,7 +64,10 @@ class _Model(models.PrimitiveModel):
 
 def lane_indices(lanes: Sequence[int]) -> ir.Constant:
     """The numbers of lanes as a constant for LLVM's shuffles."""
-    return ir.Constant(ir.VectorType(ir.IntType(32), len(lanes)), [ir.Constant(ir.IntType(32), lane) for lane in lanes])
+    return ir.Constant(
+        ir.VectorType(ir.IntType(32), len(lanes)),
+        [ir.Constant(ir.IntType(32), lane) for lane in lanes],
+    )
 
 
 def broadcast(builder: Any, scalar: Any, kind: ir.VectorType) -> Any:
@@ -72,7 +77,9 @@ def broadcast(builder: Any, scalar: Any, kind: ir.VectorType) -> Any:
     return builder.shuffle_vector(first, undefined, lane_indices([0] * kind.count))
 
 
-def as_vectors(context: Any, builder: Any, values: Sequence[Any], kinds: Sequence[Any]) -> list[Any]:
+def as_vectors(
+    context: Any, builder: Any, values: Sequence[Any], kinds: Sequence[Any]
+) -> list[Any]:
     """The operands ``values`` of the numba types ``kinds``; numbers are broadcast to all lanes."""
     return [
         broadcast(builder, context.cast(builder, value, kind, types.float32), VECTOR.ir)
@@ -88,13 +95,19 @@ def _fits(kinds: Sequence[Any]) -> bool:
 
 
 def _register_operator(
-    functions: Sequence[Any], operands: Sequence[tuple[Any, ...]], emit: Callable[..., Any], gives: types.Type = VECTOR
+    functions: Sequence[Any],
+    operands: Sequence[tuple[Any, ...]],
+    emit: Callable[..., Any],
+    gives: types.Type = VECTOR,
 ) -> None:
-    """Make numba compile ``functions`` of one of the combinations ``operands`` to ``emit(builder, *operands)``."""
+    """Make numba compile ``functions`` of one of the combinations ``operands`` to ``emit(builder,
+    *operands)``."""
 
     class _Template(AbstractTemplate):
         def generic(self, args: Sequence[Any], kws: Any) -> Any:
-            fits = any(len(args) == len(kinds) and all(map(isinstance, args, kinds)) for kinds in operands)
+            fits = any(
+                len(args) == len(kinds) and all(map(isinstance, args, kinds)) for kinds in operands
+            )
             return signature(gives, *args) if fits else None
 
     def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
@@ -109,14 +122,28 @@ def _register_operator(
 _register_operator([operator.add, operator.iadd], BINARY, lambda builder, a, b: builder.fadd(a, b))
 _register_operator([operator.sub, operator.isub], BINARY, lambda builder, a, b: builder.fsub(a, b))
 _register_operator([operator.mul, operator.imul], BINARY, lambda builder, a, b: builder.fmul(a, b))
-_register_operator([operator.truediv, operator.itruediv], BINARY, lambda builder, a, b: builder.fdiv(a, b))
+_register_operator(
+    [operator.truediv, operator.itruediv], BINARY, lambda builder, a, b: builder.fdiv(a, b)
+)
 _register_operator([operator.neg], [(Vector,)], lambda builder, a: builder.fneg(a))
-_register_operator([operator.lt], BINARY, lambda builder, a, b: builder.fcmp_ordered("<", a, b), MASK)
-_register_operator([operator.le], BINARY, lambda builder, a, b: builder.fcmp_ordered("<=", a, b), MASK)
-_register_operator([operator.gt], BINARY, lambda builder, a, b: builder.fcmp_ordered(">", a, b), MASK)
-_register_operator([operator.ge], BINARY, lambda builder, a, b: builder.fcmp_ordered(">=", a, b), MASK)
-_register_operator([operator.and_, operator.iand], [(Mask, Mask)], lambda builder, a, b: builder.and_(a, b), MASK)
-_register_operator([operator.or_, operator.ior], [(Mask, Mask)], lambda builder, a, b: builder.or_(a, b), MASK)
+_register_operator(
+    [operator.lt], BINARY, lambda builder, a, b: builder.fcmp_ordered("<", a, b), MASK
+)
+_register_operator(
+    [operator.le], BINARY, lambda builder, a, b: builder.fcmp_ordered("<=", a, b), MASK
+)
+_register_operator(
+    [operator.gt], BINARY, lambda builder, a, b: builder.fcmp_ordered(">", a, b), MASK
+)
+_register_operator(
+    [operator.ge], BINARY, lambda builder, a, b: builder.fcmp_ordered(">=", a, b), MASK
+)
+_register_operator(
+    [operator.and_, operator.iand], [(Mask, Mask)], lambda builder, a, b: builder.and_(a, b), MASK
+)
+_register_operator(
+    [operator.or_, operator.ior], [(Mask, Mask)], lambda builder, a, b: builder.or_(a, b), MASK
+)
 _register_operator([operator.invert], [(Mask,)], lambda builder, a: builder.not_(a), MASK)
 
 
@@ -130,7 +157,9 @@ def address(context: Any, builder: Any, sig: Any, args: Any) -> Any:
 
 
 def _check_array(array: Any) -> None:
-    if not (isinstance(array, types.Array) and array.layout == "C" and array.dtype == types.float32):
+    if not (
+        isinstance(array, types.Array) and array.layout == "C" and array.dtype == types.float32
+    ):
         raise TypeError(f"a contiguous float32 array is needed, got {array}")
 
 
@@ -140,11 +169,14 @@ def load(typing_context, array, index):
     _check_array(array)
 
     def codegen(context, builder, sig, args):
-        # LLVM aligns the stack to 16 bytes only. Vectors that it spills to the stack could then cross cache lines, in
-        # some processes and threads but not in others, which would cost a quarter of a kernel's time.
+        # LLVM aligns the stack to 16 bytes only. Vectors that it spills to the stack could then
+        # cross cache lines, in some processes and threads but not in others, which would cost a
+        # quarter of a kernel's time.
         builder.function.attributes.alignstack = 4 * LANES
         builder.function.attributes.add("nounwind")
-        return builder.load(builder.bitcast(address(context, builder, sig, args), VECTOR.ir.as_pointer()), align=4)
+        return builder.load(
+            builder.bitcast(address(context, builder, sig, args), VECTOR.ir.as_pointer()), align=4
+        )
 
     return VECTOR(array, index), codegen
 
@@ -158,7 +190,9 @@ def load_numbers(typing_context, array, index):
     kind = ir.VectorType(ir.IntType(8), LANES) if is_bytes else VECTOR.ir
 
     def codegen(context, builder, sig, args):
-        value = builder.load(builder.bitcast(address(context, builder, sig, args), kind.as_pointer()), align=1)
+        value = builder.load(
+            builder.bitcast(address(context, builder, sig, args), kind.as_pointer()), align=1
+        )
         return builder.uitofp(value, VECTOR.ir) if is_bytes else value
 
     return VECTOR(array, index), codegen
@@ -179,7 +213,8 @@ def store(typing_context, array, index, value):
 
 
 def _places(context: Any, builder: Any, sig: Any, args: Any) -> Iterator[Any]:
-    """The addresses of ``array.flat[indices[k] * stride + offset]`` for each lane k; ``args[:4]`` are these four."""
+    """The addresses of ``array.flat[indices[k] * stride + offset]`` for each lane k; ``args[:4]``
+    are these four."""
     data = context.make_array(sig.args[0])(context, builder, args[0]).data
     indices = context.make_array(sig.args[1])(context, builder, args[1]).data
     stride, offset = (context.cast(builder, args[k], sig.args[k], types.intp) for k in (2, 3))
@@ -190,13 +225,16 @@ def _places(context: Any, builder: Any, sig: Any, args: Any) -> Iterator[Any]:
 
 @intrinsic
 def gather(typing_context, array, indices, stride, offset):
-    """``array.flat[indices[k] * stride + offset]`` in lane k; ``indices`` is an int64 array [16]."""
+    """``array.flat[indices[k] * stride + offset]`` in lane k; ``indices`` is an int64 array
+    [16]."""
     _check_array(array)
 
     def codegen(context, builder, sig, args):
         vector = ir.Constant(VECTOR.ir, ir.Undefined)
         for lane, place in enumerate(_places(context, builder, sig, args)):
-            vector = builder.insert_element(vector, builder.load(place), ir.Constant(ir.IntType(32), lane))
+            vector = builder.insert_element(
+                vector, builder.load(place), ir.Constant(ir.IntType(32), lane)
+            )
         return vector
 
     return VECTOR(array, indices, stride, offset), codegen
@@ -204,12 +242,15 @@ def gather(typing_context, array, indices, stride, offset):
 
 @intrinsic
 def scatter(typing_context, array, indices, stride, offset, value):
-    """Write lane k of ``value`` to ``array.flat[indices[k] * stride + offset]``; of equal indices the last wins."""
+    """Write lane k of ``value`` to ``array.flat[indices[k] * stride + offset]``; of equal indices
+    the last wins."""
     _check_array(array)
 
     def codegen(context, builder, sig, args):
         for lane, place in enumerate(_places(context, builder, sig, args)):
-            builder.store(builder.extract_element(args[4], ir.Constant(ir.IntType(32), lane)), place)
+            builder.store(
+                builder.extract_element(args[4], ir.Constant(ir.IntType(32), lane)), place
+            )
         return context.get_dummy_value()
 
     return types.void(array, indices, stride, offset, value), codegen
@@ -236,11 +277,14 @@ def prefetch(typing_context, array, index):
 
 def _call(builder: Any, name: str, *operands: Any) -> Any:
     kind = ir.FunctionType(VECTOR.ir, [VECTOR.ir] * len(operands))
-    return builder.call(cgutils.get_or_insert_function(builder.module, kind, f"llvm.{name}.v{LANES}f32"), operands)
+    return builder.call(
+        cgutils.get_or_insert_function(builder.module, kind, f"llvm.{name}.v{LANES}f32"), operands
+    )
 
 
 def _function(emit: Callable[..., Any], *kinds: Any) -> Any:
-    """An intrinsic of vectors, or vectors and numbers, that compiles to ``emit(builder, *operands)``."""
+    """An intrinsic of vectors, or vectors and numbers, that compiles to ``emit(builder,
+    *operands)``."""
     if not _fits(kinds):
         return None
 
@@ -269,13 +313,17 @@ def fma(typing_context, a, b, c):
 @intrinsic
 def minimum(typing_context, a, b):
     """``a if a < b else b``; so b if either is NaN."""
-    return _function(lambda builder, x, y: builder.select(builder.fcmp_ordered("<", x, y), x, y), a, b)
+    return _function(
+        lambda builder, x, y: builder.select(builder.fcmp_ordered("<", x, y), x, y), a, b
+    )
 
 
 @intrinsic
 def maximum(typing_context, a, b):
     """``a if a > b else b``; so b if either is NaN."""
-    return _function(lambda builder, x, y: builder.select(builder.fcmp_ordered(">", x, y), x, y), a, b)
+    return _function(
+        lambda builder, x, y: builder.select(builder.fcmp_ordered(">", x, y), x, y), a, b
+    )
 
 
 @intrinsic
@@ -334,14 +382,19 @@ def mask_from_bits(typing_context, bits):
 
 @intrinsic
 def lanes_with_bit(typing_context, masks, index, bit):
-    """A 64-bit word whose bit k is 1 if ``masks.flat[index + k] & bit`` is not 0; ``masks`` is a uint16 array."""
+    """A 64-bit word whose bit k is 1 if ``masks.flat[index + k] & bit`` is not 0; ``masks`` is a
+    uint16 array."""
     lanes = 64
     kind = ir.VectorType(ir.IntType(16), lanes)
 
     def codegen(context, builder, sig, args):
-        values = builder.load(builder.bitcast(address(context, builder, sig, args), kind.as_pointer()), align=2)
+        values = builder.load(
+            builder.bitcast(address(context, builder, sig, args), kind.as_pointer()), align=2
+        )
         wanted = broadcast(builder, context.cast(builder, args[2], sig.args[2], types.uint16), kind)
-        found = builder.icmp_unsigned("!=", builder.and_(values, wanted), ir.Constant(kind, [0] * lanes))
+        found = builder.icmp_unsigned(
+            "!=", builder.and_(values, wanted), ir.Constant(kind, [0] * lanes)
+        )
         return builder.bitcast(found, ir.IntType(lanes))
 
     return types.uint64(masks, index, bit), codegen
@@ -367,9 +420,11 @@ def _polynomial(builder: Any, x: Any, coefficients: Sequence[float]) -> Any:
 
 
 MANTISSA_BITS = 23
-# 2^f on [-1/2, 1/2]: least-squares fit of the relative error at 200 Chebyshev nodes; exact at 0, error 1.0e-7.
+# 2^f on [-1/2, 1/2]: least-squares fit of the relative error at 200 Chebyshev nodes; exact at 0,
+# error 1.0e-7.
 _EXP2 = (1.0, 0.69314688444, 0.24022237957, 0.05550893024, 0.00967169832, 0.00132186722)
-# log2(m) = 2 / ln 2 artanh(s), s = (m - 1) / (m + 1), as a series in s^2; error 2e-8 for m in [sqrt(1/2), sqrt(2)].
+# log2(m) = 2 / ln 2 artanh(s), s = (m - 1) / (m + 1), as a series in s^2; error 2e-8 for m in
+# [sqrt(1/2), sqrt(2)].
 _LOG2_SERIES = tuple(2.0 / math.log(2.0) / (2 * k + 1) for k in range(5))
 _BITS_OF_ROOT_HALF = 0x3F3504F3
 
@@ -378,7 +433,8 @@ _BITS_OF_ROOT_HALF = 0x3F3504F3
 def exp2(typing_context, a):
     """``2^a`` with an error of at most 2.5e-7 for -126 <= a < 127.5; undefined elsewhere.
 
-    2^a = 2^n 2^f. Adding 1.5 * 2^23 to a leaves the nearest integer n in the low bits of the mantissa.
+    2^a = 2^n 2^f. Adding 1.5 * 2^23 to a leaves the nearest integer n in the low bits of the
+    mantissa.
     """
 
     def emit(builder, x):
@@ -394,14 +450,23 @@ def exp2(typing_context, a):
 
 @intrinsic
 def log2(typing_context, a):
-    """``log2(a)`` of positive normal numbers, with an error of at most 2e-7 max(1, |log2(a)|); undefined elsewhere."""
+    """``log2(a)`` of positive normal numbers, with an error of at most 2e-7 max(1, |log2(a)|);
+    undefined elsewhere."""
 
     def emit(builder, x):
-        # x = 2^n m with m from sqrt(1/2) to sqrt(2): n is the difference of the bits and those of sqrt(1/2), shifted.
+        # x = 2^n m with m from sqrt(1/2) to sqrt(2): n is the difference of the bits and those of
+        # sqrt(1/2), shifted.
         bits = builder.bitcast(x, VECTOR.bits_ir)
-        exponent = builder.ashr(builder.sub(bits, VECTOR.bits(_BITS_OF_ROOT_HALF)), VECTOR.bits(MANTISSA_BITS))
-        mantissa = builder.bitcast(builder.sub(bits, builder.shl(exponent, VECTOR.bits(MANTISSA_BITS))), VECTOR.ir)
-        s = builder.fdiv(builder.fsub(mantissa, VECTOR.constant(1.0)), builder.fadd(mantissa, VECTOR.constant(1.0)))
+        exponent = builder.ashr(
+            builder.sub(bits, VECTOR.bits(_BITS_OF_ROOT_HALF)), VECTOR.bits(MANTISSA_BITS)
+        )
+        mantissa = builder.bitcast(
+            builder.sub(bits, builder.shl(exponent, VECTOR.bits(MANTISSA_BITS))), VECTOR.ir
+        )
+        s = builder.fdiv(
+            builder.fsub(mantissa, VECTOR.constant(1.0)),
+            builder.fadd(mantissa, VECTOR.constant(1.0)),
+        )
         series = _polynomial(builder, builder.fmul(s, s), _LOG2_SERIES)
         return _call(builder, "fmuladd", s, series, builder.sitofp(exponent, VECTOR.ir))
 
@@ -414,10 +479,11 @@ SUM_LANES = tuple(int(f"{k:04b}"[::-1], 2) for k in range(LANES))
 
 @intrinsic
 def lane_sums(typing_context, vectors):
-    """Sum the 16 lanes of each of up to 16 vectors; the k-th sum is in lane ``SUM_LANES[k]``, other lanes are 0.
+    """Sum the 16 lanes of each of up to 16 vectors; the k-th sum is in lane ``SUM_LANES[k]``, other
+    lanes are 0.
 
-    It is a tree of shuffles and additions in which each level merges pairs of vectors. So the sums of eleven vectors
-    take about as long as three single sums.
+    It is a tree of shuffles and additions in which each level merges pairs of vectors. So the sums
+    of eleven vectors take about as long as three single sums.
     """
     if not (isinstance(vectors, types.UniTuple) and vectors.dtype is VECTOR):
         return None
@@ -429,10 +495,15 @@ def lane_sums(typing_context, vectors):
             if len(level) % 2:
                 level.append(VECTOR.constant(0.0))
             # In each group of 2 * half lanes, the first half is from a, the second from b.
-            low = [lane // (2 * half) * 2 * half + lane % half + lane // half % 2 * LANES for lane in range(LANES)]
+            low = [
+                lane // (2 * half) * 2 * half + lane % half + lane // half % 2 * LANES
+                for lane in range(LANES)
+            ]
             first, second = lane_indices(low), lane_indices([lane + half for lane in low])
             level = [
-                builder.fadd(builder.shuffle_vector(a, b, first), builder.shuffle_vector(a, b, second))
+                builder.fadd(
+                    builder.shuffle_vector(a, b, first), builder.shuffle_vector(a, b, second)
+                )
                 for a, b in zip(level[::2], level[1::2], strict=True)
             ]
             half //= 2

@@ -1,4 +1,5 @@
-"""Pools of memory. Page faults of newly allocated arrays would take longer than the kernels that fill the arrays."""
+"""Pools of memory. Page faults of newly allocated arrays would take longer than the kernels that
+fill the arrays."""
 
 import threading
 import weakref
@@ -24,13 +25,17 @@ def aligned_bytes(size: int) -> NDArray[np.uint8]:
 
 
 class Arena:
-    """Named scratch arrays that only grow. ``take`` returns a view with the contents of its previous use."""
+    """Named scratch arrays that only grow. ``take`` returns a view with the contents of its
+    previous use."""
 
     def __init__(self) -> None:
         self._blocks: dict[str, NDArray[np.uint8]] = {}
 
-    def take(self, name: str, shape: tuple[int, ...], dtype: DTypeLike, zero: bool = False) -> NDArray[Any]:
-        """Return an array of ``shape``. With ``zero`` it is cleared when newly allocated, and only then."""
+    def take(
+        self, name: str, shape: tuple[int, ...], dtype: DTypeLike, zero: bool = False
+    ) -> NDArray[Any]:
+        """Return an array of ``shape``. With ``zero`` it is cleared when newly allocated, and only
+        then."""
         size = prod(shape) * np.dtype(dtype).itemsize
         block = self._blocks.get(name)
         if block is None or block.size < size:
@@ -64,7 +69,8 @@ class ArenaPool:
 
 
 class TensorPool:
-    """A pool of memory for float32 tensors. Memory returns to it when torch frees the last tensor that uses it."""
+    """A pool of memory for float32 tensors. Memory returns to it when torch frees the last tensor
+    that uses it."""
 
     def __init__(self) -> None:
         self._free: list[NDArray[np.uint8]] = []
@@ -80,27 +86,37 @@ class TensorPool:
 
     def _pop(self, size: int) -> NDArray[np.uint8]:
         with self._lock:
-            fitting = [k for k, block in enumerate(self._free) if size <= block.size <= 2 * size + 4096]
+            fitting = [
+                k for k, block in enumerate(self._free) if size <= block.size <= 2 * size + 4096
+            ]
             if fitting:
                 return self._free.pop(min(fitting, key=lambda k: self._free[k].size))
-            if self._free:  # drop what was unused for longest: the pool never has more blocks than were in use at once
+            # drop what was unused for longest: the pool never has more blocks than were in use at
+            # once
+            if self._free:
                 self._free.pop(0)
         return aligned_bytes(int(size * HEADROOM))
 
 
 class ShardRunner:
-    """Runs the shards of a stage on ``threads`` threads. The result of a shard must not depend on the thread.
+    """Runs the shards of a stage on ``threads`` threads. The result of a shard must not depend on
+    the thread.
 
-    A single thread runs all shards in one call, because each call of a kernel costs up to 40 microseconds.
+    A single thread runs all shards in one call, because each call of a kernel costs up to 40
+    microseconds.
     """
 
     def __init__(self, threads: int) -> None:
         self.threads = threads
-        self._executor = ThreadPoolExecutor(threads, thread_name_prefix="gsbench-raster") if threads > 1 else None
+        self._executor = (
+            ThreadPoolExecutor(threads, thread_name_prefix="gsbench-raster")
+            if threads > 1
+            else None
+        )
 
     def run(self, shards: int, work: Callable[[int, int], None]) -> None:
-        """Call ``work(first, past)`` for ranges of shards until all have run. On an error or an interrupt, wait for
-        the calls that have begun."""
+        """Call ``work(first, past)`` for ranges of shards until all have run. On an error or an
+        interrupt, wait for the calls that have begun."""
         if self._executor is None:
             work(0, shards)
             return

@@ -1,1 +1,2 @@
-"""``raster=triton``: the rasterizer for GPUs. It needs only torch and the Triton that torch installs."""
+"""``raster=triton``: the rasterizer for GPUs. It needs only torch and the Triton that torch
+installs."""

@@ -1,8 +1,10 @@
-"""Compositing of blocks, forward and backward, and footprints: one program of one warp per block, four pixels per lane.
+"""Compositing of blocks, forward and backward, and footprints: one program of one warp per block,
+four pixels per lane.
 
-With one warp, nothing is shared between warps: the loop over a list has no barrier, a record is read once for all 128
-pixels, and shuffles compute gradient sums. The four pixels of a lane are in one row, so terms that depend only on dy
-are computed once for all four, and four chains of fma run in parallel.
+With one warp, nothing is shared between warps: the loop over a list has no barrier, a record is
+read once for all 128 pixels, and shuffles compute gradient sums. The four pixels of a lane are in
+one row, so terms that depend only on dy are computed once for all four, and four chains of fma run
+in parallel.
 """
 
 from __future__ import annotations
@@ -44,16 +46,18 @@ ALPHA_MAX = tl.constexpr(CONSTANTS.alpha_max)
 TRANSMITTANCE_MIN = tl.constexpr(CONSTANTS.transmittance_min)
 UNROLL = tl.constexpr(4)  # entries between two checks whether all pixels have stopped
 UNROLL_BACK = tl.constexpr(2)  # entries per iteration of the backward pass's loop
-TO_PRECISION = tl.constexpr(2 * math.log(2.0))  # -curve to entry of the inverse covariance, up to sign
-COVERED, VALUES, DISTANCES = tl.constexpr(0), tl.constexpr(1), tl.constexpr(2)  # entries of a footprint's row
+# -curve to entry of the inverse covariance, up to sign
+TO_PRECISION = tl.constexpr(2 * math.log(2.0))
+# entries of a footprint's row
+COVERED, VALUES, DISTANCES = tl.constexpr(0), tl.constexpr(1), tl.constexpr(2)
 
 
 @triton.jit
 def block_pixels(block, blocks_x, width, height):
     """The pixels of a block.
 
-    Returns a mask of the pixels in the image and their numbers in it, both [STEPS, LANES]; then for each lane the
-    column of its first pixel and the row of all four, both [LANES] px.
+    Returns a mask of the pixels in the image and their numbers in it, both [STEPS, LANES]; then for
+    each lane the column of its first pixel and the row of all four, both [LANES] px.
     """
     lane, step = tl.arange(0, LANES), tl.arange(0, STEPS)
     x = block % blocks_x * BLOCK_WIDTH + lane % LANE_COLUMNS
@@ -67,7 +71,8 @@ def block_pixels(block, blocks_x, width, height):
 def block_places():
     """The places of a block's pixels in memory, [STEPS, LANES]; those of a lane are adjacent.
 
-    With this order Triton chooses a layout of [STEPS, LANES] in which sums over steps stay within a lane.
+    With this order Triton chooses a layout of [STEPS, LANES] in which sums over steps stay within a
+    lane.
     """
     return tl.arange(0, STEPS)[:, None] + tl.arange(0, LANES)[None, :] * STEPS
 
@@ -90,9 +95,11 @@ def load_record(records, entry):
 
 @triton.jit
 def log2_alpha(record, x, y):
-    """log2(alpha) before the clamp and t, both [STEPS, LANES], and dy [LANES], at x and y of ``block_pixels``.
+    """log2(alpha) before the clamp and t, both [STEPS, LANES], and dy [LANES], at x and y of
+    ``block_pixels``.
 
-    Each fma is explicit, so that the forward and the backward kernel round alike and skip the same pixels.
+    Each fma is explicit, so that the forward and the backward kernel round alike and skip the same
+    pixels.
     """
     mean_x, mean_y, shear, curve_t, curve_y, log2_opacity, _, _, _ = record
     dy = y - mean_y
@@ -126,26 +133,30 @@ def composite(
 
     In:
 
-    - ``order`` [blocks], ``starts`` [blocks + 1], ``entries`` [pairs] and ``slots`` [pairs], the lists;
+    - ``order`` [blocks], ``starts`` [blocks + 1], ``entries`` [pairs] and ``slots`` [pairs], the
+      lists;
     - ``records`` [N + 1, 16], with an invisible one at ``closing``.
 
     Out:
 
     - ``image`` [H, W, 3], ``alpha`` [H, W];
-    - ``transmittance``, final, and ``last``, past the last entry that was read before the pixel stopped; both by block,
-      lane and step;
-    - ``past`` [blocks], the maximum of ``last``; ``last_slots`` [blocks], the slot of the entry before it, -1 if none;
+    - ``transmittance``, final, and ``last``, past the last entry that was read before the pixel
+      stopped; both by block, lane and step;
+    - ``past`` [blocks], the maximum of ``last``; ``last_slots`` [blocks], the slot of the entry
+      before it, -1 if none;
     - ``borders`` that compositing crossed.
     """
     block = tl.load(order + tl.program_id(0)).to(tl.int32)
     inside, pixel, x, y = block_pixels(block, blocks_x, width, height)
     begin, end = tl.load(starts + block), tl.load(starts + block + 1)
-    # The transmittance of a pixel that has stopped or is outside the image has a minus sign: it does not change again.
+    # The transmittance of a pixel that has stopped or is outside the image has a minus sign: it
+    # does not change again.
     light = tl.where(inside, 1.0, -1.0)
     red, green, blue = tl.zeros_like(light), tl.zeros_like(light), tl.zeros_like(light)
     seen = tl.where(inside, begin, 0)
 
-    # Records are loaded one entry ahead, entries two ahead; behind the end of the list, the invisible record is used.
+    # Records are loaded one entry ahead, entries two ahead; behind the end of the list, the
+    # invisible record is used.
     ahead = load_record(records, tl.load(entries + begin, mask=begin < end, other=closing))
     entry = tl.load(entries + begin + 1, mask=begin + 1 < end, other=closing)
     alive = True
@@ -162,7 +173,9 @@ def composite(
                 entry = tl.load(entries + position + 2, mask=position + 2 < end, other=closing)
                 position += 1
                 power, _, _ = log2_alpha(record, x, y)
-                opacity = tl.where(power >= LOG2_ALPHA_MIN, tl.minimum(tl.exp2(power), ALPHA_MAX), 0.0)
+                opacity = tl.where(
+                    power >= LOG2_ALPHA_MIN, tl.minimum(tl.exp2(power), ALPHA_MAX), 0.0
+                )
                 weight = light * opacity
                 after = light - weight
                 stopped = after < TRANSMITTANCE_MIN
@@ -182,12 +195,16 @@ def composite(
             red, green, blue = tl.zeros_like(light), tl.zeros_like(light), tl.zeros_like(light)
             crossed += 1
 
-    # Now the colours are those of the last segment. Adding segment by segment, back to front, gives the light behind
-    # each border without a subtraction.
+    # Now the colours are those of the last segment. Adding segment by segment, back to front, gives
+    # the light behind each border without a subtraction.
     tl.debug_barrier()
     for k in range(0, crossed):
         place = first_border + (crossed - 1 - k) * BORDER
-        before = tl.load(place + BEHIND_RED), tl.load(place + BEHIND_GREEN), tl.load(place + BEHIND_BLUE)
+        before = (
+            tl.load(place + BEHIND_RED),
+            tl.load(place + BEHIND_GREEN),
+            tl.load(place + BEHIND_BLUE),
+        )
         tl.store(place + BEHIND_RED, red)
         tl.store(place + BEHIND_GREEN, green)
         tl.store(place + BEHIND_BLUE, blue)
@@ -208,9 +225,11 @@ def composite(
 
 @triton.jit
 def _fold(a, b, lane, BIT: tl.constexpr):
-    """Sums over pairs of lanes that differ in ``BIT``: of ``a`` in the lanes without it, of ``b`` in those with it.
+    """Sums over pairs of lanes that differ in ``BIT``: of ``a`` in the lanes without it, of ``b``
+    in those with it.
 
-    All are [LANES]. One exchange between lanes gives both sums, where two separate sums would take two.
+    All are [LANES]. One exchange between lanes gives both sums, where two separate sums would take
+    two.
     """
     low = (lane & BIT) == 0
     return tl.where(low, a, b) + tl.gather(tl.where(low, b, a), lane ^ BIT, 0)
@@ -224,7 +243,8 @@ def _sum_over(a, lane, BIT: tl.constexpr):
 
 @triton.jit
 def _number_of_sum(lane, ABSOLUTE: tl.constexpr):
-    """The number of the sum that ``_sums_over_lanes`` leaves in each lane, and a mask of the lanes that store it."""
+    """The number of the sum that ``_sums_over_lanes`` leaves in each lane, and a mask of the lanes
+    that store it."""
     four, three, two, one = (lane >> 4) & 1, (lane >> 3) & 1, (lane >> 2) & 1, (lane >> 1) & 1
     if ABSOLUTE:
         further = tl.where(three == 1, 10, 8 + four)
@@ -237,19 +257,23 @@ def _number_of_sum(lane, ABSOLUTE: tl.constexpr):
 
 @triton.jit
 def _sums_over_lanes(sums, lane, ABSOLUTE: tl.constexpr):
-    """The sums over all lanes of the nine (or eleven) ``sums``; ``_number_of_sum`` says which lane has which."""
+    """The sums over all lanes of the nine (or eleven) ``sums``; ``_number_of_sum`` says which lane
+    has which."""
     first = _fold(_fold(sums[0], sums[1], lane, 16), _fold(sums[2], sums[3], lane, 16), lane, 8)
     second = _fold(_fold(sums[4], sums[5], lane, 16), _fold(sums[6], sums[7], lane, 16), lane, 8)
     if ABSOLUTE:
         further = _fold(_fold(sums[8], sums[9], lane, 16), _sum_over(sums[10], lane, 16), lane, 8)
     else:
         further = _sum_over(_sum_over(sums[8], lane, 16), lane, 8)
-    return _sum_over(_fold(_fold(first, second, lane, 4), _sum_over(further, lane, 4), lane, 2), lane, 1)
+    return _sum_over(
+        _fold(_fold(first, second, lane, 4), _sum_over(further, lane, 4), lane, 2), lane, 1
+    )
 
 
 @triton.jit
 def _lane_sums(h, weight, t, dy, g, record, ABSOLUTE: tl.constexpr):
-    """The nine (or eleven) gradient sums over the pixels of each lane, [LANES], in the order of a row."""
+    """The nine (or eleven) gradient sums over the pixels of each lane, [LANES], in the order of a
+    row."""
     ht = h * t
     sum_h, sum_ht = tl.sum(h, 0), tl.sum(ht, 0)
     sum_hy = sum_h * dy  # all pixels of a lane have the same dy
@@ -267,9 +291,9 @@ def _lane_sums(h, weight, t, dy, g, record, ABSOLUTE: tl.constexpr):
 def _segment(order, starts, blocks, inner):
     """The block and the first entry of this program's segment, which may not exist.
 
-    Program p of the first ``inner`` has the segment behind border p. Only the list with the entry before (p + 1) *
-    SEGMENT can have this border; bisection finds it. The other programs have the first segments of the blocks in
-    ``order``.
+    Program p of the first ``inner`` has the segment behind border p. Only the list with the entry
+    before (p + 1) * SEGMENT can have this border; bisection finds it. The other programs have the
+    first segments of the blocks in ``order``.
     """
     program = tl.program_id(0)
     if program >= inner:
@@ -311,12 +335,14 @@ def composite_backward(
     HAS_ALPHA: tl.constexpr,
     ABSOLUTE: tl.constexpr,
 ):
-    """Write the gradient sums of the pairs of one segment to their rows in ``rows_out`` [pairs, 16], back to front.
+    """Write the gradient sums of the pairs of one segment to their rows in ``rows_out`` [pairs,
+    16], back to front.
 
-    c is the colour of a Gaussian, g the gradient of the pixel, T the transmittance before the Gaussian, and S the sum
-    of (c . g) alpha T over the later Gaussians and the background. The derivative of the loss by alpha is T (c . g) - S
-    / (1 - alpha). Back to front, S is a sum that starts with the background and the light behind the segment, so
-    nothing cancels. ``slots`` [pairs] has the row of each entry. Rows of entries that compositing did not reach are not
+    c is the colour of a Gaussian, g the gradient of the pixel, T the transmittance before the
+    Gaussian, and S the sum of (c . g) alpha T over the later Gaussians and the background. The
+    derivative of the loss by alpha is T (c . g) - S / (1 - alpha). Back to front, S is a sum that
+    starts with the background and the light behind the segment, so nothing cancels. ``slots``
+    [pairs] has the row of each entry. Rows of entries that compositing did not reach are not
     written. ``g_alpha`` is read only if ``HAS_ALPHA``.
     """
     block, begin = _segment(order, starts, blocks, inner)
@@ -337,7 +363,9 @@ def composite_backward(
     state = block * BLOCK_PIXELS + places
     light = tl.load(transmittance + state)
     seen = tl.load(last + state)
-    behind = g[0] * tl.load(background) + g[1] * tl.load(background + 1) + g[2] * tl.load(background + 2)
+    behind = (
+        g[0] * tl.load(background) + g[1] * tl.load(background + 1) + g[2] * tl.load(background + 2)
+    )
     if HAS_ALPHA:
         behind -= tl.load(g_alpha + pixel, mask=inside, other=0.0)
     behind *= light
@@ -378,13 +406,24 @@ def composite_backward(
 
 @triton.jit(do_not_specialize=["width", "height", "blocks_x"])
 def cover(
-    starts, entries, slots, records, width, height, blocks_x, last, past, values, rows_out, HAS_VALUES: tl.constexpr
+    starts,
+    entries,
+    slots,
+    records,
+    width,
+    height,
+    blocks_x,
+    last,
+    past,
+    values,
+    rows_out,
+    HAS_VALUES: tl.constexpr,
 ):
-    """Write the footprints of one block, for its entries up to ``past`` [blocks], to their rows in ``rows_out``
-    [pairs, 16].
+    """Write the footprints of one block, for its entries up to ``past`` [blocks], to their rows in
+    ``rows_out`` [pairs, 16].
 
-    A footprint is the number of pixels that the Gaussian was blended into, and the sums over them of ``values`` [H, W],
-    read only if ``HAS_VALUES``, and of the distances to its mean, px.
+    A footprint is the number of pixels that the Gaussian was blended into, and the sums over them
+    of ``values`` [H, W], read only if ``HAS_VALUES``, and of the distances to its mean, px.
     """
     block = tl.program_id(0)
     inside, pixel, x, y = block_pixels(block, blocks_x, width, height)
@@ -405,9 +444,19 @@ def cover(
 
 @triton.jit(do_not_specialize=["count"])
 def sum_cover(
-    count, row_counts, first_units, pair_ends, unit_widths, rows, covered, sums, distances, GROUP: tl.constexpr
+    count,
+    row_counts,
+    first_units,
+    pair_ends,
+    unit_widths,
+    rows,
+    covered,
+    sums,
+    distances,
+    GROUP: tl.constexpr,
 ):
-    """Write ``covered`` [N] int32, ``sums`` and ``distances`` [N] from the rows that ``sum_units`` has summed."""
+    """Write ``covered`` [N] int32, ``sums`` and ``distances`` [N] from the rows that ``sum_units``
+    has summed."""
     index = tl.program_id(0).to(tl.int64) * GROUP + tl.arange(0, GROUP)  # [GROUP]
     own_rows = tl.load(row_counts + index, mask=index < count, other=0)
     unit = tl.load(first_units + index, mask=own_rows > 0, other=0)

@@ -48,27 +48,33 @@ class TritonFrame:
 class TritonRasterizer(StagedRasterizer[TritonFrame]):
     """float32 on a GPU, compiled by Triton at first use. Same bits on every run on one GPU.
 
-    Each render keeps its intermediate results until its graph is freed; then their memory is reused. A render waits for
-    the device once, for the sizes of the lists.
+    Each render keeps its intermediate results until its graph is freed; then their memory is
+    reused. A render waits for the device once, for the sizes of the lists.
     """
 
     name = "triton"
 
     def __init__(self) -> None:
         if CONSTANTS.tile != TILE.value:
-            raise ValueError(f"the Triton rasterizer has tiles of {TILE.value} px, the contract {CONSTANTS.tile}")
+            raise ValueError(
+                f"the Triton rasterizer has tiles of {TILE.value} px, the contract {CONSTANTS.tile}"
+            )
         self._frames = WorkspacePool()
         self._scratch = WorkspacePool()
 
     def check(self, gaussians: Gaussians) -> None:
-        """Raise ValueError if tensors are not float32, and InputError if Triton cannot use the GPU."""
+        """Raise ValueError if tensors are not float32, and InputError if Triton cannot use the
+        GPU."""
         if gaussians.means.dtype != torch.float32:
             raise ValueError(f"means: raster=triton needs float32, got {gaussians.means.dtype}")
         if gaussians.means.device.type == "cuda":
             load_driver()
 
-    def forward(self, gaussians: Gaussians, request: RenderRequest) -> tuple[Tensor, Tensor, Tensor, TritonFrame]:
-        """Project, sort, bin, composite; see `StagedRasterizer`. Raises ValueError for bad values."""
+    def forward(
+        self, gaussians: Gaussians, request: RenderRequest
+    ) -> tuple[Tensor, Tensor, Tensor, TritonFrame]:
+        """Project, sort, bin, composite; see `StagedRasterizer`. Raises ValueError for bad
+        values."""
         camera, device = request.camera, gaussians.means.device
         image = torch.empty(camera.height, camera.width, 3, dtype=torch.float32, device=device)
         alpha = torch.empty(camera.height, camera.width, dtype=torch.float32, device=device)
@@ -77,7 +83,8 @@ class TritonRasterizer(StagedRasterizer[TritonFrame]):
         with torch.cuda.device_of(image):
             memory = self._frames.lease(request.lifetime, device)
             scratch = self._scratch.lease(call_lifetime, device)
-            # No number is an integer: Triton compiles a kernel again for the integer 1 and for multiples of 16.
+            # No number is an integer: Triton compiles a kernel again for the integer 1 and for
+            # multiples of 16.
             view = CameraNumbers._make(map(float, CameraNumbers.of(camera)))
             blocks_x = -(-camera.width // BLOCK_WIDTH.value)
             blocks = blocks_x * -(-camera.height // BLOCK_HEIGHT.value)
@@ -85,7 +92,9 @@ class TritonRasterizer(StagedRasterizer[TritonFrame]):
             flags = scratch.take("flags", 1, torch.int32).zero_()
             keys = scratch.take("depth_keys", count, torch.int32)
             projected = _project(memory, gaussians, view, request.degree, keys, radii, flags)
-            units, owners = find_all_units(memory, scratch, gaussians, projected, blocks_x, keys, flags, background)
+            units, owners = find_all_units(
+                memory, scratch, gaussians, projected, blocks_x, keys, flags, background
+            )
             lists = make_lists(memory, scratch, units, owners, blocks)
             frame = TritonFrame(
                 blocks_x,
@@ -193,17 +202,27 @@ class TritonRasterizer(StagedRasterizer[TritonFrame]):
             return Gradients(gradients, g_screen, g_splitting)
 
     def footprint(
-        self, frame: TritonFrame, gaussians: Gaussians, request: RenderRequest, values: Tensor | None = None
+        self,
+        frame: TritonFrame,
+        gaussians: Gaussians,
+        request: RenderRequest,
+        values: Tensor | None = None,
     ) -> Footprint:
         """See ``raster.base.RenderOutput``."""
         lifetime = Lifetime()
         with torch.cuda.device_of(gaussians.means):
             scratch = self._scratch.lease(lifetime, gaussians.means.device)
-            units, lists, count, device = frame.units, frame.lists, len(gaussians), gaussians.means.device
+            units, lists, count, device = (
+                frame.units,
+                frame.lists,
+                len(gaussians),
+                gaussians.means.device,
+            )
             covered = torch.zeros(count, dtype=torch.int32, device=device)
             sums, distances = torch.zeros(2, count, device=device)
             given = sums if values is None else values.detach().float().contiguous()
-            rows = scratch.take("rows", units.pairs * ROW.value, torch.float32)  # ``cover`` fills 3 of 16 columns
+            # ``cover`` fills 3 of 16 columns
+            rows = scratch.take("rows", units.pairs * ROW.value, torch.float32)
             launch_grid(cover, frame.blocks)(
                 lists.starts,
                 lists.entries,
@@ -243,7 +262,8 @@ def _project(
     radii: Tensor,
     flags: Tensor,
 ) -> Projected:
-    """Project all Gaussians; fill ``keys``, by which depth is sorted, ``radii`` and ``flags``, 1 for bad values."""
+    """Project all Gaussians; fill ``keys``, by which depth is sorted, ``radii`` and ``flags``, 1
+    for bad values."""
     count = len(gaussians)
     projected = Projected(
         memory.take("records", (count + 1) * RECORD.value, torch.float32),

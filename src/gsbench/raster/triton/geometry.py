@@ -1,6 +1,7 @@
 """Projection geometry and spherical harmonics for both passes, float32, one lane per Gaussian.
 
-Matrices are tuples of rows, and vectors are tuples. No formula subtracts large numbers (see ``spread``).
+Matrices are tuples of rows, and vectors are tuples. No formula subtracts large numbers (see
+``spread``).
 """
 
 from __future__ import annotations
@@ -31,7 +32,8 @@ def load_vector(array, index, mask):
 
 @triton.jit
 def load_quaternion(quaternions, index, mask):
-    """The unit quaternions (w, x, y, z), and the inverse norm and the squared norm of the stored ones."""
+    """The unit quaternions (w, x, y, z), and the inverse norm and the squared norm of the stored
+    ones."""
     place = quaternions + 4 * index
     w = tl.load(place, mask=mask, other=1.0)
     x = tl.load(place + 1, mask=mask, other=0.0)
@@ -77,7 +79,8 @@ def scaled(row, scales):
 def from_camera(mean, v):
     """The vector from the camera centre to the mean, in world axes.
 
-    It is computed first: rotating the difference loses no digits, even if the scene is far from the origin.
+    It is computed first: rotating the difference loses no digits, even if the scene is far from the
+    origin.
     """
     return mean[0] - v.center_x, mean[1] - v.center_y, mean[2] - v.center_z
 
@@ -92,7 +95,8 @@ def to_view(offset, v):
 
 @triton.jit
 def image_axes(slope_x, slope_y, inverse_z, v):
-    """A = J W, the derivative of the pixel by the world position, as two rows; and the clamped slopes."""
+    """A = J W, the derivative of the pixel by the world position, as two rows; and the clamped
+    slopes."""
     slope_x = tl.minimum(tl.maximum(slope_x, v.slope_x_min), v.slope_x_max)
     slope_y = tl.minimum(tl.maximum(slope_y, v.slope_y_min), v.slope_y_max)
     first, second = image_rows(slope_x, slope_y, inverse_z, v)
@@ -103,8 +107,16 @@ def image_axes(slope_x, slope_y, inverse_z, v):
 def image_rows(slope_x, slope_y, inverse_z, v):
     """The derivative of the pixel by the world position at given slopes x/z, y/z, as two rows."""
     jx, jy = inverse_z * v.fx, inverse_z * v.fy
-    first = (jx * (v.r00 - slope_x * v.r20), jx * (v.r01 - slope_x * v.r21), jx * (v.r02 - slope_x * v.r22))
-    second = (jy * (v.r10 - slope_y * v.r20), jy * (v.r11 - slope_y * v.r21), jy * (v.r12 - slope_y * v.r22))
+    first = (
+        jx * (v.r00 - slope_x * v.r20),
+        jx * (v.r01 - slope_x * v.r21),
+        jx * (v.r02 - slope_x * v.r22),
+    )
+    second = (
+        jy * (v.r10 - slope_y * v.r20),
+        jy * (v.r11 - slope_y * v.r21),
+        jy * (v.r12 - slope_y * v.r22),
+    )
     return first, second
 
 
@@ -112,20 +124,25 @@ def image_rows(slope_x, slope_y, inverse_z, v):
 def spread(m0, m1):
     """xx, xy, yy of the covariance C = M M^T + BLUR I, for the rows of M; and a = yy / det C.
 
-    1/a is the variance of x given y. det(M M^T) is the squared cross product of the rows. Dividing one row by sqrt(yy)
-    first gives 1/a without cancellation and overflow.
+    1/a is the variance of x given y. det(M M^T) is the squared cross product of the rows. Dividing
+    one row by sqrt(yy) first gives 1/a without cancellation and overflow.
     """
     xx, xy, yy = dot(m0, m0), dot(m0, m1), dot(m1, m1) + BLUR
     inverse = 1.0 / tl.sqrt(yy)
     n1 = (m1[0] * inverse, m1[1] * inverse, m1[2] * inverse)
-    cross = (m0[1] * n1[2] - m0[2] * n1[1], m0[2] * n1[0] - m0[0] * n1[2], m0[0] * n1[1] - m0[1] * n1[0])
+    cross = (
+        m0[1] * n1[2] - m0[2] * n1[1],
+        m0[2] * n1[0] - m0[0] * n1[2],
+        m0[0] * n1[1] - m0[1] * n1[0],
+    )
     given = dot(cross, cross) + BLUR * (xx + yy) / yy
     return xx + BLUR, xy, yy, 1.0 / given
 
 
 @triton.jit
 def basis(direction, DEGREE: tl.constexpr):
-    """The basis functions of degrees 1 to ``DEGREE`` at unit directions; ``DEGREE`` is at least 1."""
+    """The basis functions of degrees 1 to ``DEGREE`` at unit directions; ``DEGREE`` is at least
+    1."""
     x, y, z = direction
     values = (y * -F1, z * F1, x * -F1)
     if DEGREE >= 2:
@@ -158,13 +175,18 @@ def _coefficients(sh_rest, index, k: tl.constexpr, mask):
 
 @triton.jit
 def _add(sums, coefficients, factor):
-    return (sums[0] + coefficients[0] * factor, sums[1] + coefficients[1] * factor, sums[2] + coefficients[2] * factor)
+    return (
+        sums[0] + coefficients[0] * factor,
+        sums[1] + coefficients[1] * factor,
+        sums[2] + coefficients[2] * factor,
+    )
 
 
 @triton.jit
 def colors(direction, dc, sh_rest, index, mask, DEGREE: tl.constexpr):
-    """The colours SH + 0.5, not clamped, of the Gaussians ``index`` at unit directions, and their derivatives by x, y
-    and z of the direction, not yet projected to the tangent of the unit sphere; each for red, green and blue.
+    """The colours SH + 0.5, not clamped, of the Gaussians ``index`` at unit directions, and their
+    derivatives by x, y and z of the direction, not yet projected to the tangent of the unit sphere;
+    each for red, green and blue.
 
     ``dc`` are the coefficients of degree 0.
     """
@@ -191,12 +213,20 @@ def colors(direction, dc, sh_rest, index, mask, DEGREE: tl.constexpr):
         c = _coefficients(sh_rest, index, 6, mask)
         rgb, by_x, by_z = _add(rgb, c, values[6]), _add(by_x, c, D3 * z), _add(by_z, c, D3 * x)
         c = _coefficients(sh_rest, index, 7, mask)
-        rgb, by_x, by_y = _add(rgb, c, values[7]), _add(by_x, c, 2 * D4 * x), _add(by_y, c, -2 * D4 * y)
+        rgb, by_x, by_y = (
+            _add(rgb, c, values[7]),
+            _add(by_x, c, 2 * D4 * x),
+            _add(by_y, c, -2 * D4 * y),
+        )
     if DEGREE >= 3:
         xx, yy, zz = x * x, y * y, z * z
         xy, yz, xz = x * y, y * z, x * z
         c = _coefficients(sh_rest, index, 8, mask)
-        rgb, by_x, by_y = _add(rgb, c, values[8]), _add(by_x, c, 6 * T0 * xy), _add(by_y, c, 3 * T0 * (xx - yy))
+        rgb, by_x, by_y = (
+            _add(rgb, c, values[8]),
+            _add(by_x, c, 6 * T0 * xy),
+            _add(by_y, c, 3 * T0 * (xx - yy)),
+        )
         c = _coefficients(sh_rest, index, 9, mask)
         rgb, by_x = _add(rgb, c, values[9]), _add(by_x, c, T1 * yz)
         by_y, by_z = _add(by_y, c, T1 * xz), _add(by_z, c, T1 * xy)
@@ -213,7 +243,11 @@ def colors(direction, dc, sh_rest, index, mask, DEGREE: tl.constexpr):
         rgb, by_x = _add(rgb, c, values[13]), _add(by_x, c, 2 * T5 * xz)
         by_y, by_z = _add(by_y, c, -2 * T5 * yz), _add(by_z, c, T5 * (xx - yy))
         c = _coefficients(sh_rest, index, 14, mask)
-        rgb, by_x, by_y = _add(rgb, c, values[14]), _add(by_x, c, 3 * T6 * (xx - yy)), _add(by_y, c, -6 * T6 * xy)
+        rgb, by_x, by_y = (
+            _add(rgb, c, values[14]),
+            _add(by_x, c, 3 * T6 * (xx - yy)),
+            _add(by_y, c, -6 * T6 * xy),
+        )
     return rgb, by_x, by_y, by_z
 
 

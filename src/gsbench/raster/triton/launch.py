@@ -15,7 +15,8 @@ OPTIONS = {"enable_fp_fusion": True}
 
 
 def launch(kernel: Any, count: int, group: int) -> Callable[..., None]:
-    """Return a launcher of ``kernel`` for ``count`` items, one per lane and ``group`` per program; no launch for 0."""
+    """Return a launcher of ``kernel`` for ``count`` items, one per lane and ``group`` per program;
+    no launch for 0."""
 
     def run(*arguments: Any, **constants: Any) -> None:
         if count:
@@ -25,7 +26,8 @@ def launch(kernel: Any, count: int, group: int) -> Callable[..., None]:
 
 
 def launch_grid(kernel: Any, *programs: int) -> Callable[..., None]:
-    """Return a launcher of ``kernel`` on a grid of ``programs``, at least 1 on each axis; also takes ``num_warps``."""
+    """Return a launcher of ``kernel`` on a grid of ``programs``, at least 1 on each axis; also
+    takes ``num_warps``."""
 
     def run(*arguments: Any, **constants: Any) -> None:
         kernel[programs](*arguments, **OPTIONS, **constants)
@@ -34,7 +36,8 @@ def launch_grid(kernel: Any, *programs: int) -> Callable[..., None]:
 
 
 class Workspace:
-    """Named 1D tensors that grow by doubling. ``take`` returns a view with the contents of the last use."""
+    """Named 1D tensors that grow by doubling. ``take`` returns a view with the contents of the last
+    use."""
 
     def __init__(self, device: torch.device) -> None:
         self.device = device
@@ -44,8 +47,10 @@ class Workspace:
         """Return ``count`` numbers of ``dtype``. A name must always have the same dtype."""
         if name not in self._buffers or count > self.capacity(name):
             grown = max(count, 2 * self.capacity(name))
-            self._buffers.pop(name, None)  # free the old one first, so that both never exist at once
-            with torch.inference_mode(False):  # an inference tensor could not be written to outside that mode
+            # free the old one first, so that both never exist at once
+            self._buffers.pop(name, None)
+            # an inference tensor could not be written to outside that mode
+            with torch.inference_mode(False):
                 self._buffers[name] = torch.empty(grown, dtype=dtype, device=self.device)
         return self._buffers[name][:count]
 
@@ -58,7 +63,8 @@ class Workspace:
 class WorkspacePool:
     """A pool of workspaces. A workspace returns to the pool when its ``holder`` is freed.
 
-    It is then leased only for the same stream, because work that still reads it is queued there first.
+    It is then leased only for the same stream, because work that still reads it is queued there
+    first.
     """
 
     def __init__(self) -> None:

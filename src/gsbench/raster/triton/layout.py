@@ -8,8 +8,8 @@ import triton.language as tl
 
 from gsbench.raster.base import CONSTANTS
 
-# One program of one warp composites one block: half a tile of 3DGS, four pixels per lane. Lane l has row
-# l // LANE_COLUMNS, and in it every LANE_COLUMNS-th pixel from column l % LANE_COLUMNS on.
+# One program of one warp composites one block: half a tile of 3DGS, four pixels per lane. Lane l
+# has row l // LANE_COLUMNS, and in it every LANE_COLUMNS-th pixel from column l % LANE_COLUMNS on.
 TILE = tl.constexpr(16)  # px
 BLOCK_WIDTH = tl.constexpr(16)  # px; as wide as a tile
 BLOCK_HEIGHT = tl.constexpr(8)  # px
@@ -19,12 +19,14 @@ LANE_COLUMNS = tl.constexpr(4)
 STEPS = tl.constexpr(4)  # pixels per lane
 BLOCK_PIXELS = tl.constexpr(128)
 
-# The backward pass divides a list into segments of SEGMENT entries, one program each. If compositing continued behind
-# a segment, a border stores the state that a program needs to start there. The border of the segment that starts at
-# entry e has the number e // SEGMENT. These numbers are unique: borders of one list are SEGMENT entries apart, and the
-# first segment of the next list starts behind them.
+# The backward pass divides a list into segments of SEGMENT entries, one program each. If
+# compositing continued behind a segment, a border stores the state that a program needs to start
+# there. The border of the segment that starts at entry e has the number e // SEGMENT. These numbers
+# are unique: borders of one list are SEGMENT entries apart, and the first segment of the next list
+# starts behind them.
 SEGMENT = tl.constexpr(256)  # entries; a multiple of UNROLL and UNROLL_BACK
-BORDER = tl.constexpr(4 * 128)  # float32 numbers: the four quantities below of each pixel, by lane and step
+# float32 numbers: the four quantities below of each pixel, by lane and step
+BORDER = tl.constexpr(4 * 128)
 TRANSMITTANCE = tl.constexpr(0)
 BEHIND_RED, BEHIND_GREEN, BEHIND_BLUE = (
     tl.constexpr(128),
@@ -32,9 +34,10 @@ BEHIND_RED, BEHIND_GREEN, BEHIND_BLUE = (
     tl.constexpr(384),
 )  # light blended behind it
 
-# A record has what compositing needs of one Gaussian: 16 float32. With d = pixel - mean and t = dx + SHEAR dy,
-# log2(alpha) = LOG2_OPACITY + CURVE_T t^2 + CURVE_Y dy^2. The conic is a sum of squares here: unlike
-# a dx^2 + 2b dx dy + c dy^2, it has no cancellation for needles, and the exponent is never positive.
+# A record has what compositing needs of one Gaussian: 16 float32. With d = pixel - mean and t = dx
+# + SHEAR dy, log2(alpha) = LOG2_OPACITY + CURVE_T t^2 + CURVE_Y dy^2. The conic is a sum of squares
+# here: unlike a dx^2 + 2b dx dy + c dy^2, it has no cancellation for needles, and the exponent is
+# never positive.
 RECORD = tl.constexpr(16)
 MEAN_X, MEAN_Y = tl.constexpr(0), tl.constexpr(1)  # px, integer pixel centres
 SHEAR = tl.constexpr(2)  # b / a
@@ -47,14 +50,16 @@ COLUMNS = tl.constexpr(10)  # of blocks that the contour can touch: first + 6553
 FIRST_ROW = tl.constexpr(11)  # of blocks that the contour can touch
 CLAMPED = tl.constexpr(12)  # bit c: colour channel c was below 0
 
-# A row has the gradient sums of one Gaussian over the pixels of one block: 16 float32; h = d loss / d log(alpha).
+# A row has the gradient sums of one Gaussian over the pixels of one block: 16 float32; h = d loss /
+# d log(alpha).
 ROW = tl.constexpr(16)
 SUM_H, SUM_H_T, SUM_H_Y = tl.constexpr(0), tl.constexpr(1), tl.constexpr(2)
 SUM_H_TT, SUM_H_TY, SUM_H_YY = tl.constexpr(3), tl.constexpr(4), tl.constexpr(5)
 SUM_RED, SUM_GREEN, SUM_BLUE = tl.constexpr(6), tl.constexpr(7), tl.constexpr(8)
 SUM_ABS_T, SUM_ABS_Y = tl.constexpr(9), tl.constexpr(10)  # |h t|, |h (d power / d dy)|
 
-COLOR_SLOPES = tl.constexpr(9)  # derivatives of red by x, y, z of the direction; then of green; then of blue
+# derivatives of red by x, y, z of the direction; then of green; then of blue
+COLOR_SLOPES = tl.constexpr(9)
 
 LOG2_E = tl.constexpr(1 / math.log(2.0))
 ALPHA_MIN = tl.constexpr(CONSTANTS.alpha_min)

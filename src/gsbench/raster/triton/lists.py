@@ -1,8 +1,9 @@
 """Lists of the Gaussians that each block composites, front to back.
 
-In each row of blocks, the contour alpha = 1/255 of a Gaussian covers a span of blocks. One (Gaussian, row) is a *unit*,
-one (Gaussian, block) a *pair*. Units and pairs are numbered by depth of the Gaussian, then by row and column; the
-number of a pair is its *slot*. A stable sort of the pairs by block gives the list of each block.
+In each row of blocks, the contour alpha = 1/255 of a Gaussian covers a span of blocks. One
+(Gaussian, row) is a *unit*, one (Gaussian, block) a *pair*. Units and pairs are numbered by depth
+of the Gaussian, then by row and column; the number of a pair is its *slot*. A stable sort of the
+pairs by block gives the list of each block.
 """
 
 from __future__ import annotations
@@ -42,7 +43,8 @@ MAX_COLUMN = tl.constexpr(1e6)  # px; beyond every image, but within int32
 
 @triton.jit
 def _span(records, place, row, first, past, mask):
-    """The block columns, within ``first`` to ``past``, that the contour reaches in ``row``: first, past-the-last."""
+    """The block columns, within ``first`` to ``past``, that the contour reaches in ``row``: first,
+    past-the-last."""
     mean_x = tl.load(records + place + MEAN_X, mask=mask, other=0.0)
     mean_y = tl.load(records + place + MEAN_Y, mask=mask, other=0.0)
     shear = tl.load(records + place + SHEAR, mask=mask, other=0.0)
@@ -54,15 +56,25 @@ def _span(records, place, row, first, past, mask):
     margin_y = PIXEL_MARGIN + FLOAT_MARGIN * tl.abs(mean_y)
     top = (row * BLOCK_HEIGHT).to(tl.float32) - mean_y - margin_y
     bottom = top + (BLOCK_HEIGHT - 1) + 2 * margin_y
-    # As a function of y, the contour's right side is concave and its left side convex. So the extremes within the row
-    # are at the rightmost and the leftmost point, clamped to the row.
+    # As a function of y, the contour's right side is concave and its left side convex. So the
+    # extremes within the row are at the rightmost and the leftmost point, clamped to the row.
     y_right = tl.minimum(tl.maximum(rightmost, top), bottom)
     y_left = tl.minimum(tl.maximum(-rightmost, top), bottom)
-    right = tl.sqrt(tl.maximum((reach + curve_y * y_right * y_right) / -curve_t, 0.0)) - shear * y_right
-    left = -tl.sqrt(tl.maximum((reach + curve_y * y_left * y_left) / -curve_t, 0.0)) - shear * y_left
-    margin_x = PIXEL_MARGIN + FLOAT_MARGIN * (tl.abs(mean_x) + tl.maximum(tl.abs(left), tl.abs(right)))
-    low = tl.ceil(tl.minimum(tl.maximum(mean_x + left - margin_x, -MAX_COLUMN), MAX_COLUMN)).to(tl.int32)
-    high = tl.floor(tl.minimum(tl.maximum(mean_x + right + margin_x, -MAX_COLUMN), MAX_COLUMN)).to(tl.int32)
+    right = (
+        tl.sqrt(tl.maximum((reach + curve_y * y_right * y_right) / -curve_t, 0.0)) - shear * y_right
+    )
+    left = (
+        -tl.sqrt(tl.maximum((reach + curve_y * y_left * y_left) / -curve_t, 0.0)) - shear * y_left
+    )
+    margin_x = PIXEL_MARGIN + FLOAT_MARGIN * (
+        tl.abs(mean_x) + tl.maximum(tl.abs(left), tl.abs(right))
+    )
+    low = tl.ceil(tl.minimum(tl.maximum(mean_x + left - margin_x, -MAX_COLUMN), MAX_COLUMN)).to(
+        tl.int32
+    )
+    high = tl.floor(tl.minimum(tl.maximum(mean_x + right + margin_x, -MAX_COLUMN), MAX_COLUMN)).to(
+        tl.int32
+    )
     # Triton's // truncates towards 0, which would be wrong below 0: hence the maximum.
     low, high = tl.maximum(low, 0) // BLOCK_WIDTH, tl.maximum(high + BLOCK_WIDTH, 0) // BLOCK_WIDTH
     return tl.maximum(low, first), tl.minimum(high, past)
@@ -86,9 +98,9 @@ def find_units(
 ):
     """Find the units of all Gaussians, in the ``order`` [N] of depth; one lane per Gaussian.
 
-    In: ``unit_ends`` [N], the running sum of ``row_counts`` in that order. Out: ``first_units`` [N], the first unit of
-    each Gaussian; and for each unit its Gaussian, its first block and its number of blocks, which may be 0. Units from
-    ``capacity`` on are not written.
+    In: ``unit_ends`` [N], the running sum of ``row_counts`` in that order. Out: ``first_units``
+    [N], the first unit of each Gaussian; and for each unit its Gaussian, its first block and its
+    number of blocks, which may be 0. Units from ``capacity`` on are not written.
     """
     rank = tl.program_id(0).to(tl.int64) * GROUP + tl.arange(0, GROUP)  # [GROUP]
     inside = rank < count
@@ -110,7 +122,8 @@ def find_units(
 
 @triton.jit(do_not_specialize=["count", "capacity"])
 def summarise(unit_ends, count, pair_ends, capacity, flags, background, status):
-    """Fill ``status`` [3] int64: number of units; number of pairs (if the units fit); 1 if a value is bad."""
+    """Fill ``status`` [3] int64: number of units; number of pairs (if the units fit); 1 if a value
+    is bad."""
     units = tl.load(unit_ends + count - 1, mask=count > 0, other=0)
     pairs = tl.load(pair_ends + capacity - 1)
     channel = tl.arange(0, 4)
@@ -122,8 +135,11 @@ def summarise(unit_ends, count, pair_ends, capacity, flags, background, status):
 
 
 @triton.jit(do_not_specialize=["units"])
-def write_pairs(unit_owners, unit_blocks, unit_widths, pair_ends, units, keys, owners, GROUP: tl.constexpr):
-    """Write the block (``keys``) and the Gaussian (``owners``) of each slot, both [pairs]; one lane per unit."""
+def write_pairs(
+    unit_owners, unit_blocks, unit_widths, pair_ends, units, keys, owners, GROUP: tl.constexpr
+):
+    """Write the block (``keys``) and the Gaussian (``owners``) of each slot, both [pairs]; one lane
+    per unit."""
     unit = tl.program_id(0).to(tl.int64) * GROUP + tl.arange(0, GROUP)  # [GROUP]
     inside = unit < units
     width = tl.load(unit_widths + unit, mask=inside, other=0)
@@ -179,11 +195,14 @@ def find_all_units(
 ) -> tuple[Units, Tensor]:
     """Find the units of all Gaussians, front to back, and the Gaussian of each unit, [units].
 
-    Repeats with more memory if the first attempt has too little. Here the host waits for the device.
+    Repeats with more memory if the first attempt has too little. Here the host waits for the
+    device.
     """
     count = len(gaussians)
     depth_order = scratch.take("depth_order", count, torch.int64)
-    torch.sort(keys, stable=True, out=(scratch.take("sorted_depths", count, torch.int32), depth_order))
+    torch.sort(
+        keys, stable=True, out=(scratch.take("sorted_depths", count, torch.int32), depth_order)
+    )
     unit_ends = scratch.take("unit_ends", count, torch.int64)
     torch.cumsum(projected.row_counts[depth_order], 0, out=unit_ends)
     first = memory.take("first_units", count, torch.int64)
@@ -217,11 +236,15 @@ def find_all_units(
             break
         capacity = 2 * units
     if pairs > MAX_INT32:
-        raise ValueError(f"gaussians: {pairs} (Gaussian, block) pairs in one view are more than {MAX_INT32}")
+        raise ValueError(
+            f"gaussians: {pairs} (Gaussian, block) pairs in one view are more than {MAX_INT32}"
+        )
     return Units(units, pairs, first, widths, blocks, pair_ends), owners
 
 
-def make_lists(memory: Workspace, scratch: Workspace, units: Units, owners: Tensor, blocks: int) -> Lists:
+def make_lists(
+    memory: Workspace, scratch: Workspace, units: Units, owners: Tensor, blocks: int
+) -> Lists:
     """Sort the pairs of all units by block; within a block they stay front to back."""
     pairs = units.pairs
     key_type = torch.int16 if blocks <= MAX_INT16 else torch.int32

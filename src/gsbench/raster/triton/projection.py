@@ -68,18 +68,23 @@ SIGMA_EXTENT = tl.constexpr(CONSTANTS.sigma_extent)
 EIGENVALUE_FLOOR = tl.constexpr(CONSTANTS.eigenvalue_floor)
 MAX_RADIUS = tl.constexpr(2.0**24)  # px; keeps the radius of a huge Gaussian within int32
 MAX_CENTER = tl.constexpr(1e9)  # px; so far outside the image, float32 cannot resolve a pixel
-MAX_VARIANCE = tl.constexpr(1e18)  # px^2; the same for standard deviations; also keeps squares finite
+# px^2; the same for standard deviations; also keeps squares finite
+MAX_VARIANCE = tl.constexpr(1e18)
 MIN_SQUARED_NORM = tl.constexpr(MIN_QUATERNION_NORM**2)
-CONTOUR_MARGIN = tl.constexpr(0.01)  # px, and relative: rounding must not lose a pixel of the contour alpha = 1/255
+# px, and relative: rounding must not lose a pixel of the contour alpha = 1/255
+CONTOUR_MARGIN = tl.constexpr(0.01)
 LAST_KEY = tl.constexpr(2**31 - 1)  # sorts behind every depth
 INVISIBLE = tl.constexpr(-1e9)  # log2(opacity) of the invisible record
 
 
 @triton.jit
 def _tile_range(low, high, tiles, SIZE: tl.constexpr):
-    """First and past-the-last tile of ``SIZE`` px for the pixels ``low`` to ``high`` - 1, within the grid; int32."""
+    """First and past-the-last tile of ``SIZE`` px for the pixels ``low`` to ``high`` - 1, within
+    the grid; int32."""
     first = tl.floor(tl.minimum(tl.maximum(low * (1.0 / SIZE), 0.0), tiles)).to(tl.int32)
-    past = tl.floor(tl.minimum(tl.maximum((high + (SIZE - 1)) * (1.0 / SIZE), 0.0), tiles)).to(tl.int32)
+    past = tl.floor(tl.minimum(tl.maximum((high + (SIZE - 1)) * (1.0 / SIZE), 0.0), tiles)).to(
+        tl.int32
+    )
     return first, past
 
 
@@ -106,9 +111,10 @@ def project(
     """Project all Gaussians. Fills:
 
     - ``radii`` [N];
-    - ``records`` [N + 1, 16] of visible Gaussians (undefined for others), with an invisible record at N;
-      ``record_ints`` is the same memory;
-    - ``color_slopes`` [N, 9] of visible Gaussians, the derivatives of colour by the direction, unless ``DEGREE`` is 0;
+    - ``records`` [N + 1, 16] of visible Gaussians (undefined for others), with an invisible record
+      at N; ``record_ints`` is the same memory;
+    - ``color_slopes`` [N, 9] of visible Gaussians, the derivatives of colour by the direction,
+      unless ``DEGREE`` is 0;
     - ``keys`` [N], by which depth is sorted;
     - ``row_counts`` [N], the number of rows of blocks that the contour can touch;
     - ``flags`` [1], set to 1 if a value is not finite or a quaternion has length 0.
@@ -133,7 +139,11 @@ def project(
     scales = (tl.exp(log_scale[0]), tl.exp(log_scale[1]), tl.exp(log_scale[2]))
     matrix = rotation_matrix(quaternion)
     m0, m1 = scaled(times(axis_x, matrix), scales), scaled(times(axis_y, matrix), scales)
-    visible &= (tl.abs(column) < MAX_CENTER) & (tl.abs(row) < MAX_CENTER) & (dot(m0, m0) + dot(m1, m1) < MAX_VARIANCE)
+    visible &= (
+        (tl.abs(column) < MAX_CENTER)
+        & (tl.abs(row) < MAX_CENTER)
+        & (dot(m0, m0) + dot(m1, m1) < MAX_VARIANCE)
+    )
     xx, xy, yy, a = spread(m0, m1)
     half = (xx - yy) * 0.5
     # The discriminant (trace / 2)^2 - det, written as a sum of squares.
@@ -144,17 +154,29 @@ def project(
     visible &= (first_x < past_x) & (first_y < past_y)
     tl.store(radii + index, tl.where(visible, radius, 0.0).to(tl.int32), mask=inside)
 
-    # Of the blocks in the tiles of the 3 sigma square, keep those that the contour alpha = 1/255 can touch.
+    # Of the blocks in the tiles of the 3 sigma square, keep those that the contour alpha = 1/255
+    # can touch.
     growth = tl.exp(-logit) + 1.0
     log2_opacity = -tl.log2(growth)
-    reach = tl.maximum((log2_opacity - LOG2_ALPHA_MIN) * (2 / LOG2_E), 0.0)  # squared Mahalanobis distance
+    # squared Mahalanobis distance
+    reach = tl.maximum((log2_opacity - LOG2_ALPHA_MIN) * (2 / LOG2_E), 0.0)
     half_x = tl.sqrt(reach * xx) * (1 + CONTOUR_MARGIN) + CONTOUR_MARGIN
     half_y = tl.sqrt(reach * yy) * (1 + CONTOUR_MARGIN) + CONTOUR_MARGIN
-    blocks_x, blocks_y = tl.ceil(v.width * (1.0 / BLOCK_WIDTH)), tl.ceil(v.height * (1.0 / BLOCK_HEIGHT))
-    inner_x, outer_x = _tile_range(tl.ceil(column - half_x), tl.floor(column + half_x) + 1, blocks_x, BLOCK_WIDTH)
-    inner_y, outer_y = _tile_range(tl.ceil(row - half_y), tl.floor(row + half_y) + 1, blocks_y, BLOCK_HEIGHT)
+    blocks_x, blocks_y = (
+        tl.ceil(v.width * (1.0 / BLOCK_WIDTH)),
+        tl.ceil(v.height * (1.0 / BLOCK_HEIGHT)),
+    )
+    inner_x, outer_x = _tile_range(
+        tl.ceil(column - half_x), tl.floor(column + half_x) + 1, blocks_x, BLOCK_WIDTH
+    )
+    inner_y, outer_y = _tile_range(
+        tl.ceil(row - half_y), tl.floor(row + half_y) + 1, blocks_y, BLOCK_HEIGHT
+    )
     first_x, past_x = tl.maximum(first_x, inner_x), tl.minimum(past_x, outer_x)
-    first_y, past_y = tl.maximum(first_y * BLOCK_ROWS, inner_y), tl.minimum(past_y * BLOCK_ROWS, outer_y)
+    first_y, past_y = (
+        tl.maximum(first_y * BLOCK_ROWS, inner_y),
+        tl.minimum(past_y * BLOCK_ROWS, outer_y),
+    )
     seen = visible & (growth * ALPHA_MIN < 1.0) & (first_x < past_x) & (first_y < past_y)
     tl.store(row_counts + index, tl.where(seen, past_y - first_y, 0), mask=inside)
     # The bits of positive float32 numbers sort like the numbers.
@@ -196,8 +218,8 @@ def project(
 def sum_units(pair_ends, unit_widths, unit_blocks, last_slots, units, rows, GROUP: tl.constexpr):
     """Sum the ``rows`` [pairs, 16] of each unit, which are adjacent, into its first row.
 
-    Only rows of entries that compositing reached have been written. These are the slots up to ``last_slots`` [blocks],
-    because the slots in the list of a block rise.
+    Only rows of entries that compositing reached have been written. These are the slots up to
+    ``last_slots`` [blocks], because the slots in the list of a block rise.
     """
     unit = tl.program_id(0).to(tl.int64) * GROUP + tl.arange(0, GROUP)  # [GROUP]
     inside = unit < units
@@ -214,7 +236,9 @@ def sum_units(pair_ends, unit_widths, unit_blocks, last_slots, units, rows, GROU
 
 
 @triton.jit
-def _sum_rows(index, rows_of_blocks, first_units, pair_ends, unit_widths, rows, ABSOLUTE: tl.constexpr):
+def _sum_rows(
+    index, rows_of_blocks, first_units, pair_ends, unit_widths, rows, ABSOLUTE: tl.constexpr
+):
     """The gradient sums of each Gaussian over its units: nine, and two more if ``ABSOLUTE``."""
     unit = tl.load(first_units + index, mask=rows_of_blocks > 0, other=0)
     zero = tl.zeros_like(rows_of_blocks).to(tl.float32)
@@ -250,17 +274,25 @@ def _store_vector(array, index, values, mask):
 
 @triton.jit
 def _store_splitting(place, d00, d01, d11, shear, rows, mask):
-    """Write the splitting matrices F^T U^T (D G D - h D) U F. F = ``rows`` is the derivative of the projected mean;
-    ``d00``, ``d01`` and ``d11`` are the entries of D G D - h D.
+    """Write the splitting matrices F^T U^T (D G D - h D) U F. F = ``rows`` is the derivative of the
+    projected mean; ``d00``, ``d01`` and ``d11`` are the entries of D G D - h D.
 
-    The second derivative of alpha by the projected mean is alpha (u u^T - C), with u = C (dx, dy) and the conic C = U^T
-    D U. Its sum with weights h / alpha is U^T (D G D - h D) U.
+    The second derivative of alpha by the projected mean is alpha (u u^T - C), with u = C (dx, dy)
+    and the conic C = U^T D U. Its sum with weights h / alpha is U^T (D G D - h D) U.
     """
-    r0 = (rows[0][0] + shear * rows[1][0], rows[0][1] + shear * rows[1][1], rows[0][2] + shear * rows[1][2])
+    r0 = (
+        rows[0][0] + shear * rows[1][0],
+        rows[0][1] + shear * rows[1][1],
+        rows[0][2] + shear * rows[1][2],
+    )
     r1 = rows[1]
     s0 = (d00 * r0[0] + d01 * r1[0], d00 * r0[1] + d01 * r1[1], d00 * r0[2] + d01 * r1[2])
     s1 = (d01 * r0[0] + d11 * r1[0], d01 * r0[1] + d11 * r1[1], d01 * r0[2] + d11 * r1[2])
-    xy, xz, yz = r0[0] * s0[1] + r1[0] * s1[1], r0[0] * s0[2] + r1[0] * s1[2], r0[1] * s0[2] + r1[1] * s1[2]
+    xy, xz, yz = (
+        r0[0] * s0[1] + r1[0] * s1[1],
+        r0[0] * s0[2] + r1[0] * s1[2],
+        r0[1] * s0[2] + r1[1] * s1[2],
+    )
     tl.store(place, r0[0] * s0[0] + r1[0] * s1[0], mask=mask)
     tl.store(place + 1, xy, mask=mask)
     tl.store(place + 2, xz, mask=mask)
@@ -327,7 +359,11 @@ def backproject(
     if DEGREE > 0:
         for c in tl.static_range(3):
             slope = load_vector(color_slopes + 3 * c, 3 * index, seen)
-            pulled = (pulled[0] + g_rgb[c] * slope[0], pulled[1] + g_rgb[c] * slope[1], pulled[2] + g_rgb[c] * slope[2])
+            pulled = (
+                pulled[0] + g_rgb[c] * slope[0],
+                pulled[1] + g_rgb[c] * slope[1],
+                pulled[2] + g_rgb[c] * slope[2],
+            )
     store_gradients(to, g_rgb, g_sh_rest, index, seen, DEGREE)
     radial = dot(pulled, to)
     from_x = (pulled[0] - radial * to[0]) * inverse_distance
@@ -357,9 +393,9 @@ def backproject(
         tl.store(g_absolute + 2 * index, a * abs_t * half_width, mask=seen)
         tl.store(g_absolute + 2 * index + 1, abs_y * half_height, mask=seen)
 
-    # Covariance: M = N S and N = A R. d loss / d M = U^T Q U M with Q = D G D, D = diag(a, e), U = [[1, shear], [0, 1]]
-    # and G the second moments of h over (t, dy). For a needle the first row of U M is small, so U N is computed first,
-    # before large numbers can cancel.
+    # Covariance: M = N S and N = A R. d loss / d M = U^T Q U M with Q = D G D, D = diag(a, e), U =
+    # [[1, shear], [0, 1]] and G the second moments of h over (t, dy). For a needle the first row of
+    # U M is small, so U N is computed first, before large numbers can cancel.
     q00, q01, q11 = a * a * h_tt, a * e * h_ty, e * e * h_yy
     if SPLITTING:
         free = image_rows(x * inverse_z, y * inverse_z, inverse_z, v)
@@ -368,12 +404,17 @@ def backproject(
     g0 = (q00 * u0[0] + q01 * n1[0], q00 * u0[1] + q01 * n1[1], q00 * u0[2] + q01 * n1[2])
     g1 = (q01 * u0[0] + q11 * n1[0], q01 * u0[1] + q11 * n1[1], q01 * u0[2] + q11 * n1[2])
     variances = scaled(scales, scales)
-    along = (u0[0] * g0[0] + n1[0] * g1[0], u0[1] * g0[1] + n1[1] * g1[1], u0[2] * g0[2] + n1[2] * g1[2])
+    along = (
+        u0[0] * g0[0] + n1[0] * g1[0],
+        u0[1] * g0[1] + n1[1] * g1[1],
+        u0[2] * g0[2] + n1[2] * g1[2],
+    )
     _store_vector(g_log_scales, index, scaled(along, variances), seen)
 
-    # Rotation by small angles w about the Gaussian's own axes changes R S^2 R^T by a commutator, so the gradient by w
-    # has differences of variances as factors. Computing these differences first makes the gradient of a sphere exactly
-    # 0; otherwise rounding errors remain, which Adam scales to full steps. The quaternion changes by q (0, w) / 2.
+    # Rotation by small angles w about the Gaussian's own axes changes R S^2 R^T by a commutator, so
+    # the gradient by w has differences of variances as factors. Computing these differences first
+    # makes the gradient of a sphere exactly 0; otherwise rounding errors remain, which Adam scales
+    # to full steps. The quaternion changes by q (0, w) / 2.
     w_x = (u0[1] * g0[2] + n1[1] * g1[2]) * (scales[1] - scales[2]) * (scales[1] + scales[2])
     w_y = (u0[2] * g0[0] + n1[2] * g1[0]) * (scales[2] - scales[0]) * (scales[2] + scales[0])
     w_z = (u0[0] * g0[1] + n1[0] * g1[1]) * (scales[0] - scales[1]) * (scales[0] + scales[1])
@@ -388,8 +429,14 @@ def backproject(
     s1 = (s1[0] + shear * s0[0], s1[1] + shear * s0[1], s1[2] + shear * s0[2])
     a0 = (dot(s0, matrix[0]), dot(s0, matrix[1]), dot(s0, matrix[2]))
     a1 = (dot(s1, matrix[0]), dot(s1, matrix[1]), dot(s1, matrix[2]))
-    j00, j02 = a0[0] * v.r00 + a0[1] * v.r01 + a0[2] * v.r02, a0[0] * v.r20 + a0[1] * v.r21 + a0[2] * v.r22
-    j11, j12 = a1[0] * v.r10 + a1[1] * v.r11 + a1[2] * v.r12, a1[0] * v.r20 + a1[1] * v.r21 + a1[2] * v.r22
+    j00, j02 = (
+        a0[0] * v.r00 + a0[1] * v.r01 + a0[2] * v.r02,
+        a0[0] * v.r20 + a0[1] * v.r21 + a0[2] * v.r22,
+    )
+    j11, j12 = (
+        a1[0] * v.r10 + a1[1] * v.r11 + a1[2] * v.r12,
+        a1[0] * v.r20 + a1[1] * v.r21 + a1[2] * v.r22,
+    )
     fx_z, fy_z = inverse_z * v.fx, inverse_z * v.fy
     free_x, free_y = x * inverse_z, y * inverse_z
     # The clamp of a slope passes the gradient only within the limits.

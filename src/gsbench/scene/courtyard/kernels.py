@@ -1,4 +1,5 @@
-"""Ray casting for the courtyard, compiled with numba; all functions are scalar and share no state."""
+"""Ray casting for the courtyard, compiled with numba; all functions are scalar and share no
+state."""
 
 from math import exp, floor, inf, sqrt
 
@@ -9,7 +10,8 @@ from gsbench.scene.courtyard.textures import clamp, ground, octaves2, shade_fact
 from gsbench.system.jit import inlined, kernel
 
 GROUND, SKY = -1, -2
-SUN = (-0.5130, -0.4305, 0.7426)  # unit vector towards the sun: from the south-west, 48 degrees high
+# unit vector towards the sun: from the south-west, 48 degrees high
+SUN = (-0.5130, -0.4305, 0.7426)
 SUN_LIGHT = (2.55, 2.30, 1.90)
 SKY_LIGHT = (0.42, 0.50, 0.64)  # ambient light from above
 BOUNCE_LIGHT = (0.19, 0.18, 0.13)  # ambient light from below
@@ -37,7 +39,8 @@ def inverse(value):
 
 @inlined
 def enter_box(lx, ly, lz, hx, hy, hz, ox, oy, oz, ix, iy, iz):
-    """(entry, exit) of a ray with inverse direction i through the box from l to h; entry > exit if it misses."""
+    """(entry, exit) of a ray with inverse direction i through the box from l to h; entry > exit if
+    it misses."""
     ax, bx = (lx - ox) * ix, (hx - ox) * ix
     ay, by = (ly - oy) * iy, (hy - oy) * iy
     az, bz = (lz - oz) * iz, (hz - oz) * iz
@@ -46,7 +49,8 @@ def enter_box(lx, ly, lz, hx, hy, hz, ox, oy, oz, ix, iy, iz):
 
 @inlined
 def hit_tube(outer, half, inner, ox, oy, oz, dx, dy, dz):
-    """The first distance > 0 at which a ray meets a capped cylinder, solid or with a bore; inf if it misses."""
+    """The first distance > 0 at which a ray meets a capped cylinder, solid or with a bore; inf if
+    it misses."""
     best = inf
     a = dx * dx + dy * dy
     for radius in (outer, inner):
@@ -73,7 +77,18 @@ def hit_primitive(kind, size, ox, oy, oz, dx, dy, dz):
     """The first distance > 0 along a local ray to the primitive, or inf if it misses."""
     if kind == BOX:
         entry, exit_ = enter_box(
-            -size[0], -size[1], -size[2], size[0], size[1], size[2], ox, oy, oz, inverse(dx), inverse(dy), inverse(dz)
+            -size[0],
+            -size[1],
+            -size[2],
+            size[0],
+            size[1],
+            size[2],
+            ox,
+            oy,
+            oz,
+            inverse(dx),
+            inverse(dy),
+            inverse(dz),
         )
         return entry if 0.0 < entry <= exit_ else inf
     if kind == SPHERE:
@@ -90,7 +105,8 @@ def hit_primitive(kind, size, ox, oy, oz, dx, dy, dz):
 def cast(layout, ox, oy, oz, dx, dy, dz, any_hit):
     """(distance, primitive) of the nearest hit, GROUND or SKY included.
 
-    With ``any_hit``, for shadow rays, the first primitive found ends the search, and the ground is ignored.
+    With ``any_hit``, for shadow rays, the first primitive found ends the search, and the ground is
+    ignored.
     """
     best, index = inf, SKY
     ix, iy, iz = inverse(dx), inverse(dy), inverse(dz)
@@ -98,7 +114,9 @@ def cast(layout, ox, oy, oz, dx, dy, dz, any_hit):
         best, index = -oz / dz, GROUND
     for g in range(len(layout.group_low)):
         low, high = layout.group_low[g], layout.group_high[g]
-        entry, exit_ = enter_box(low[0], low[1], low[2], high[0], high[1], high[2], ox, oy, oz, ix, iy, iz)
+        entry, exit_ = enter_box(
+            low[0], low[1], low[2], high[0], high[1], high[2], ox, oy, oz, ix, iy, iz
+        )
         if entry > exit_ or exit_ < 0.0 or entry > best:
             continue
         for i in range(layout.group_start[g], layout.group_start[g + 1]):
@@ -133,7 +151,8 @@ def signed_distance(kind, size, x, y, z):
 
 @inlined
 def nearest_surface(layout, x, y, z, limit):
-    """The smallest |distance| from a point to any surface, the ground included, if below ``limit``, else ``limit``."""
+    """The smallest |distance| from a point to any surface, the ground included, if below ``limit``,
+    else ``limit``."""
     best = min(abs(z), limit)
     for g in range(len(layout.group_low)):
         low, high = layout.group_low[g], layout.group_high[g]
@@ -156,17 +175,36 @@ def nearest_surface(layout, x, y, z, limit):
 
 @inlined
 def local_normal(kind, size, x, y, z):
-    """The outward normal (3 values) at a local surface point, and coordinates (u, v) in m along the face."""
+    """The outward normal (3 values) at a local surface point, and coordinates (u, v) in m along the
+    face."""
     if kind == SPHERE:
         r = size[0]
         return x / r, y / r, z / r, (x + y) * 0.8, z + 0.4 * (x - y)
     if kind == BOX:
         qx, qy, qz = abs(x) - size[0], abs(y) - size[1], abs(z) - size[2]
         if qx >= qy and qx >= qz:
-            return (1.0 if x > 0 else -1.0), 0.0, 0.0, (y if size[1] > size[2] else z), (z if size[1] > size[2] else y)
+            return (
+                (1.0 if x > 0 else -1.0),
+                0.0,
+                0.0,
+                (y if size[1] > size[2] else z),
+                (z if size[1] > size[2] else y),
+            )
         if qy >= qz:
-            return 0.0, (1.0 if y > 0 else -1.0), 0.0, (x if size[0] > size[2] else z), (z if size[0] > size[2] else x)
-        return 0.0, 0.0, (1.0 if z > 0 else -1.0), (x if size[0] > size[1] else y), (y if size[0] > size[1] else x)
+            return (
+                0.0,
+                (1.0 if y > 0 else -1.0),
+                0.0,
+                (x if size[0] > size[2] else z),
+                (z if size[0] > size[2] else x),
+            )
+        return (
+            0.0,
+            0.0,
+            (1.0 if z > 0 else -1.0),
+            (x if size[0] > size[1] else y),
+            (y if size[0] > size[1] else x),
+        )
     radius = sqrt(x * x + y * y)
     if abs(abs(z) - size[1]) < min(abs(radius - size[0]), abs(radius - size[2])):
         return 0.0, 0.0, (1.0 if z > 0 else -1.0), x, y
@@ -187,7 +225,8 @@ def sky(dx, dy, dz, seed):
 
 @inlined
 def shade(layout, ox, oy, oz, dx, dy, dz, pixel, seed):
-    """The linear colour that a camera ray sees; ``pixel`` is the angle that one subsample covers, in rad."""
+    """The linear colour that a camera ray sees; ``pixel`` is the angle that one subsample covers,
+    in rad."""
     t, i = cast(layout, ox, oy, oz, dx, dy, dz, False)
     if i == SKY:
         return sky(dx, dy, dz, seed)
@@ -205,7 +244,9 @@ def shade(layout, ox, oy, oz, dx, dy, dz, pixel, seed):
         nz = rotation[2, 0] * lx + rotation[2, 1] * ly + rotation[2, 2] * lz
         facing = abs(nx * dx + ny * dy + nz * dz)
         footprint = t * pixel / max(sqrt(facing), 0.15)
-        light, warmth = shade_factors(layout.material[i], px, py, pz, u, v, footprint, seed + 1009 * (i + 1))
+        light, warmth = shade_factors(
+            layout.material[i], px, py, pz, u, v, footprint, seed + 1009 * (i + 1)
+        )
         red = tint[0] * light * (1.0 + 0.30 * warmth)
         green = tint[1] * light
         blue = tint[2] * light * (1.0 - 0.30 * warmth)

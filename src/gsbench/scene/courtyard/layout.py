@@ -1,4 +1,5 @@
-"""Objects of the procedural courtyard: solid primitives with materials, in metres, z up, the lawn at z = 0."""
+"""Objects of the procedural courtyard: solid primitives with materials, in metres, z up, the lawn
+at z = 0."""
 
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -28,9 +29,9 @@ _LEAF, _DEEP_LEAF, _PALE_LEAF = (0.10, 0.20, 0.045), (0.055, 0.13, 0.04), (0.17,
 class Layout(NamedTuple):
     """The primitives as arrays, sorted by group; rays test the bounding box of a group first.
 
-    The first three values of ``size`` are half extents of a BOX, (radius, -, -) of a SPHERE, or (outer radius, half
-    height, inner radius or 0) of a TUBE, whose axis is local z. The fourth is the radius of the bounding sphere.
-    ``rotation`` [S, 3, 3] maps local to world directions.
+    The first three values of ``size`` are half extents of a BOX, (radius, -, -) of a SPHERE, or
+    (outer radius, half height, inner radius or 0) of a TUBE, whose axis is local z. The fourth is
+    the radius of the bounding sphere. ``rotation`` [S, 3, 3] maps local to world directions.
     """
 
     kind: NDArray[np.int64]  # [S]
@@ -68,24 +69,44 @@ class _Builder:
     def sphere(self, at, radius: float, material: int, tint) -> None:
         self.add(SPHERE, at, (radius, radius, radius), material, tint)
 
-    def tube(self, at, radius: float, height: float, material: int, tint, inner: float = 0.0, **angles: float) -> None:
+    def tube(
+        self,
+        at,
+        radius: float,
+        height: float,
+        material: int,
+        tint,
+        inner: float = 0.0,
+        **angles: float,
+    ) -> None:
         self.add(TUBE, at, (radius, height / 2, inner), material, tint, **angles)
 
     def layout(self) -> Layout:
         kind, center, rotation, size, material, tint = zip(*self.rows, strict=True)
-        size = [(*sides, _bounding_radius(shape, sides)) for shape, sides in zip(kind, size, strict=True)]
+        size = [
+            (*sides, _bounding_radius(shape, sides))
+            for shape, sides in zip(kind, size, strict=True)
+        ]
         starts = np.array([*self.starts, len(self.rows)])
         boxes = [_bounds(*row[:4]) for row in self.rows]
         low = [np.min([boxes[i][0] for i in range(a, b)], axis=0) for a, b in pairwise(starts)]
         high = [np.max([boxes[i][1] for i in range(a, b)], axis=0) for a, b in pairwise(starts)]
         return Layout(
-            np.array(kind), np.array(center), np.array(rotation), np.array(size), np.array(material), np.array(tint),
-            starts, np.array(low), np.array(high),
-        )  # fmt: skip
+            np.array(kind),
+            np.array(center),
+            np.array(rotation),
+            np.array(size),
+            np.array(material),
+            np.array(tint),
+            starts,
+            np.array(low),
+            np.array(high),
+        )
 
 
 def build_layout(seed: int) -> Layout:
-    """The courtyard. The plan is fixed; the seed varies angles and tints of small objects and the shrubs."""
+    """The courtyard. The plan is fixed; the seed varies angles and tints of small objects and the
+    shrubs."""
     rng = np.random.default_rng(seed)
     build = _Builder()
     # Objects near the cameras come first: a ray that hits one skips the groups behind it.
@@ -104,11 +125,17 @@ def build_layout(seed: int) -> Layout:
 
 def _house(build: _Builder) -> None:
     build.group(0.0, WALL_DISTANCE + 0.3)
-    build.box((0, 0, HOUSE_HEIGHT / 2), (2 * WALL_DISTANCE + 1.2, 0.6, HOUSE_HEIGHT), PLASTER, _WHITEWASH)
+    build.box(
+        (0, 0, HOUSE_HEIGHT / 2), (2 * WALL_DISTANCE + 1.2, 0.6, HOUSE_HEIGHT), PLASTER, _WHITEWASH
+    )
     build.box((0, -0.32, 0.22), (2 * WALL_DISTANCE, 0.12, 0.44), STONE, _GREY_STONE)
     build.group(0.0, WALL_DISTANCE + 0.3)
-    build.box((0, 0.75, HOUSE_HEIGHT + 0.55), (2 * WALL_DISTANCE + 1.6, 2.9, 0.12), TILES, _ROOF, roll=30)
-    build.box((0, -0.52, HOUSE_HEIGHT - 0.14), (2 * WALL_DISTANCE + 1.4, 0.1, 0.12), WOOD, _DARK_OAK)
+    build.box(
+        (0, 0.75, HOUSE_HEIGHT + 0.55), (2 * WALL_DISTANCE + 1.6, 2.9, 0.12), TILES, _ROOF, roll=30
+    )
+    build.box(
+        (0, -0.52, HOUSE_HEIGHT - 0.14), (2 * WALL_DISTANCE + 1.4, 0.1, 0.12), WOOD, _DARK_OAK
+    )
     for x in (-5.0, -2.5, 2.5, 5.0):
         build.group(x, WALL_DISTANCE)
         _window(build)
@@ -164,7 +191,9 @@ def _pergola(build: _Builder, rng: np.random.Generator) -> None:
 
 
 def _shrubs(build: _Builder, rng: np.random.Generator) -> None:
-    places = [(6.5, y) for y in (-5.8, -3.9, -1.6, 0.8, 3.2, 5.4)] + [(x, -6.5) for x in (-5.6, -3.6, -1.8, 3.0, 5.0)]
+    places = [(6.5, y) for y in (-5.8, -3.9, -1.6, 0.8, 3.2, 5.4)] + [
+        (x, -6.5) for x in (-5.6, -3.6, -1.8, 3.0, 5.0)
+    ]
     for x, y in places:
         build.group(x + rng.uniform(-0.15, 0.1), y + rng.uniform(-0.3, 0.3))
         tint = (_LEAF, _DEEP_LEAF, _PALE_LEAF)[rng.integers(3)]
@@ -173,7 +202,12 @@ def _shrubs(build: _Builder, rng: np.random.Generator) -> None:
         for _ in range(4):
             angle, small = rng.uniform(0, 2 * pi), radius * rng.uniform(0.5, 0.72)
             height = radius * rng.uniform(0.5, 1.5)
-            build.sphere((0.62 * radius * cos(angle), 0.62 * radius * sin(angle), height), small, LEAVES, tint)
+            build.sphere(
+                (0.62 * radius * cos(angle), 0.62 * radius * sin(angle), height),
+                small,
+                LEAVES,
+                tint,
+            )
 
 
 def _well(build: _Builder) -> None:
@@ -204,14 +238,22 @@ def _crates(build: _Builder, rng: np.random.Generator) -> None:
     build.sphere((0, 0, 0.26), 0.26, PAINT, (0.50, 0.06, 0.04))
 
 
-def _crate(build: _Builder, at: tuple[float, float, float], side: float, yaw: float, tint: tuple) -> None:
+def _crate(
+    build: _Builder, at: tuple[float, float, float], side: float, yaw: float, tint: tuple
+) -> None:
     x, y, z = at
     build.box((x, y, z + side / 2), (side - 0.04, side - 0.04, side - 0.02), WOOD, tint, yaw=yaw)
     turn, half, slat = _rotation(yaw=yaw), side / 2 - 0.035, 0.07
     for dx in (-half, half):
         for dy in (-half, half):
             corner = turn @ np.array([dx, dy, 0.0])
-            build.box((x + corner[0], y + corner[1], z + side / 2), (slat, slat, side), WOOD, _DARK_OAK, yaw=yaw)
+            build.box(
+                (x + corner[0], y + corner[1], z + side / 2),
+                (slat, slat, side),
+                WOOD,
+                _DARK_OAK,
+                yaw=yaw,
+            )
 
 
 def _bench(build: _Builder, rng: np.random.Generator) -> None:
@@ -235,7 +277,11 @@ def _pots(build: _Builder, rng: np.random.Generator) -> None:
         build.sphere((0, 0, 0.66 * scale), 0.3 * scale, LEAVES, tint)
         for _ in range(3):
             angle = rng.uniform(0, 2 * pi)
-            at = (0.18 * scale * cos(angle), 0.18 * scale * sin(angle), scale * rng.uniform(0.65, 0.95))
+            at = (
+                0.18 * scale * cos(angle),
+                0.18 * scale * sin(angle),
+                scale * rng.uniform(0.65, 0.95),
+            )
             build.sphere(at, 0.19 * scale, LEAVES, tint)
 
 
@@ -256,7 +302,8 @@ def _sundial(build: _Builder, rng: np.random.Generator) -> None:
 
 
 def _rotation(yaw: float = 0.0, tilt: float = 0.0, roll: float = 0.0) -> NDArray[np.float64]:
-    """The rotation [3, 3] by ``roll`` about x, then ``tilt`` about y, then ``yaw`` about z, in degrees."""
+    """The rotation [3, 3] by ``roll`` about x, then ``tilt`` about y, then ``yaw`` about z, in
+    degrees."""
     a, b, c = radians(yaw), radians(tilt), radians(roll)
     about_z = np.array([[cos(a), -sin(a), 0], [sin(a), cos(a), 0], [0, 0, 1]])
     about_y = np.array([[cos(b), 0, sin(b)], [0, 1, 0], [-sin(b), 0, cos(b)]])

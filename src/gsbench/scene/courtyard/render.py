@@ -1,7 +1,8 @@
 """The built-in scene: a procedural courtyard, rendered to photographs with exactly known cameras.
 
-It has a well, crates, a bench, pots, a gravel path, stone walls and a house front, with detail for structure from
-motion, and a large lawn of faint texture, on which 3DGS grows oversized Gaussians. Equal seeds give equal images.
+It has a well, crates, a bench, pots, a gravel path, stone walls and a house front, with detail for
+structure from motion, and a large lawn of faint texture, on which 3DGS grows oversized Gaussians.
+Equal seeds give equal images.
 """
 
 from concurrent.futures import ThreadPoolExecutor
@@ -21,7 +22,8 @@ from gsbench.scene.types import Camera
 from gsbench.system.resources import available_threads
 
 VERSION = 1  # to be raised when the images change
-MAX_STEP = radians(7.5)  # between neighbouring views; wider steps gave wrong SfM models on scenes like this one
+# between neighbouring views; wider steps gave wrong SfM models on scenes like this one
+MAX_STEP = radians(7.5)
 RING_RADIUS = 4.55  # m
 FIELD_OF_VIEW = radians(56.0)  # horizontal
 TARGET = (0.0, 0.0, 0.72)  # m, what all cameras look at
@@ -35,12 +37,14 @@ def render_courtyard(
     seed: int = 0,
     progress: Progress = no_progress,
 ) -> None:
-    """Write the capture: ``output_dir/images/*.png`` and the exact COLMAP model ``output_dir/sparse/0`` without points.
+    """Write the capture: ``output_dir/images/*.png`` and the exact COLMAP model
+    ``output_dir/sparse/0`` without points.
 
-    ``width`` and ``height`` are in px. The same arguments give the same bytes. ``progress`` counts views. Raises
-    `InputError` for fewer than 3 views or images below 16 px.
+    ``width`` and ``height`` are in px. The same arguments give the same bytes. ``progress`` counts
+    views. Raises `InputError` for fewer than 3 views or images below 16 px.
     """
-    from gsbench.scene.colmap import write_model  # loads pycolmap, which is slow and only needed here
+    # loads pycolmap, which is slow and only needed here
+    from gsbench.scene.colmap import write_model
 
     cameras = courtyard_cameras(views, width, height)
     layout = build_layout(seed)
@@ -58,17 +62,24 @@ def render_courtyard(
 
 
 def courtyard_cameras(views: int, width: int, height: int) -> dict[str, Camera]:
-    """The cameras by file name, on a wavy ring in steps of 7.5 degrees, or of less for more than 48 views."""
+    """The cameras by file name, on a wavy ring in steps of 7.5 degrees, or of less for more than 48
+    views."""
     if views < MIN_IMAGES:
         raise InputError(f"scene.views must be at least {MIN_IMAGES}, got {views}")
     if min(width, height) < MIN_SIZE:
-        raise InputError(f"scene.width and scene.height must be at least {MIN_SIZE} px, got {width}x{height}")
+        raise InputError(
+            f"scene.width and scene.height must be at least {MIN_SIZE} px, got {width}x{height}"
+        )
     step = min(MAX_STEP, 2 * pi / views)
-    return {f"{index:04d}.png": ring_camera(index * step - 0.5 * pi, width, height) for index in range(views)}
+    return {
+        f"{index:04d}.png": ring_camera(index * step - 0.5 * pi, width, height)
+        for index in range(views)
+    }
 
 
 def ring_camera(angle: float, width: int, height: int) -> Camera:
-    """The camera at an azimuth (rad); its height and distance are smooth, periodic functions of the azimuth."""
+    """The camera at an azimuth (rad); its height and distance are smooth, periodic functions of the
+    azimuth."""
     radius = RING_RADIUS + 0.2 * cos(2 * angle)
     center = np.array([radius * cos(angle), radius * sin(angle), 1.95 + 0.40 * sin(5 * angle)])
     forward = np.array(TARGET) - center
@@ -81,7 +92,8 @@ def ring_camera(angle: float, width: int, height: int) -> Camera:
 
 
 def render_view(layout: Layout, camera: Camera, seed: int) -> NDArray[np.uint8]:
-    """Render one photograph, [H, W, 3] uint8 sRGB; surfaces are matt, so a point has one colour in all views."""
+    """Render one photograph, [H, W, 3] uint8 sRGB; surfaces are matt, so a point has one colour in
+    all views."""
     image = np.empty((camera.height, camera.width, 3), dtype=np.uint8)
     pose = np.ascontiguousarray(camera.rotation), np.ascontiguousarray(camera.center)
     render(layout, *pose, (camera.fx, camera.fy, camera.cx, camera.cy), image, seed)
