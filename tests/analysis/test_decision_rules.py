@@ -13,10 +13,9 @@ from gsbench.analysis.pairing import Pairs
 from gsbench.analysis.quantities import asked_quantity
 from gsbench.analysis.statistics import Outcome, look_levels, t_test
 from gsbench.runs.experiments import Question
-from tests.analysis.untruths import scene_pairs
-from tests.conftest import script
+from tests.analysis.untruths import KINDS, rates, scene_pairs
+from tests.analysis.untruths import decision_rules as rules
 
-rules = script("decision_rules")
 OUTCOMES: tuple[Outcome, ...] = ("undecided", "supported", "refuted", "too small to matter")
 RATE = 0.0125
 CHECKS = 100
@@ -52,3 +51,8 @@ def test_the_simulator_has_the_test_and_the_levels_of_the_judge() -> None:
     found = rules.look_levels(rules.CHOSEN, 3, (2, 3, 4), 0.05)
     # two independent simulations of 20,000 and 100,000 draws
     assert found == pytest.approx(look_levels(3, (2, 3, 4), 0.05), rel=0.15)
+
+
+@pytest.mark.parametrize("kind", ["normal", "one scene in eight stands out"])
+def test_the_table_of_untruths_is_that_of_the_judge(kind: str) -> None:
+    assert rates(KINDS[kind], 1.0, 20, fast=True) == rates(KINDS[kind], 1.0, 20)
