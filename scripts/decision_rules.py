@@ -66,10 +66,8 @@ def _moderate(variances: Array, each: Array) -> tuple[Array, Array]:
     half = each[0] / 2
     logs = np.log(variances) - special.digamma(half) + math.log(half)
     excess = np.maximum(logs.var(axis=1, ddof=1) - special.polygamma(1, half), 1e-3)
-    prior = 0.5 + 1 / excess  # half of its degrees of freedom, by Newton's method
-    for _ in range(8):
-        found = special.polygamma(1, prior)
-        prior += found * (1 - found / excess) / special.polygamma(2, prior)
+    grid = np.geomspace(1e3, 1e-2, 2000)  # half of the prior's degrees of freedom
+    prior = np.interp(excess, special.polygamma(1, grid), grid)
     common = np.exp(logs.mean(axis=1) + special.digamma(prior) - np.log(prior))
     drawn = (prior[:, None] * common[:, None] + half * variances) / (prior + half)[:, None]
     return drawn, np.minimum(_matched(drawn, 2 * (prior + half)[:, None]), each.sum())
