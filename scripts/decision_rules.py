@@ -312,5 +312,5 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--draws", type=int, default=20_000, help="in each cell and row")
+    parser.add_argument("--draws", type=int, default=8000, help="in each cell and row")
     print(table(parser.parse_args().draws), end="")
