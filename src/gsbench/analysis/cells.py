@@ -1,5 +1,7 @@
-"""Table cells (a mean with its deviation) and data frames from trials. Unlike trials are never
-averaged."""
+"""Table cells (a mean with its deviation) and data frames from trials.
+
+Unlike trials are never averaged.
+"""
 
 from __future__ import annotations
 
@@ -66,23 +68,20 @@ class Cell:
 
 
 def field_value(trial: TrialResult, name: str) -> str:
-    """A field of a trial, or a dotted key of its configuration, as text; a missing key counts as
-    unset (null)."""
+    """A field of a trial, or a dotted key of its configuration, as text; null if missing."""
     if name in TRIAL_FIELDS:
         return str(getattr(trial.record, name))
     return str(_settings_with(trial, name).get(name))
 
 
 def _settings_with(trial: TrialResult, name: str) -> Mapping[str, Any]:
-    """The settings that may contain ``name``; those that change no result are read from the trial's
-    own file."""
+    """The settings that may contain ``name``; in the trial's own file if no result changes."""
     is_hashed = name in trial.config or not name.startswith(NOT_HASHED)
     return trial.config if is_hashed else trial.whole_config
 
 
 def check_fields(trials: Iterable[TrialResult], names: Iterable[str]) -> None:
-    """Raise ``InputError`` for the first name that is neither a field nor a setting of any
-    trial."""
+    """Raise ``InputError`` for the first name that is no field or setting of any trial."""
     trials = list(trials)
     for name in names:
         if name not in TRIAL_FIELDS and not any(
@@ -111,8 +110,7 @@ def select_trials(trials: Iterable[TrialResult], where: Mapping[str, str]) -> li
 
 
 def check_averageable(trials: Sequence[TrialResult], where: str) -> None:
-    """Raise ``InputError`` that names the differing keys, unless each scene's trials repeat one
-    configuration."""
+    """Raise ``InputError`` with the differing keys unless each scene's trials are repetitions."""
     if code := differing_code(trials):
         listed, experiment = (
             "; ".join(describe_code(*part) for part in code.items()),
@@ -147,15 +145,13 @@ def check_averageable(trials: Sequence[TrialResult], where: str) -> None:
 
 
 def swept_settings(trials: Iterable[TrialResult]) -> list[str]:
-    """The settings in which trials of one scene, initialiser and densifier differ, without
-    `IGNORED_SETTINGS`."""
+    """The settings in which trials of one scene and arm differ, without `IGNORED_SETTINGS`."""
     groups = group_by(trials, lambda trial: (trial.scene, trial.init, trial.densify)).values()
     return sorted({key for group in groups for key in differing_settings(group)})
 
 
 def with_variants(trials: Sequence[TrialResult]) -> list[TrialResult]:
-    """The trials, each with its values of the swept settings as ``variant``: different values are
-    different arms."""
+    """The trials with their values of the swept settings as ``variant``, so as different arms."""
     swept = swept_settings(trials)
     if not swept:
         return list(trials)
@@ -168,8 +164,7 @@ def with_variants(trials: Sequence[TrialResult]) -> list[TrialResult]:
 def make_cell(
     trials: Sequence[TrialResult], quantity: Quantity, scenes: Sequence[str], expected: int
 ) -> Cell:
-    """The cell of trials that passed `check_averageable`; each of ``scenes`` should have
-    ``expected`` trials."""
+    """The cell of averageable trials; each of ``scenes`` should have ``expected`` of them."""
     values: dict[str, dict[int, float]] = {scene: {} for scene in scenes}
     for trial in trials:
         value = quantity.read(trial)
@@ -192,16 +187,14 @@ def make_cell(
 
 
 def short_reason(reason: str) -> str:
-    """The reason why a metric is missing; missing weights in one line, of which results.json has
-    the full text."""
+    """Why a metric is missing, in one line; for weights results.json has the full text."""
     if reason.startswith("weights not found: "):
         return f"{reason.partition(' (')[0]}; gsbench doctor says where they come from"
     return reason
 
 
 def best_cells(cells: Mapping[K, Cell], quantity: Quantity) -> set[K]:
-    """The keys of the best means after rounding to the quantity's decimals; empty if all are
-    equal."""
+    """The keys of the best means, rounded to the quantity's decimals; none if all are equal."""
     means = {
         key: round(cell.mean, quantity.decimals)
         for key, cell in cells.items()
@@ -226,8 +219,7 @@ def _refusal(
 
 
 def to_frame(trials: Experiment | Sequence[TrialResult]) -> pd.DataFrame:
-    """The complete trials of an experiment, or the given trials, as a data frame with one row per
-    trial.
+    """An experiment's complete trials, or the given ones, as a data frame of a row each.
 
     It has these columns:
 

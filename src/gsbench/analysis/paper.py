@@ -1,5 +1,4 @@
-"""Printed numbers of papers, Tables 1 and 2 of the method's paper from measured trials, and the
-differences."""
+"""Printed numbers of papers, the method's Tables 1 and 2 as measured, and the differences."""
 
 import math
 from collections import Counter
@@ -42,8 +41,7 @@ FindPrinted = Callable[[str, Arm, str], "PrintedNumber | None"]  # by scene, arm
 
 @dataclass(frozen=True)
 class PrintedNumber:
-    """A printed number; it stands for the ``range`` of values within half a unit of its last
-    digit."""
+    """A printed number: ``range`` is half a unit of its last digit on both sides."""
 
     text: str
 
@@ -63,8 +61,10 @@ class PrintedNumber:
 
 @dataclass(frozen=True)
 class Paper:
-    """The paper of the method: its ``tables`` by name, where it contradicts itself (one sentence
-    each), and what it says on settings (``setup``, by topic).
+    """The paper of the method.
+
+    Its ``tables`` by name, where it contradicts itself (one sentence each), and what it says on
+    settings (``setup``, by topic).
     """
 
     tables: Mapping[str, Mapping[Key, PrintedNumber]]
@@ -78,8 +78,7 @@ class Paper:
 
 @dataclass(frozen=True)
 class Published:
-    """Another paper's numbers; ``scenes`` has the printed text of each of ``quantities`` for its
-    method."""
+    """Another paper's numbers: ``scenes`` has the printed text of its method's ``quantities``."""
 
     title: str
     source: str  # where the numbers were read
@@ -125,8 +124,7 @@ def published_names() -> list[str]:
 
 @cache
 def load_published(name: str) -> Published:
-    """The numbers of the paper ``name``; for an unknown name raises InputError that lists the known
-    ones."""
+    """The numbers of the paper ``name``; raises InputError with the known names for another."""
     names = published_names()
     if name not in names:
         raise InputError(
@@ -141,8 +139,7 @@ def _read(name: str) -> Any:
 
 
 def layout_of(name: str) -> str | None:
-    """The paper's table that the experiment ``name`` repeats, or None: ``table1`` for ``table1``
-    and ``table1_own``."""
+    """The paper's table that the experiment repeats: ``table1`` for ``table1_own``; or None."""
     table = name.removesuffix(OWN)
     return table if table in PAPER_TABLES else None
 
@@ -153,8 +150,7 @@ def paper_tables(
     trials: Sequence[TrialResult] | None = None,
     metrics: Sequence[str] | None = None,
 ) -> list[Table]:
-    """The measured table in the paper's layout, and the table of differences from the printed
-    numbers.
+    """The measured table in the paper's layout, and that of differences from its numbers.
 
     ``name`` is ``table1`` or ``table2``. If only one initialiser was run and it is not DIM, it
     replaces DIM in Table 1.
@@ -211,16 +207,14 @@ def paper_tables(
 
 
 def _run_as(init: str, inits: set[str]) -> str:
-    """Our initialiser for the paper's ``init``: the one of this name, or if it was not run, one
-    that repeats it."""
+    """Our initialiser for the paper's ``init``: that of this name, or one that repeats it."""
     if init in inits:
         return init
     return next((own for own in sorted(inits) if STAND_FOR.get(own) == init), init)
 
 
 def published_table(trials: Sequence[TrialResult], name: str) -> Table:
-    """The measured arms on the scenes of the paper ``name``, its printed numbers, and the
-    differences.
+    """The measured arms on the paper's scenes, its printed numbers, and the differences.
 
     Raises InputError if no trial is of a scene of the paper, or if a cell would average unlike
     trials.
@@ -260,8 +254,7 @@ def _differences(
     notes: Sequence[str],
     setup: Mapping[str, str],
 ) -> Table:
-    """A table with a row per scene and arm: what the ``paper`` printed, and the measured minus the
-    printed value."""
+    """A table with a row per scene and arm: the printed number, and measured minus printed."""
     shown = [quantity(key, trials) for key in keys]
     expected = len({trial.seed for trial in trials})
     marks: Counter[str] = Counter()
@@ -309,8 +302,10 @@ def _difference(
 
 
 def agreement(cell: Cell, printed: PrintedNumber) -> str:
-    """The mark of a measured cell: ``=`` if its mean is in the printed number's range, ``≈`` if its
-    interval overlaps the range, else ``≠``. A single trial has no interval.
+    """The mark of a measured cell: ``=``, ``≈`` or ``≠``.
+
+    ``=`` if its mean is in the printed number's range, ``≈`` if its interval overlaps the range,
+    else ``≠``. A single trial has no interval.
     """
     from gsbench.analysis.statistics import StudentT  # here, since SciPy is slow to import
 

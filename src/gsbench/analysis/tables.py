@@ -331,8 +331,7 @@ def doubt_notes(trials: Sequence[TrialResult]) -> list[str]:
 
 
 def origin_notes(trials: Sequence[TrialResult]) -> list[str]:
-    """Lines on the arms that gsbench did not train: who did, and whether a model or renders were
-    measured."""
+    """Lines on arms that gsbench did not train: who did, and what was measured."""
     notes = []
     not_ours = [trial for trial in trials if trial.program or trial.made_elsewhere]
     for trained_here, measured, what in ORIGINS:
@@ -357,8 +356,7 @@ def origin_notes(trials: Sequence[TrialResult]) -> list[str]:
 
 
 def comparison_notes(experiment: Experiment) -> list[str]:
-    """Lines on the compared arms: the declared verdict, arms that are equal to the last bit, and
-    caveats.
+    """Lines on the compared arms: declared verdict, equality to the last bit, and caveats.
 
     They are about the whole experiment, so choosing the trials that a table shows cannot change a
     verdict.
@@ -415,8 +413,7 @@ AGREEMENT = {
 
 
 def with_agreement(tables: Sequence[Table]) -> list[Table]:
-    """The tables, of which the first says how weakly its metrics agree with people, if a study
-    measured any of them."""
+    """The tables; the first says how weakly its metrics agree with people, if that is known."""
     shown = {column.key[0] for table in tables for column in table.columns}
     found = [
         f"{value} for {facts.label}"
@@ -449,8 +446,7 @@ def machine_notes(trials: Sequence[TrialResult]) -> list[str]:
 
 
 def cloud_notes(trials: Sequence[TrialResult]) -> list[str]:
-    """A line for each scene and initialiser whose trials have the same settings but started from
-    several clouds."""
+    """A line for each scene and initialiser with equal settings but several clouds."""
     notes = []
     groups = group_by(
         trials, lambda trial: (trial.scene, trial.init, trial.record.hashes.get("init"))
@@ -467,8 +463,7 @@ def cloud_notes(trials: Sequence[TrialResult]) -> list[str]:
 
 
 def held_out_notes(trials: Sequence[TrialResult]) -> list[str]:
-    """A line for each way in which views were held out; it names the scenes if there are several
-    ways and scenes."""
+    """A line for each way of holding views out, with its scenes if there are several ways."""
     notes = []
     recorded = [trial for trial in trials if trial.record.held_out]
     splits = group_by(recorded, lambda trial: (trial.question, trial.record.held_out))
@@ -490,8 +485,7 @@ def held_out_notes(trials: Sequence[TrialResult]) -> list[str]:
 
 
 def points_notes(trials: Sequence[TrialResult]) -> list[str]:
-    """A line for each initialiser on the views that made its points; none for points that no
-    photographs made."""
+    """A line for each initialiser on the views that made its points, if photographs did."""
     notes = []
     for init, choice in sorted({(trial.init, _points_from(trial)) for trial in trials}):
         if choice == "all":

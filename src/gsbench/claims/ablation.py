@@ -1,5 +1,4 @@
-"""Ablation of a densifier: its switches, the runs of all their combinations, and the verdicts on
-them.
+"""Ablation of a densifier: its switches, the runs of all combinations, and the verdicts on them.
 
 A switch turns one part of the densifier off by its ``off`` settings; as configured, all switches
 are on. The class (``SWITCHES``), the YAML file (``switches``) or the command line declares it. A
@@ -28,8 +27,9 @@ TrialKeys = Mapping[str, str]  # scene -> folder of a run's trials, without the 
 
 
 def declared_switches(own: Mapping[str, Switch], values: Mapping[str, Any]) -> dict[str, Switch]:
-    """The switches of a densifier's class (``own``) and of its settings, without those whose
-    ``off`` settings hold already.
+    """The switches of a densifier's class (``own``) and of its settings.
+
+    Those whose ``off`` settings hold already are left out.
 
     Raises InputError for a malformed switch.
     """
@@ -80,8 +80,7 @@ def choose_switches(
 
 
 def effective_run(run: Run, switches: Mapping[str, Switch]) -> Run:
-    """The run without the switches that have no effect in it, because the switch that they depend
-    on is off."""
+    """The run without the switches that have no effect in it: the switch that they need is off."""
 
     def acts(name: str) -> bool:
         within = switches[name].within
@@ -91,8 +90,10 @@ def effective_run(run: Run, switches: Mapping[str, Switch]) -> Run:
 
 
 def runs_to_train(switches: Mapping[str, Switch]) -> list[Run]:
-    """All different runs, the one with all switches on first; raises InputError if switches depend
-    on each other."""
+    """All different runs, the one with all switches on first.
+
+    Raises InputError if switches depend on each other.
+    """
     for name in switches:
         chain, outer = [name], switches[name].within
         while outer in switches:
@@ -127,8 +128,7 @@ def run_name(run: Run, switches: Sequence[str]) -> str:
 def judge_runs(
     trials: Sequence[TrialResult], runs: Mapping[Run, TrialKeys], metric: str
 ) -> list[Verdict]:
-    """The verdicts on all runs against the run with all switches on, as one family, in the order of
-    ``runs``."""
+    """The verdicts on all ``runs`` against that with all switches on, in order, as one family."""
     quantity = asked_quantity(metric, trials)
     full = max(runs, key=len)
     questions = [

@@ -86,8 +86,7 @@ FILES = {  # media types and descriptions
 
 
 def write_archive(experiment: Experiment, out: Path, pictures: bool = False) -> list[str]:
-    """Write the experiment's results to the file ``out``; return a line for each trial that is left
-    out, with why.
+    """Write the experiment's results to ``out``; return a line for each trial left out.
 
     ``pictures`` adds those of the test views. Raises InputError if no trial can be exported.
     """
@@ -162,8 +161,7 @@ def _pixel_measures(trials: Sequence[TrialResult]) -> Iterator[dict[str, Any]]:
 
 
 def unpack_archive(file: Path, runs: Path) -> Experiment:
-    """Unpack the trials of an archive into the empty runs folder ``runs``, and read them as an
-    experiment.
+    """Unpack an archive's trials into the empty runs folder ``runs``; read them as an experiment.
 
     Raises InputError, one line that names the file, if it is no archive, or is cut, edited or of
     another version.
@@ -201,8 +199,7 @@ def unpack_archive(file: Path, runs: Path) -> Experiment:
 def _check_configuration(
     folder: str, values: Mapping[str, Any], results: Mapping[str, Any]
 ) -> None:
-    """Raise InputError if the configuration ``values`` contradicts the ``results`` of the trial in
-    ``folder``."""
+    """Raise InputError if the configuration ``values`` contradicts ``results`` in ``folder``."""
     names = {SEED_KEY: values[SEED_KEY]}
     names |= {
         group: values[group].get("name")
@@ -328,8 +325,10 @@ def _unpack(
 
 
 def _unpack_picture(home: Path, name: str, content: bytes) -> None:
-    """Write a picture of a test view into its trial's folder; raises InputError for a name that
-    leads elsewhere."""
+    """Write a picture of a test view into its trial's folder.
+
+    Raises InputError for a name that leads elsewhere.
+    """
     folder, kind, file = name.removeprefix(f"{PICTURES_FOLDER}/").rsplit("/", 2)
     if (
         kind not in PICTURES
@@ -347,8 +346,10 @@ def _folder(trial: TrialResult) -> str:
 
 
 def _checked_folder(folder: object) -> str:
-    """A trial's folder within its experiment; raises InputError for a path that could lead out of
-    the runs folder."""
+    """A trial's folder within its experiment.
+
+    Raises InputError for a path that could lead out of the runs folder.
+    """
     parts = str(folder).split("/")
     if len(parts) != 3 or not all(map(is_folder_name, parts)):
         raise InputError(f"{folder!r} cannot be the folder of a trial")
@@ -356,8 +357,10 @@ def _checked_folder(folder: object) -> str:
 
 
 def _configuration(trial: TrialResult) -> str:
-    """The trial's ``config.yaml`` as JSON, without paths of this machine; raises InputError if it
-    is damaged."""
+    """The trial's ``config.yaml`` as JSON, without paths of this machine.
+
+    Raises InputError if it is damaged.
+    """
     try:
         values = read_yaml(trial.path / CONFIG)
     except FileNotFoundError:
@@ -380,8 +383,7 @@ def _results(trial: TrialResult) -> dict[str, Any]:
 
 
 def without_paths(value: Any) -> Any:
-    """Plain values in which only the last name of each path on this machine is kept, and no URL has
-    a password."""
+    """Plain values with only the last name of each path on this machine, no password in a URL."""
     if isinstance(value, Mapping):
         return {key: without_paths(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):

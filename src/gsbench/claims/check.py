@@ -1,5 +1,4 @@
-"""Checks of a file of claims: what can be tested here, the trials that are needed, the verdicts,
-and their page.
+"""Checks of a file of claims: what can be tested here, which trials it needs, verdicts, page.
 
 The trials are ordinary trials of one experiment. So a check that was killed continues where it
 stopped and ends with the same verdicts. A published archive gives the same verdicts without any
@@ -157,8 +156,9 @@ class Check:
 def prepare(
     file: ClaimsFile, runs: Path, find_missing: FindMissing, permissions: Sequence[str] = ()
 ) -> Check:
-    """Compose the first trial of each scene and arm of each claim; scenes with something missing
-    are not tested.
+    """Compose the first trial of each scene and arm of each claim.
+
+    Scenes with something missing are not tested.
 
     ``permissions`` are words such as ``allow_targets=[mine]`` from the command line: a file of
     claims cannot give permissions. Raises InputError that names claim, scene and arm for settings
@@ -212,8 +212,7 @@ def prepare(
 def claim_verdicts(
     file: ClaimsFile, declaration: Declaration, judged: Sequence[Verdict]
 ) -> list[ClaimVerdict]:
-    """Every claim of the file with its verdict among ``judged``, or with the reason why it could
-    not be tested."""
+    """Every claim of the file with its verdict in ``judged``, or why it is not tested."""
     by_name = {verdict.question.name: verdict for verdict in judged}
     verdicts = []
     for claim in file.claims:
@@ -231,8 +230,7 @@ def claim_verdicts(
 def recheck(
     file: ClaimsFile, archive: Path, folder: Path
 ) -> tuple[list[ClaimVerdict], Declaration, list[Declaration]]:
-    """Judge the claims of ``file`` by the trials in ``archive`` alone, unpacked into the empty
-    folder ``folder``.
+    """Judge the claims of ``file`` by the trials in ``archive``, unpacked into ``folder``, empty.
 
     Returns the verdicts, the declaration that they follow, and all declarations of claims. Raises
     InputError, one line, for an archive that is damaged, of another experiment or without declared
@@ -256,8 +254,7 @@ def recheck(
 
 
 def _check_same_claims(file: ClaimsFile, declaration: Declaration) -> None:
-    """Raise InputError if a claim's question differs from the one that was declared before the
-    trials ran."""
+    """Raise InputError if a claim's question differs from that declared before the trials ran."""
     declared = {question.name: question for question in declaration.questions}
     for claim in file.claims:
         in_file, before = file.question(claim, {}), declared.get(claim.id)

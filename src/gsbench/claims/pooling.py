@@ -1,5 +1,4 @@
-"""Pooling results of many laboratories: the mean of their effects, with an interval whose error
-rate is known.
+"""Pooling results of many laboratories: their mean, with an interval of a known error rate.
 
 A study is one archive's mean difference of two arms in one metric, over its pairs of trials
 (docs/verdict.md). Student's t tests the mean of studies, each with the same weight. Weights from
@@ -32,8 +31,7 @@ MIN_STUDIES = 2
 
 @dataclass(frozen=True)
 class Study:
-    """One archive's difference of two arms in one metric, with its ``interval`` (None for a single
-    pair).
+    """One archive's difference of two arms in a metric; ``interval`` is None for a single pair.
 
     Only studies with the same ``protocol`` are pooled. ``budget`` says what limited the growth of
     its arms; "" if that is unknown.
@@ -127,8 +125,7 @@ def describe(pooled: Pooled) -> list[str]:
 
 @dataclass(frozen=True)
 class PooledQuestion:
-    """The question to pool: the names that ``arm`` and ``baseline`` may have in the archives, and
-    the metric's key.
+    """The question to pool: names of ``arm`` and ``baseline`` in the archives, the metric's key.
 
     Only trials whose settings have the values of ``where`` count.
     """
@@ -142,8 +139,9 @@ class PooledQuestion:
 def pool_sources(
     sources: Sequence[Path], wanted: PooledQuestion, protocol: str | None = None
 ) -> tuple[Pooled, list[str], list[str]]:
-    """Pool all studies in ``sources``: (their mean, notes on them, a line for each source or study
-    that is left out).
+    """Pool all studies in ``sources``.
+
+    Returns their mean, notes on them, and a line for each source or study that is left out.
 
     Raises InputError if no study is left.
     """
@@ -182,8 +180,7 @@ def pool_sources(
 def read_studies(
     path: Path, question: PooledQuestion, name: str
 ) -> tuple[list[Study], list[str], set[str]]:
-    """The studies in the archive ``path``, one or more for each protocol; their labels begin with
-    ``name``.
+    """The studies in the archive ``path``, by protocol; their labels begin with ``name``.
 
     Also returns notes on them, and a mark of each trial (`_mark`), so that none is counted twice.
     Raises InputError, one line, if there is no study.
@@ -231,8 +228,7 @@ def read_studies(
 def _group_into_studies(
     trials: Sequence[TrialResult], pairs: Sequence[tuple[Arm, Arm]]
 ) -> list[list[tuple[Arm, Arm]]]:
-    """All pairs of arms as one study if each scene has one initialiser; else each pair as its own
-    study."""
+    """All pairs of arms as one study if each scene has one initialiser, else each as its own."""
     scenes = [{trial.scene for trial in trials if trial.arm in pair} for pair in pairs]
     disjoint = sum(map(len, scenes)) == len(set().union(*scenes))
     return [list(pairs)] if disjoint else [[pair] for pair in pairs]
@@ -283,8 +279,7 @@ def _budgets(trials: Sequence[TrialResult], pairs: Sequence[tuple[Arm, Arm]]) ->
 
 
 def _size(trials: Sequence[TrialResult]) -> str:
-    """The iterations, view sizes and gsbench versions, in which pooled trials may differ, for the
-    reader to judge."""
+    """Iterations, view sizes and versions, in which pooled trials may differ, for the reader."""
     sizes = sorted(
         {f"{size[0]}×{size[1]}" for trial in trials if (size := trial.record.resolution)}
     )
@@ -296,8 +291,7 @@ def _size(trials: Sequence[TrialResult]) -> str:
 
 
 def _mark(trial: TrialResult) -> str:
-    """A hash that distinguishes a trial from all others, even from a repetition: that takes other
-    seconds."""
+    """A hash that distinguishes a trial even from its repetition, which takes other seconds."""
     record = trial.record
     return sha256_of(
         [trial.config_hash, trial.seed, record.hashes, record.seconds, dict(trial.metrics)]

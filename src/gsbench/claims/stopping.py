@@ -1,5 +1,4 @@
-"""Adding seeds in planned looks until every question is decided, for checks and for sweeps that
-stop when decided.
+"""Adding seeds in planned looks until every question is decided, for checks and for sweeps.
 
 In such a sweep, each compared pair of arms is a question about ``eval.primary``.
 """
@@ -51,8 +50,7 @@ KeyAndSeed = tuple[str, int]
 def trials_of_look(
     declaration: Declaration, indices: Sequence[int], seeds: int
 ) -> list[KeyAndSeed]:
-    """The trials that the questions at ``indices`` need for their first ``seeds`` seeds, in the
-    order of seeds."""
+    """The trials of the questions at ``indices`` for their first ``seeds`` seeds, seed by seed."""
     questions = [declaration.questions[k] for k in indices]
     needed = [
         (question.seeds[rank], rank, key)
@@ -122,8 +120,10 @@ class SweepInLooks:
 
 
 def plan_sweep(trials: Sequence[Trial]) -> SweepInLooks:
-    """Plan the looks of a sweep's trials; raises InputError, one line, if the sweep cannot be run
-    in looks."""
+    """Plan the looks of a sweep's trials.
+
+    Raises InputError, one line, if the sweep cannot be run in looks.
+    """
     homes = {trial.files.home for trial in trials}
     metrics = {trial.values["eval"].get("primary") for trial in trials}
     if len(homes) > 1 or len(metrics) > 1:
@@ -175,8 +175,7 @@ def plan_sweep(trials: Sequence[Trial]) -> SweepInLooks:
 
 
 def headline(verdict: Verdict) -> str:
-    """A pair's verdict in a sentence: ``better in PSNR on this scene: +0.120 (…), with 2 of at most
-    6 seeds``"""
+    """A pair's verdict: ``better in PSNR on this scene: +0.120 (…), with 2 of at most 6 seeds``"""
     question = verdict.question
     against = f"{question.arm} against {question.baseline}"
     if verdict.interval is None:
@@ -187,8 +186,7 @@ def headline(verdict: Verdict) -> str:
 
 
 def _expected(trial: Trial) -> TrialResult:
-    """A trial that has not run as a `TrialResult` without results, so that arms can be paired
-    beforehand."""
+    """A `TrialResult` without results for a trial that has not run, to pair arms beforehand."""
     values, folder = trial.values, trial.folder
     record = TrialRecord(
         status="complete",  # the only status that the type allows; no file has this record
@@ -206,8 +204,10 @@ def _expected(trial: Trial) -> TrialResult:
 
 
 def facts_for(metric: str, values: Mapping[str, Any]) -> MetricFacts:
-    """The facts of a metric of trials with the configuration ``values``; raises InputError for an
-    unknown metric."""
+    """The facts of a metric of trials with the configuration ``values``.
+
+    Raises InputError for an unknown metric.
+    """
     shipped = find_metric(metric)
     if shipped is not None:
         return shipped
@@ -218,8 +218,10 @@ def facts_for(metric: str, values: Mapping[str, Any]) -> MetricFacts:
 
 
 def _seeds(trials: Sequence[TrialResult]) -> tuple[int, ...]:
-    """The seeds of all scenes and arms, in the order of the sweep; raises InputError if they
-    differ."""
+    """The seeds of all scenes and arms, in the order of the sweep.
+
+    Raises InputError if they differ.
+    """
     groups = group_by(trials, lambda trial: (trial.scene, trial.arm))
     seeds = {
         key: tuple(dict.fromkeys(trial.seed for trial in group)) for key, group in groups.items()

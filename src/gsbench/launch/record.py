@@ -40,8 +40,7 @@ LEVELS = 3  # folders of scene, arm and trial
 
 @dataclass(frozen=True, kw_only=True)
 class PlannedTrial(Record):
-    """A planned trial: its overrides, the folder in which the command was given, and the Unix
-    time."""
+    """A planned trial: its overrides, the folder of the command, and the Unix time."""
 
     overrides: tuple[str, ...]
     cwd: str
@@ -130,8 +129,7 @@ def _write_plan(home: Path, trials: dict[Path, PlannedTrial]) -> None:
 
 
 def declared_metrics(trials: Sequence[Trial]) -> dict[Path, str | None]:
-    """The metric that each experiment's trials declare (``eval.primary``), by the experiment's
-    folder, or None.
+    """The metric that trials declare (``eval.primary``) or None, by the experiment's folder.
 
     Raises InputError if trials of one experiment declare different metrics.
     """
@@ -150,8 +148,7 @@ def declared_metrics(trials: Sequence[Trial]) -> dict[Path, str | None]:
 
 
 def declare(trials: Sequence[Trial]) -> None:
-    """Add a declaration to each experiment's record, unless the latest one already covers these
-    trials.
+    """Add a declaration to each experiment's record, unless the latest covers these trials.
 
     It has the metric (`declared_metrics`) and all trials, done or not. A command without a metric
     keeps the declared one: the trials that it adds are declared with that metric, with their own
@@ -202,8 +199,7 @@ def declare(trials: Sequence[Trial]) -> None:
 
 
 def declare_questions(home: Path, asked: Declaration) -> Declaration:
-    """Add questions to the experiment's record: of a file of claims, of a sweep in looks, or of
-    people's votes.
+    """Add a claims file's, sweep's or round's questions to the experiment's record.
 
     Returns the recorded declaration: if the latest one of its kind is equal, that one with its
     earlier time.

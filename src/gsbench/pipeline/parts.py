@@ -1,5 +1,7 @@
-"""The parts of a trial: the objects that its configuration describes. Errors name the
-configuration's key."""
+"""The parts of a trial: the objects that its configuration describes.
+
+Errors name the configuration's key.
+"""
 
 import dataclasses
 import inspect
@@ -73,8 +75,9 @@ REQUIRED_METHODS = {  # of a user's class, by the group that names it
 
 
 class Parts:
-    """The objects that the resolved configuration ``values`` describes. Each is made at its first
-    use and kept.
+    """The objects that the resolved configuration ``values`` describes.
+
+    Each is made at its first use and kept.
 
     The first use raises InputError for a wrong key. It also runs the user's code if the class is
     the user's own.
@@ -110,8 +113,7 @@ class Parts:
 
     @cached_property
     def trainer(self) -> Densifier | External:
-        """The trainer that the group densify describes: a densifier of gsbench's own trainer, or
-        another program."""
+        """The trainer of the group densify: a densifier of gsbench's own, or another program."""
         trainer: Densifier | External = build("densify", self.values["densify"], self._allowed)
         return trainer
 
@@ -174,8 +176,9 @@ class Parts:
         return sorted({step for step in self.eval.at if step < self.train.iterations})
 
     def check(self, on_this_machine: bool) -> None:
-        """Raise InputError, which names the key, for what is known to fail. Call it before any
-        work.
+        """Raise InputError, which names the key, for what is known to fail.
+
+        Call it before any work.
 
         With ``on_this_machine`` the trial will run on this machine, so its devices and programs are
         checked too.
@@ -260,8 +263,10 @@ def build_own_rasterizer(values: dict[str, Any], allow_targets: list[str]) -> Ra
 
 
 def build_metrics(values: dict[str, Any], allow_targets: list[str]) -> dict[str, Metric]:
-    """The user's own metrics that the settings ``eval`` name. Raises InputError for an unusable
-    one."""
+    """The user's own metrics that the settings ``eval`` name.
+
+    Raises InputError for an unusable one.
+    """
     metrics: dict[str, Metric] = {}
     for name, options in values.get("extra", {}).items():
         metrics[name] = build(f"eval.extra.{name}", options, allow_targets)
@@ -298,8 +303,9 @@ def _check_names(cls: Any, target: str, options: dict[str, Any], group: str) -> 
 
 
 def locate(target: str, group: str, allow_targets: list[str]) -> type:
-    """The class at the import path ``package.module.Class``. Raises InputError if ``group`` cannot
-    use it.
+    """The class at the import path ``package.module.Class``.
+
+    Raises InputError if ``group`` cannot use it.
 
     Warns of code whose version the results cannot record.
     """

@@ -1,5 +1,4 @@
-"""One trial: its steps in order, how it gets from a configuration to ``results.json``, and the
-content of that file."""
+"""One trial: its steps in order, and the content of its ``results.json``."""
 
 import logging
 import sys
@@ -95,8 +94,9 @@ class TrialSteps:
         self.parts, self.store = parts, store
 
     def steps(self) -> Iterator[keys.Step]:
-        """The steps in order. A caller that wants results builds each step before it asks for the
-        next.
+        """The steps in order.
+
+        A caller that wants results builds each step before it asks for the next.
 
         Keys are known without building, with one exception: the courtyard's photographs must be
         rendered before their fingerprint is known. While they are missing from the store, the step
@@ -161,8 +161,10 @@ def run_trial(trial: Trial, wait: bool = True) -> TrialRecord:
 
 @contextmanager
 def _recorded_failures(values: dict[str, Any], folder: TrialFolder) -> Iterator[None]:
-    """Write ``failed.json`` if the block fails. Code that ends the process has failed, even with
-    exit code 0."""
+    """Write ``failed.json`` if the block fails.
+
+    Code that ends the process has failed, even with exit code 0.
+    """
     try:
         with storage_errors(folder.runs):
             try:
@@ -253,8 +255,7 @@ def _run(trial: Trial, folder: TrialFolder) -> TrialRecord:
 
 
 def source_files(capture: Capture, store: Store) -> list[Path]:
-    """The user's files from which a capture was read; none for a scene that gsbench made in the
-    store."""
+    """The user's files from which a capture was read; none for a scene that gsbench made."""
     if capture.images.resolve().is_relative_to(store.root.resolve()):
         return []
     images = [(capture.images / name).resolve() for name in capture.image_names]

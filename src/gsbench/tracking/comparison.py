@@ -1,5 +1,4 @@
-"""The page of an experiment in MLflow: table and verdict as its description, and a view that
-compares the arms.
+"""The page of an experiment in MLflow: its table and verdict, and a view that compares arms.
 
 MLflow's page keeps what it shows (columns, groups, charts) in a tag of the experiment, if somebody
 shares that as a link: ``mlflow.sharedViewState.KEY`` holds JSON, and the address has
@@ -43,8 +42,7 @@ Sections = dict[str, list[dict[str, Any]]]  # charts by the headings of their se
 
 
 def publish(home: Path, uri: str | None) -> str:
-    """Renew the page of the experiment in ``home``; returns the experiment's id in the tracker
-    ``uri``.
+    """Renew the page of the experiment in ``home``; returns its id in the tracker ``uri``.
 
     Raises InputError, and any error of the tracker's client.
     """
@@ -107,8 +105,7 @@ def packed(state: dict[str, Any]) -> str:
 
 
 def view_state(trials: Sequence[TrialResult]) -> dict[str, Any]:
-    """The state of MLflow's page that shows the ``trials`` in groups by arm, with a chart for each
-    result."""
+    """The state of MLflow's page: ``trials`` in groups by arm, with a chart for each result."""
     measured = {key for trial in trials for key in trial.metrics}
     keys = [
         *(key for key in known_keys() if key in measured),
@@ -140,8 +137,7 @@ def _group_of(trial: TrialResult, swept: Sequence[str]) -> str:
 def _state(
     results: list[str], sections: Sections, groups: Any, expanded: dict[str, bool]
 ) -> dict[str, Any]:
-    """The state of MLflow's page with these metrics in its list, charts in sections, and groups of
-    runs."""
+    """The state of MLflow's page: metrics in its list, charts in sections, groups of runs."""
     columns = [*(f"tags.`{tag}`" for tag in COLUMNS), *(f"metrics.`{name}`" for name in results)]
     return {
         # the search

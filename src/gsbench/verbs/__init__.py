@@ -1,5 +1,4 @@
-"""The verbs of the command line: functions ``VERB(argv, runs) -> exit code``, where ``runs`` is the
-runs folder."""
+"""The verbs of the command line: functions ``VERB(argv, runs) -> exit code`` on ``runs``."""
 
 import importlib
 from collections.abc import Callable

@@ -12,8 +12,9 @@ MAX_PORT = 65535
 
 
 class ArgumentParser(argparse.ArgumentParser):
-    """An argparse parser that raises InputError for what it does not understand; ``--help`` prints
-    and exits.
+    """An argparse parser that raises InputError for what it does not understand.
+
+    ``--help`` prints and exits.
 
     ``gsbench VERB --help`` prints the verb's purpose, and ``more``.
     """
@@ -74,8 +75,7 @@ def add_question(parser: argparse.ArgumentParser) -> None:
 
 
 def add_where(parser: argparse.ArgumentParser) -> None:
-    """Add ``--where KEY=VALUE``, whose values `gsbench.analysis.cells.select_trials` takes as a
-    dict."""
+    """Add ``--where KEY=VALUE``; `gsbench.analysis.cells.select_trials` takes a dict of them."""
     text = "only such trials (repeatable)"
     parser.add_argument(
         "--where", type=_condition, action="append", default=[], metavar="KEY=VALUE", help=text

@@ -1,5 +1,4 @@
-"""Verbs that answer whether an idea helps: ``gsbench check``, ``plan`` and ``ablate``
-(docs/claims.md)."""
+"""Verbs that answer whether an idea helps: ``check``, ``plan`` and ``ablate`` (docs/claims.md)."""
 
 import argparse
 import math
@@ -87,8 +86,7 @@ def check(argv: Sequence[str], runs: Path) -> int:
 
 
 def _recheck(file: ClaimsFile, archive: Path, out: Path | None) -> int:
-    """Print the verdicts by the archive's trials, and write their page to ``out`` if given; returns
-    0.
+    """Print the verdicts by the archive's trials; write their page to ``out`` if given. Returns 0.
 
     Raises InputError for an ``out`` of another format.
     """
@@ -118,8 +116,7 @@ def _permissions(words: Sequence[str]) -> Sequence[str]:
 
 
 def describe(check: Check) -> list[str]:
-    """The lines of a dry run: each claim with its question or why it is not testable, the trials,
-    and the time."""
+    """The lines of a dry run: each claim's question or why it is not testable, trials, and time."""
     file, declaration = check.file, check.declaration
     questions = {question.name: question for question in declaration.questions}
     lines = [f"{file.paper}: {counted(len(questions), 'claim')} to be tested"]
@@ -256,8 +253,10 @@ def _above_zero(text: str) -> float:
 
 
 def ablate(argv: Sequence[str], runs: Path) -> int:
-    """Run the verb: the exit code says, as a sweep's does, whether a trial failed; raises
-    InputError for bad input."""
+    """Run the verb: the exit code says, as a sweep's does, whether a trial failed.
+
+    Raises InputError for bad input.
+    """
     from gsbench.pipeline.parts import Parts  # here, for a quick answer to --help
 
     options = _ablate_parser().parse_args(argv)

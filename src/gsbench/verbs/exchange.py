@@ -1,5 +1,4 @@
-"""Verbs for what goes to others or comes from them: ``gsbench evaluate``, ``export``, ``pool`` and
-``site``."""
+"""Verbs for what goes to others or comes from them: evaluate, export, pool and site."""
 
 import logging
 import shutil
@@ -184,8 +183,7 @@ def check_form(out: Path) -> None:
 
 
 def export_init(entry: Path, out: Path, normalization: Normalization) -> None:
-    """Copy the COLMAP model of the stage result ``entry`` to `MODEL_FOLDER` of ``out``, as 3DGS
-    trainers read it.
+    """Copy the COLMAP model of the stage result ``entry`` into ``out``, as 3DGS trainers read it.
 
     It gets the coordinates in which the scene was given. Raises InputError if ``out`` has a folder
     of models.

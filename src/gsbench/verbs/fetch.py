@@ -129,8 +129,10 @@ def _scenes(dataset: PublicDataset, names: Sequence[str]) -> Sequence[str]:
 
 
 def _mirror(mirror: str | None) -> str | None:
-    """The address or folder to fetch from instead of the published one; raises InputError if it is
-    neither."""
+    """The address or folder to fetch from instead of the published one.
+
+    Raises InputError if it is neither.
+    """
     if not mirror:
         return None
     with suppress(ValueError):  # urlsplit raises for an address such as http://[::1

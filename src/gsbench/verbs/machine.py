@@ -1,5 +1,4 @@
-"""Verbs about this machine: ``gsbench doctor`` (what is missing) and ``gsbench bench`` (how fast it
-is)."""
+"""Verbs about this machine: ``doctor`` (what is missing) and ``bench`` (how fast it is)."""
 
 import argparse
 import json
@@ -156,8 +155,7 @@ def check_packages() -> Iterator[Finding]:
 
 
 def check_devices() -> Iterator[Finding]:
-    """Findings about torch, the GPUs that it can or cannot use and why, and the rasterizers on each
-    device."""
+    """Findings about torch, the GPUs that it can use or not, and each device's rasterizers."""
     try:
         import torch
     except (ImportError, OSError) as error:

@@ -1,5 +1,4 @@
-"""Questions about the configuration that Hydra answers: ``--cfg job``, ``--info``, tab
-completion."""
+"""Questions on the configuration that Hydra answers: ``--cfg job``, ``--info``, tab completion."""
 
 import os
 import re
@@ -33,8 +32,10 @@ COMPLETION = re.compile(r"(install|uninstall|query)=(bash|zsh|fish)")
 
 
 def ask_hydra(argv: list[str]) -> int:
-    """Let Hydra answer a question about the configuration, and run no trial. Raises InputError for
-    bad input."""
+    """Let Hydra answer a question about the configuration, and run no trial.
+
+    Raises InputError for bad input.
+    """
     options = _parser().parse_args(argv)
     asked = [
         options.cfg is not None,
@@ -68,8 +69,7 @@ def ask_hydra(argv: list[str]) -> int:
 
 
 def _check_typed(line: str) -> None:
-    """Refuse to complete a line that would make Hydra import a package which the line does not
-    allow."""
+    """Refuse to complete a line that makes Hydra import a package which the line does not allow."""
     words = []
     for word in line.split():
         with suppress(InputError):  # a half-typed word

@@ -1,5 +1,4 @@
-"""Verbs that show an experiment's results from its files: ``gsbench tables``, ``report`` and
-``explain``."""
+"""Verbs that show an experiment's results from its files: ``tables``, ``report``, ``explain``."""
 
 import argparse
 import re
@@ -180,8 +179,7 @@ def _tables_parser() -> ArgumentParser:
 
 
 def _write(texts: Mapping[str, str], out: Path | None, name: str) -> None:
-    """Print the texts, or write them to the file ``out``, or into the folder ``out`` unless it has
-    the format's ending.
+    """Print the texts, or write them to ``out``: a file if its ending is the format's, or a folder.
 
     In a folder, files are named after the experiment. A second table is written beside the file
     ``out``.
@@ -232,8 +230,7 @@ def report(argv: Sequence[str], runs: Path) -> int:
 
 
 def file_at(out: Path, experiment: str) -> Path:
-    """The file that ``--out`` means: ``out`` itself, or in a folder a file named after the
-    experiment."""
+    """The file that ``--out`` means: ``out``, or in a folder one with the experiment's name."""
     is_file = out.suffix.lower() in FILE_SUFFIXES and not out.is_dir()
     return out if is_file else out / f"{experiment}-{REPORT_NAME}"
 
@@ -281,8 +278,7 @@ def explain_cell(address: str, runs: Path) -> str:
 
 
 def _trials_at(experiment: Experiment, scene: str, arm: str) -> list[TrialResult]:
-    """The trials of a scene and an arm: ``<init>-<densify>``, or the densifier alone if only one
-    arm has it."""
+    """The trials of a scene and an arm: ``<init>-<densify>``, or a densifier that one arm has."""
     of_scene = [trial for trial in experiment.trials if trial.scene == scene]
     if not of_scene:
         scenes = ", ".join(sorted({trial.scene for trial in experiment.trials}))
@@ -296,8 +292,7 @@ def _trials_at(experiment: Experiment, scene: str, arm: str) -> list[TrialResult
 
 
 def _trials_lines(trials: Sequence[TrialResult], shown: Quantity) -> list[str]:
-    """The value and the origin of each trial; a line that equals the previous trial's is not
-    repeated."""
+    """The value and the origin of each trial; a line that repeats the last trial's is left out."""
     lines = ["", "Trials"]
     previous: dict[str, str] = {}
     for trial in trials:

@@ -111,8 +111,7 @@ def ui(argv: Sequence[str], runs: Path) -> int:
 
 
 def _serves(server: str, experiment: str, page: str) -> bool:
-    """Return whether an MLflow server answers there that knows the experiment by the id in
-    ``page``."""
+    """Return whether an MLflow server there knows the experiment by the id in ``page``."""
     place = f"{server}/api/2.0/mlflow/experiments/get-by-name"
     try:
         answer = requests.get(

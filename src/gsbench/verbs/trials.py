@@ -44,8 +44,7 @@ log = logging.getLogger(__name__)
 
 
 def status(argv: Sequence[str], runs: Path) -> int:
-    """Run the verb: 0 if all trials are done, running or queued, 1 if some failed or are
-    missing."""
+    """Run the verb: 0 if all trials are done, running or queued, 1 if any failed or is missing."""
     parser = ArgumentParser("status")
     parser.add_argument(
         "experiment", nargs="?", help="its name; without one, a line for each experiment"
@@ -100,8 +99,7 @@ def status(argv: Sequence[str], runs: Path) -> int:
 
 
 def _watch(home: Path) -> None:
-    """Show the progress of the experiment in ``home`` until all its trials have ended, or until
-    Ctrl-C."""
+    """Show the progress of the experiment in ``home`` until its trials have ended, or Ctrl-C."""
     progress = progress_of(home)
     with (
         suppress(KeyboardInterrupt),
@@ -114,8 +112,7 @@ def _watch(home: Path) -> None:
 
 
 def _progress_view(name: str, progress: Progress) -> Group:
-    """A table of arms by scenes, with the numbers of trials that are done and in other states, and
-    lines below it."""
+    """A table of arms by scenes with the numbers of trials by state, and lines below it."""
     scenes = sorted({scene for _, scene in progress.cells})
     arms = sorted({arm for arm, _ in progress.cells})
     table = Table(title=escape(f"{name}: trials done of all"))
@@ -140,8 +137,7 @@ def _cell(counts: dict[str, int]) -> str:
 
 
 def progress_with_superseded(home: Path) -> list[TrialState]:
-    """The state of every trial of the experiment in ``home``, with ``superseded`` for those that
-    older code made."""
+    """The state of every trial in ``home``; those that older code made are ``superseded``."""
     folders = {folder: trial.cwd for folder, trial in read_plan(home).items()}
 
     # The user's modules are read in the folder where the trial's command was given: another may
@@ -159,8 +155,7 @@ def progress_with_superseded(home: Path) -> list[TrialState]:
 
 
 def lines_of(trials: list[TrialState], with_done: bool) -> list[str]:
-    """A line for each trial that is not done, or whose result is in doubt (or for each,
-    ``with_done``); a summary."""
+    """A line for each trial that is not done or in doubt (``with_done``: for each), and a summary."""
     lines = []
     for trial in sorted(trials, key=lambda trial: ORDER.index(trial.state)):
         if trial.state != "done" or trial.note or with_done:
@@ -241,8 +236,7 @@ def retry(argv: Sequence[str], runs: Path) -> int:
 
 
 def _check_trackers(trials: Sequence[Trial], changes: Sequence[str]) -> None:
-    """Raise InputError for a trial that would send its results to a tracker which only a file
-    names.
+    """Raise InputError for a trial that would send results to a tracker which only a file names.
 
     The runs folder may be somebody else's, and its address theirs.
     """
@@ -260,8 +254,7 @@ def _check_trackers(trials: Sequence[Trial], changes: Sequence[str]) -> None:
 def recompose(
     folder: Path, planned: PlannedTrial | None, runs: Path, changes: list[str], modules: str
 ) -> Trial:
-    """The trial in ``folder``: from its planned overrides, else from the configuration that it
-    wrote.
+    """The trial in ``folder``: from its planned overrides, else from its ``config.yaml``.
 
     Neither gives permission to run code: ``changes`` must give it again. ``modules`` is the folder
     of the user's modules.

@@ -1,5 +1,4 @@
-"""``gsbench vote``: a page on which people compare renders blindly, and the verdict of their votes
-(docs/vote.md)."""
+"""``gsbench vote``: a page to compare renders blindly, and people's verdict (docs/vote.md)."""
 
 import argparse
 import random
@@ -139,8 +138,7 @@ def make(experiment: Experiment, options: argparse.Namespace) -> None:
 
 
 def judge(experiment: Experiment, files: Sequence[Path]) -> None:
-    """Take people's files into their rounds, and print the verdicts of these rounds; without files,
-    of all rounds."""
+    """Take people's files into their rounds, and print the verdicts of these rounds, or all."""
     ballots: dict[str, Ballot] = {}
     for file in files:
         if not file.is_file():

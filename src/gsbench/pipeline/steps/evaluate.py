@@ -1,5 +1,4 @@
-"""Evaluation: renders the test views at 8 bits, as the PNGs hold them, and measures them by the
-protocol."""
+"""Evaluation: renders the test views at 8 bits, as the PNGs hold them, and measures them."""
 
 from __future__ import annotations
 
@@ -54,8 +53,7 @@ TIMED_RENDERS = 5  # of each view, to measure the speed
 
 
 def evaluate_step(views: Views, trained: Step, parts: Parts) -> Step:
-    """The step that renders and measures the model of ``trained`` and its snapshots of earlier
-    iterations.
+    """The step that renders and measures the model of ``trained`` and its earlier snapshots.
 
     Where another program left renders instead of a model, the step measures those. ``eval.maps``
     adds a picture of the large Gaussians; ``eval.fps`` is the image size at which the speed of
@@ -177,8 +175,10 @@ def measure_speed(
     background: torch.Tensor,
     size: Sequence[int],
 ) -> dict[str, float]:
-    """The renders per second of each test view at ``size`` (width, height) px, after one render
-    that is not timed."""
+    """The renders per second of each test view at ``size`` (width, height) px.
+
+    The first render of a view is not timed.
+    """
     speeds = {}
 
     def now() -> float:
@@ -233,8 +233,7 @@ def _write_metrics(
 
 
 def one_color_psnr(scene: Scene, protocol: Protocol) -> float | None:
-    """The mean PSNR in dB of a picture in the training views' mean colour; a trained model must
-    beat it.
+    """The mean PSNR in dB of the training views' mean colour, which a trained model must beat.
 
     None without test views.
     """
@@ -256,8 +255,7 @@ def one_color_psnr(scene: Scene, protocol: Protocol) -> float | None:
 
 
 def summary_of(evaluator: Evaluator, per_view: Mapping[str, Mapping[str, float]]) -> Evaluation:
-    """Summary of an evaluation: the means, the missing metrics and why, and the facts about a
-    user's metrics."""
+    """The means, the missing metrics and why, and the facts about a user's metrics."""
     return Evaluation(
         metrics=summarize(per_view, evaluator.unavailable),
         unavailable=dict(evaluator.unavailable),
@@ -292,8 +290,9 @@ def draw_ellipsoids(
     camera: Camera,
     volume_threshold: float,
 ) -> Image.Image:
-    """The view ``render`` [H, W, 3] with the outlines of the Gaussians above ``volume_threshold``
-    (cubed scene units).
+    """The view ``render`` [H, W, 3] with outlines of Gaussians above ``volume_threshold``.
+
+    The threshold is in cubed scene units.
 
     An outline is the projected ellipsoid of one standard deviation. Its colour tells the rule that
     made the Gaussian (``causes`` [N], see ``Cause``). At most the 1500 most voluminous are drawn. A
@@ -325,8 +324,7 @@ def draw_ellipsoids(
 
 
 def _with_legend(image: Image.Image, title: str, causes: Sequence[Cause]) -> Image.Image:
-    """The image with a legend below: the title, and each cause in its colour, wrapped to the
-    image's width."""
+    """The image with a legend below: title, and causes in their colours, wrapped to its width."""
     words = [(word, TEXT_COLOR) for word in title.split()] + [
         (cause.words, cause.color) for cause in causes
     ]

@@ -141,8 +141,7 @@ def check_points(
 
 
 def _log_normalization(capture: Capture, densifier: Densifier) -> None:
-    """Log the coordinates of the training if they are not those of the scene, and V_th in the
-    scene's own units."""
+    """Log the coordinates of the training and V_th in the scene's own units, if they differ."""
     normalization = capture.normalization
     if normalization.is_identity:
         return
@@ -170,8 +169,7 @@ def _write_training(
     device: torch.device,
     start: InitialCloud,
 ) -> None:
-    """Write the lineage of a trained model, and the ``summary`` of the training with further
-    facts."""
+    """Write a trained model's lineage, and the ``summary`` of the training with more facts."""
     causes: dict[str, int] = {}
     if lineage is not None:
         causes = lineage.causes_of_living()
@@ -187,8 +185,7 @@ def _write_training(
 
 
 def initial_gaussians(init: Path, device: torch.device) -> Gaussians:
-    """The Gaussians that training starts from: the initialiser's own in the folder ``init``, or one
-    per point."""
+    """The Gaussians that training starts from: the initialiser's own, or one for each point."""
     if (init / GAUSSIANS_FILE).exists():
         return read_ply(init / GAUSSIANS_FILE, device)
     cloud = read_cloud(init / MODEL_FOLDER)
@@ -205,8 +202,7 @@ OWN_VARIABLES = "GSBENCH_"  # prefix of gsbench's own settings, which the progra
 
 
 def external_step(views: Views, trainer: External, parts: Parts) -> Step:
-    """The step in which ``trainer`` trains on the training views, from the cloud of the
-    initialiser.
+    """The step in which ``trainer`` trains on the training views, from the initialiser's cloud.
 
     Raises InputError for a capture with masks.
     """
@@ -311,8 +307,7 @@ def external_step(views: Views, trainer: External, parts: Parts) -> Step:
 
 
 def environment_of(trainer: External, values: Mapping[str, object]) -> dict[str, str]:
-    """The program's environment: gsbench's without its own variables, and what
-    ``densify.environment`` adds."""
+    """The program's environment: gsbench's without its variables, and ``densify.environment``."""
     # Without SAFE_PATH, too: a train.py must find the modules beside it.
     inherited = {
         name: value
@@ -328,8 +323,7 @@ def environment_of(trainer: External, values: Mapping[str, object]) -> dict[str,
 def check_version(
     trainer: External, values: Mapping[str, object], environment: Mapping[str, str]
 ) -> str | None:
-    """Run ``densify.version_command`` and return its output on one line; None if there is no such
-    command.
+    """Run ``densify.version_command``; return its output on one line, None without a command.
 
     Raises `InputError` unless the output contains ``densify.version``.
     """
