@@ -209,7 +209,7 @@ def tuning_sentence(trials: Sequence[TrialResult], pair: Sequence[Arm]) -> str:
 
 
 def _tuning_budget(trial: TrialResult) -> str:
-    """``6 points of 2 seeds on validation views``: the largest search it gains from, or ``none``."""
+    """``6 points of 2 seeds on validation views``: the largest search it gains from, or none."""
     searches = [search for search in _searches(trial).values() if _has_settings(trial, search.best)]
     if not searches:
         return "none"

@@ -155,7 +155,7 @@ def progress_with_superseded(home: Path) -> list[TrialState]:
 
 
 def lines_of(trials: list[TrialState], with_done: bool) -> list[str]:
-    """A line for each trial that is not done or in doubt (``with_done``: for each), and a summary."""
+    """A line for each trial not done or in doubt (``with_done``: for each), and a summary."""
     lines = []
     for trial in sorted(trials, key=lambda trial: ORDER.index(trial.state)):
         if trial.state != "done" or trial.note or with_done:
