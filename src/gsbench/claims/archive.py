@@ -7,6 +7,7 @@ It holds:
   seeds;
 - ``per_view.csv``: the metrics of every test view;
 - ``declared.jsonl``: the declarations of the experiment, if there are any;
+- ``ledger.jsonl``: the ideas of a ledger (`gsbench ledger`), if it is one;
 - ``from_pixels.jsonl``: measures of the trials' pictures, if declared claims use them;
 - ``pictures/``: renders and photographs of test views by trial, only if they were asked for;
 - ``archive.json``: the version of this format and the sha256 of the files above;
@@ -46,6 +47,7 @@ from gsbench.runs.layout import (
     DECLARED,
     FROM_PIXELS,
     GROUND_TRUTH,
+    LEDGER,
     PER_VIEW,
     RENDERS,
     RESULTS,
@@ -53,6 +55,7 @@ from gsbench.runs.layout import (
 from gsbench.settings import is_folder_name
 from gsbench.words import readable_bytes, without_folders
 
+RECORDS = (DECLARED, LEDGER)  # files of the experiment, kept as they are
 FORMAT, VERSION = "gsbench results", 1
 PIXELS = "from_pixels.jsonl"
 MANIFEST, CRATE = "archive.json", "ro-crate-metadata.json"
@@ -81,6 +84,7 @@ FILES = {  # media types and descriptions
     PER_VIEW: ("text/csv", "Metrics of every test view of every trial"),
     PIXELS: ("application/jsonl", "What declared claims ask of the trials' pictures, measured"),
     DECLARED: ("application/jsonl", "What was declared before the trials were run"),
+    LEDGER: ("application/jsonl", "The ideas in the order of their tests (gsbench ledger)"),
     MANIFEST: ("application/json", "Version of the archive, and the sha256 of its files"),
 }
 
@@ -107,7 +111,6 @@ def write_archive(experiment: Experiment, out: Path, pictures: bool = False) -> 
         kept.append(trial)
     if not kept:
         raise InputError(f"{experiment.name} has no whole trial to export (first: {left_out[0]})")
-    declared = experiment.folder / DECLARED
     contents = {
         TRIALS: _json_lines(
             {"folder": _folder(trial), "results": _results(trial)} for trial in kept
@@ -117,7 +120,10 @@ def write_archive(experiment: Experiment, out: Path, pictures: bool = False) -> 
             for text, trials in configurations.items()
         ),
         PER_VIEW: _table(rows),
-    } | ({DECLARED: read_bytes(declared)} if declared.is_file() else {})
+    }
+    for name in RECORDS:
+        record = experiment.folder / name
+        contents |= {name: read_bytes(record)} if record.is_file() else {}
     if any(
         q.metric == TEXTURED.key
         for one in read_declarations(experiment.folder)
@@ -320,8 +326,9 @@ def _unpack(
     for name in contents:
         if name.startswith(f"{PICTURES_FOLDER}/"):
             _unpack_picture(home, name, contents[name])
-    if DECLARED in contents:
-        (home / DECLARED).write_bytes(contents[DECLARED])
+    for name in RECORDS:
+        if name in contents:
+            (home / name).write_bytes(contents[name])
 
 
 def _unpack_picture(home: Path, name: str, content: bytes) -> None:
