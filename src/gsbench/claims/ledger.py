@@ -5,7 +5,7 @@ with ``ideas`` planned tests and a false discovery rate ``rate``, the next test 
 ``rate * (kept + 1) / ideas``. LOND controls the false discovery rate for p values with positive
 dependence (Zrnic, Ramdas and Jordan 2021, theorem 4), such as those of ideas that share the
 trainings of one baseline. Tests that run side by side count the ideas that were kept before they
-began, as the same paper does. `scripts/ledger_rates.py` simulates it (docs/ledger.md).
+began, as the same paper does. `scripts/ledger_rates.py` simulates it (docs/night.md).
 """
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -141,11 +141,12 @@ def end_of(idea: str, verdict: Verdict, time: str) -> Ended:
     )
 
 
-def confirmed(verdicts: Sequence[Verdict], time: str) -> Confirmed:
-    """The ledger's entry for the verdicts of a confirmation."""
+def confirmed(number: int, verdicts: Sequence[Verdict], time: str) -> Confirmed:
+    """The ledger's entry for the verdicts of the confirmation ``number``."""
     differences = {one.question.name: difference_of(one) for one in verdicts}
     return Confirmed(
         time=time,
+        number=number,
         results={one.question.name: result_of(one) for one in verdicts},
         differences={idea: one for idea, one in differences.items() if one is not None},
     )
@@ -192,24 +193,22 @@ def check_unknown_trials(ledger: Ledger, trials: Sequence[TrialResult]) -> None:
         )
 
 
-def check_untouched(ledger: Ledger, trials: Sequence[TrialResult], scenes: Collection[str]) -> None:
-    """Raise InputError if a capture among ``scenes`` was used before, by name or by photographs.
+def check_untouched(ledger: Ledger, trials: Sequence[TrialResult], asked: Confirming) -> None:
+    """Raise InputError if ``asked`` has a capture that was used before, by name or by photographs.
 
     ``trials`` are all trials of the experiment that are done.
     """
-    earlier = set(ledger.opened.keys)
+    scenes, earlier = asked.keys[BASELINE], set(ledger.opened.keys)
     for confirming, _ in ledger.confirmations:
-        earlier |= confirming.keys[BASELINE].keys()
-    photographs = {
-        trial.record.hashes["data"]: trial.scene for trial in trials if trial.scene in earlier
-    }
-    copies = [
-        trial.scene
-        for trial in trials
-        if trial.scene in scenes and trial.record.hashes["data"] in photographs
-    ]
-    if used := [*(scene for scene in scenes if scene in earlier), *copies]:
+        if (confirming.keys, confirming.seeds) != (asked.keys, asked.seeds):
+            earlier |= confirming.keys[BASELINE].keys()
+    photographs = {trial.record.hashes.get("data") for trial in trials if trial.scene in earlier}
+    used = {scene for scene in scenes if scene in earlier}
+    for trial in trials:
+        if trial.scene in scenes and trial.record.hashes.get("data") in photographs:
+            used.add(trial.scene)
+    if used:
         raise InputError(
-            f"{listed(sorted(set(used)))} was seen by the ideas, or by an earlier confirmation: "
-            "confirm on other captures"
+            f"{listed(sorted(used))} was seen by the ideas, or by an earlier confirmation: confirm "
+            "on other captures"
         )

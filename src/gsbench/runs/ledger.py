@@ -123,10 +123,11 @@ class Confirming(Record):
 
 @dataclass(frozen=True, kw_only=True)
 class Confirmed(Record):
-    """The results of the latest ``confirming`` line: each idea's difference from the baseline."""
+    """The results of the confirmation ``number`` (from 0): each idea's difference."""
 
     kind: Literal["confirmed"] = "confirmed"
     time: Text
+    number: Count
     results: dict[Text, Result]
     differences: dict[Text, Difference]
 
@@ -178,13 +179,15 @@ class Ledger:
     @property
     def confirmations(self) -> list[tuple[Confirming, Confirmed | None]]:
         """Each confirmation with its results, None while trials are missing."""
-        pairs: list[tuple[Confirming, Confirmed | None]] = []
-        for one in self.entries:
-            if isinstance(one, Confirming):
-                pairs.append((one, None))
-            elif isinstance(one, Confirmed) and pairs:
-                pairs[-1] = (pairs[-1][0], one)
-        return pairs
+        begun = [one for one in self.entries if isinstance(one, Confirming)]
+        done = {one.number: one for one in self.entries if isinstance(one, Confirmed)}
+        return [(one, done.get(number)) for number, one in enumerate(begun)]
+
+    def number_of(self, asked: Confirming) -> int | None:
+        """The number of the confirmation with the same trials, None if there is none."""
+        same = (asked.keys, asked.seeds)
+        begun = [(one.keys, one.seeds) for one, _ in self.confirmations]
+        return begun.index(same) if same in begun else None
 
     def words_of(self, idea: str) -> tuple[str, ...]:
         """The settings of an idea, or of the baseline."""

@@ -1,4 +1,4 @@
-"""``gsbench ledger``: many ideas under one false discovery rate (docs/ledger.md)."""
+"""``gsbench ledger``: many ideas under one false discovery rate (docs/night.md)."""
 
 import argparse
 import json
@@ -55,7 +55,7 @@ def _parser() -> ArgumentParser:
         "`new` declares metric, baseline, captures, seeds and error rate. `try` trains one idea, "
         "seed by seed until it is decided; exit code 0: kept, 1: dropped, or its trials fail, 3: "
         "undecided, 2: bad input. `confirm` trains what was kept on other captures. `show` lists "
-        "all (docs/ledger.md).",
+        "all (docs/night.md).",
     )
     parser.add_argument("action", choices=["new", "try", "confirm", "show"])
     parser.add_argument("name", help="the ledger, which is an experiment in the runs folder")
@@ -187,9 +187,12 @@ def _run(home: Path, book: Ledger, idea: str, trials: Trials) -> Ledger:
     ended = rules.end_of(idea, verdict, _now())
     if fails and not verdict.final:
         own = set(book.keys_of(idea).values())
-        if any(one.key in own for one in finished_trials(home, list(trials.values()))):
+        failed = {key for key, trial in trials.items() if trial.files.has_failed()}
+        done = {one.key for one in finished_trials(home, list(trials.values()))}
+        if own & done or not {key for key, _ in failed} <= own:
             raise GsbenchError(f"{idea}: {fails}; to go on, give the same command again")
-        ended = records.Ended(time=_now(), idea=idea, result=FAILED, reason=fails, seeds=0)
+        reason = next((trials[key].files.failure().reason for key in sorted(failed)), fails)
+        ended = records.Ended(time=_now(), idea=idea, result=FAILED, reason=reason, seeds=0)
 
     def make(now: Ledger) -> records.Ended | None:
         before = now.ended.get(idea)  # by a process that ran the same command
@@ -217,28 +220,40 @@ def confirm(options: argparse.Namespace, home: Path) -> int:
     asked = records.Confirming(time=_now(), seeds=_seeds(by_idea[BASELINE]), keys=keys)
 
     def make(now: Ledger) -> records.Confirming | None:
-        if any(one.keys == keys and one.seeds == asked.seeds for one, _ in now.confirmations):
+        if now.number_of(asked) is not None:
             return None
-        rules.check_untouched(now, read_experiment(home).trials, keys)
+        rules.check_untouched(now, read_experiment(home).trials, asked)
         return asked
 
     book = records.append(home, make)
-    before = [one for one in book.confirmations if one[0].keys == keys]
-    asked, results = before[-1]
-    if results is None:
-        first = {key: trial for key, trial in by_idea[BASELINE].items() if key[1] == asked.seeds[0]}
-        _run_all(first)
-        # The photographs' hashes are known only now.
-        rules.check_untouched(book, read_experiment(home).trials, keys)
-        trials = {key: trial for own in by_idea.values() for key, trial in own.items()}
-        _run_all(trials)
-        verdicts = judge(
-            finished_trials(home, list(trials.values())), rules.confirmation_of(book.opened, asked)
-        )
-        book = records.append(home, lambda now: rules.confirmed(verdicts, _now()))
-    _, results = book.confirmations[-1]
-    print(to_markdown(ledger_tables(book)[-1]))
+    number = book.number_of(asked)
+    assert number is not None  # `make` has just added it
+    if book.confirmations[number][1] is None:
+        book = _run_confirmation(home, book, number, by_idea)
+    print(to_markdown(ledger_tables(book)[1 + number]))
     return 0
+
+
+def _run_confirmation(
+    home: Path, book: Ledger, number: int, by_idea: Mapping[str, Trials]
+) -> Ledger:
+    """Train all trials of a confirmation, and write its results."""
+    asked, _ = book.confirmations[number]
+    first = {key: trial for key, trial in by_idea[BASELINE].items() if key[1] == asked.seeds[0]}
+    _run_all(first)
+    # Only now are the photographs' hashes known, which show a copy under another name.
+    rules.check_untouched(book, read_experiment(home).trials, asked)
+    trials = {key: trial for own in by_idea.values() for key, trial in own.items()}
+    _run_all(trials)
+    declaration = rules.confirmation_of(book.opened, asked)
+    verdicts = judge(finished_trials(home, list(trials.values())), declaration)
+
+    def make(now: Ledger) -> records.Confirmed | None:
+        if now.confirmations[number][1] is not None:  # by a process that ran the same command
+            return None
+        return rules.confirmed(number, verdicts, _now())
+
+    return records.append(home, make)
 
 
 def show(options: argparse.Namespace, home: Path) -> int:
