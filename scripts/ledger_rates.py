@@ -4,8 +4,9 @@
     python scripts/ledger_rates.py --nights 100    print it from fewer nights
 
 A night tries forty ideas on three scenes with up to six seeds. All are compared with the same
-trainings of one baseline. Differences are in standard deviations of a pair of trainings. In an adaptive night, every second idea (by chance)
-is another try of what looked best so far, with the same effect and new trainings.
+trainings of one baseline. Differences are in standard deviations of a pair of trainings. In an
+adaptive night, every second idea (by chance) is another try of what looked best so far, with the
+same effect and new trainings.
 """
 
 from __future__ import annotations
@@ -92,7 +93,7 @@ class Rates:
 def simulate(
     rule: Rule, least: float, real: float, effect: float, adaptive: bool, nights: int
 ) -> Rates:
-    """Nights in which a share ``real`` of the ideas gains ``effect`` times ``least``, others nothing."""
+    """Nights where a share ``real`` of the ideas gains ``effect`` times ``least``, others 0."""
     rng = np.random.default_rng([round(100 * real), round(10 * effect), adaptive])
     baseline = rng.normal(0, 0.5**0.5, (nights, SCENES, SEEDS))
     kept, false, good, found, trained = (np.zeros(nights, dtype=np.int64) for _ in range(5))

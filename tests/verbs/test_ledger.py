@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +13,7 @@ import numpy as np
 import pytest
 
 from gsbench.analysis.results import read_experiment
+from gsbench.app.command import compose_trials
 from gsbench.cli import run
 from gsbench.config.compose import Trial
 from gsbench.runs import ledger as records
@@ -60,9 +63,21 @@ def trainings(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Trainings:
     made = Trainings()
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs"))
+    monkeypatch.setattr(verb, "compose_trials", composed)
     monkeypatch.setattr(verb, "run_trials", made)
     monkeypatch.setattr(verb, "finished_trials", lambda home, trials: _finished(home, trials))
     return made
+
+
+@cache
+def _composed_once(words: tuple[str, ...]) -> list[Trial]:
+    return compose_trials(words, multirun=True)
+
+
+def composed(words: Sequence[str], multirun: bool) -> list[Trial]:
+    """The trials of words in this test's runs folder; Hydra composes equal words only once."""
+    runs = os.environ["GSBENCH_RUNS"]
+    return [Trial(one.values | {"runs": runs}, one.overrides) for one in _composed_once((*words,))]
 
 
 def _finished(home: Path, trials: Sequence[Trial]) -> list[Any]:

@@ -8,7 +8,7 @@ trainings of one baseline. Tests that run side by side count the ideas that were
 began, as the same paper does. `scripts/ledger_rates.py` simulates it (docs/night.md).
 """
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
 from gsbench.analysis.judgement import Verdict, judge

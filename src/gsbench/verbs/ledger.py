@@ -312,9 +312,10 @@ def _of_idea(book: Ledger, idea: str, name: str) -> Trials:
 
 
 def _merged(words: Sequence[str], changes: Sequence[str]) -> list[str]:
-    """The words with changes; a word gives way to a change of the same key."""
-    changed = {key_of(word) for word in changes}
-    return [*(word for word in words if key_of(word) not in changed), *changes]
+    """The words with changes: a word gives way to one of the same key, ``~KEY`` takes it away."""
+    given, changed = set(map(key_of, words)), set(map(key_of, changes))
+    kept = [word for word in words if key_of(word) not in changed]
+    return kept + [word for word in changes if not (word.startswith("~") and key_of(word) in given)]
 
 
 def _check_words(words: Sequence[str]) -> None:
