@@ -250,6 +250,17 @@ def test_edited_code_of_the_baseline_is_noticed(
     assert "the code of baseline have changed" in capsys.readouterr().err
 
 
+def test_a_ledger_of_somebody_else_runs_no_code(
+    home: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "mine.py").write_text("from gsbench.densify import ADC\nclass Mine(ADC): pass\n")
+    own = ["densify._target_=mine.Mine", "densify.name=mine", "allow_targets=[mine]"]
+    assert attempt(*own, f"{SPLIT}=0.02") == 0
+    assert attempt(f"{SPLIT}=0.03", "--against", "mine") == 2
+    assert "mine runs code of yours: add allow_targets=[mine]" in capsys.readouterr().err
+    assert attempt(f"{SPLIT}=0.03", "--against", "mine", "allow_targets=[mine]") == 0
+
+
 def test_a_kill_between_any_two_lines_changes_nothing(
     home: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

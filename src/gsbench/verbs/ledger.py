@@ -16,7 +16,7 @@ from gsbench.app.command import compose_trials, run_trials
 from gsbench.claims import ledger as rules
 from gsbench.claims.gate import asked_difference
 from gsbench.claims.stopping import KeyAndSeed, finished_trials, run_looks
-from gsbench.config.command_words import key_of
+from gsbench.config.command_words import key_of, typed_permissions
 from gsbench.config.compose import Trial
 from gsbench.errors import GsbenchError, InputError
 from gsbench.eval.options import EvalConfig
@@ -112,8 +112,14 @@ def try_idea(options: argparse.Namespace, home: Path) -> int:
         kept = listed([BASELINE, *book.kept])
         raise InputError(f"--against {against}: there is {kept}{did_you_mean(against, book.kept)}")
     _check_words(options.settings)
-    trials = _of_idea(book, against, home.name)
-    own = _compose(home.name, _merged(book.words_of(against), options.settings))
+    start = _permitted(book, against, options.settings)
+    trials = _compose(home.name, start)
+    if _keys(trials, home.name) != book.keys_of(against):
+        raise InputError(
+            f"the settings or the code of {against} have changed since its trials ran: bring them "
+            "back"
+        )
+    own = _compose(home.name, _merged(start, options.settings))
     idea, book = _start(home, own, against, options)
     if (ended := book.ended.get(idea)) is None or ended.result == FAILED:
         trials |= own
@@ -213,7 +219,9 @@ def confirm(options: argparse.Namespace, home: Path) -> int:
     if not any(key_of(word) == "scene" for word in options.settings):
         raise InputError("confirm needs captures that no idea has seen: scene=…")
     by_idea = {
-        idea: _compose(home.name, _merged(book.words_of(idea), options.settings))
+        idea: _compose(
+            home.name, _merged(_permitted(book, idea, options.settings), options.settings)
+        )
         for idea in (BASELINE, *ideas)
     }
     keys = {idea: _keys(trials, home.name) for idea, trials in by_idea.items()}
@@ -301,14 +309,18 @@ def _seeds(trials: Trials) -> tuple[int, ...]:
     return seeds
 
 
-def _of_idea(book: Ledger, idea: str, name: str) -> Trials:
-    """The trials of a past idea, or the baseline; raises InputError if its code has changed."""
-    trials = _compose(name, book.words_of(idea))
-    if _keys(trials, name) != book.keys_of(idea):
-        raise InputError(
-            f"the settings or the code of {idea} have changed since its trials ran: bring them back"
-        )
-    return trials
+def _permitted(book: Ledger, idea: str, typed: Sequence[str]) -> tuple[str, ...]:
+    """The recorded settings of an idea, or of the baseline.
+
+    Raises InputError if they would run code that the ``typed`` words do not allow: the ledger is a
+    file, and may be somebody else's.
+    """
+    words = book.words_of(idea)
+    needed = set(typed_permissions(words)) - set(typed_permissions(typed))
+    if needed:
+        names = ",".join(sorted(needed | set(typed_permissions(typed))))
+        raise InputError(f"{idea} runs code of yours: add allow_targets=[{names}]")
+    return words
 
 
 def _merged(words: Sequence[str], changes: Sequence[str]) -> list[str]:
