@@ -16,14 +16,14 @@ from gsbench.init.colmap.database import (
     create_database,
     database_counts,
     unknown_camera_groups,
-    verify_pairs,
     write_keypoints,
     write_matches,
 )
+from gsbench.init.colmap.features import extract_sift
+from gsbench.init.colmap.geometry import verification_options, verify_pairs
 from gsbench.init.colmap.mapping import map_images
-from gsbench.init.colmap.reconstruct import verification_options
-from gsbench.init.colmap.sift import extract_sift, match_sift
-from gsbench.init.networks.extract_and_match import EXTRACTORS, extract_features
+from gsbench.init.colmap.matches import match_sift
+from gsbench.init.networks.extractors import EXTRACTORS, extract_features
 from gsbench.init.networks.features import Features, FeatureSettings
 from gsbench.logs import no_progress
 from gsbench.scene.types import Capture

@@ -12,14 +12,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
-from annotated_types import Ge, Interval
+from annotated_types import Interval
 from pydantic import NonNegativeFloat, PositiveInt
 
 from gsbench.errors import InputError
 from gsbench.init.base import Preparation, Timer
-from gsbench.init.colmap.pairs import Pairing
+from gsbench.init.colmap_initializer import ColmapInitializer
 from gsbench.init.networks.features import FeatureSettings
-from gsbench.init.sfm import MIN_DETECTION_SIZE, ColmapInitializer
+from gsbench.init.options import FeatureOptions
 from gsbench.logs import Progress
 from gsbench.scene.types import Capture
 from gsbench.settings import AnyPath, Fraction
@@ -80,19 +80,13 @@ NMS_RADII = {"superpoint": 3, "aliked": 2, "disk": 2}  # px
 
 
 @dataclass(frozen=True, kw_only=True)
-class FeatureInitializer(ColmapInitializer):
+class FeatureInitializer(FeatureOptions, ColmapInitializer):
     """Base of initialisers with features and matches from outside COLMAP, which verifies and maps
     or triangulates them.
 
-    ``max_image_size`` is in px of the longest side. Features and matches are stored in the
-    ``work_dir`` of `run`, by image and by pair, so an interrupted run continues there.
+    Features and matches are stored in the ``work_dir`` of `run`, by image and by pair, so an
+    interrupted run continues there.
     """
-
-    pairs: Pairing | Literal["lowres"] = "exhaustive"  # type: ignore[assignment]  # SIFT has no "lowres"
-    max_keypoints: PositiveInt = 2048
-    max_image_size: Annotated[int, Ge(MIN_DETECTION_SIZE)] = 1600
-    max_ratio: Annotated[float, Interval(gt=0, le=1)] = 0.95
-    device: str = "cpu"
 
     @abstractmethod
     def feature_settings(self) -> FeatureSettings:
@@ -122,8 +116,8 @@ class FeatureInitializer(ColmapInitializer):
         )
 
     def fill_database(self, task: DatabaseTask, progress: Progress, timer: Timer) -> dict[str, int]:
-        from gsbench.init.colmap.database import verify_pairs, write_keypoints, write_matches
-        from gsbench.init.colmap.reconstruct import verification_options
+        from gsbench.init.colmap.database import write_keypoints, write_matches
+        from gsbench.init.colmap.geometry import verification_options, verify_pairs
         from gsbench.init.networks.extract_and_match import NetworkJob, choose_pairs, open_store
 
         job = NetworkJob(

@@ -181,12 +181,12 @@ class Random(PlacedCloud):
     seed: Seed = 0
 
     def cloud(self, capture: Capture, model: pycolmap.Reconstruction) -> PointCloud:
-        from gsbench.init import report
-        from gsbench.init.colmap import reconstruct
+        from gsbench.init.colmap.alignment import training_extent
+        from gsbench.init.colmap.reconstruct import poses_by_name
 
-        poses = reconstruct.poses_by_name(model)
+        poses = poses_by_name(model)
         centers = [poses[name][0] for name in capture.train_names if name in poses]
-        extent = report.training_extent(model, capture)
+        extent = training_extent(model, capture)
         if extent == 0:
             raise InputError(
                 f"init=random: the training cameras of scene {capture.name} are all at one place"

@@ -12,15 +12,13 @@ import pycolmap
 from numpy.typing import NDArray
 from PIL import Image
 
-from gsbench.logs import Progress
+from gsbench.init.colmap.pairs import select_pairs
+from gsbench.init.options import ColmapOptions
 from gsbench.scene.colmap import rescaled_camera
 from gsbench.scene.images import image_size, read_image
 from gsbench.scene.types import Capture
 
 COLMAP_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
-# COLMAP reports no progress within a call, so the pairs are divided over several calls
-VERIFY_CALLS = 20
-MIN_PAIRS_PER_CALL = 50
 
 
 # each camera with the names of its images
@@ -41,6 +39,27 @@ class DatabaseTask:
     pairs: list[tuple[str, str]]
     capture: Capture
     work_dir: Path
+
+
+def create_task(
+    options: ColmapOptions,
+    capture: Capture,
+    reference: pycolmap.Reconstruction | None,
+    work_dir: Path,
+) -> DatabaseTask:
+    """Create a database of the capture's images, with the cameras that ``options`` choose."""
+    ignored = options.ignores_test_photographs(reference)
+    used = capture.train_names if ignored else capture.image_names
+    images = readable_images(capture.images, used, work_dir)
+    if reference is not None and options.uses_reference_cameras:
+        groups = reference_camera_groups(reference)
+    else:
+        groups = unknown_camera_groups(
+            images, capture.image_names, options.camera, options.camera_model, options.focal_length
+        )
+    database = work_dir / "database.db"
+    names = [name for name in create_database(database, groups) if name in set(used)]
+    return DatabaseTask(database, images, names, select_pairs(names, options), capture, work_dir)
 
 
 def readable_images(images: Path, names: Sequence[str], work_dir: Path) -> Path:
@@ -173,27 +192,6 @@ def write_matches(path: Path, matches: Mapping[tuple[str, str], NDArray[np.uint3
     with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
         for (first, second), indices in matches.items():
             database.write_matches(ids[first], ids[second], indices)
-
-
-def verify_pairs(
-    path: Path,
-    pairs: Sequence[tuple[str, str]],
-    options: pycolmap.TwoViewGeometryOptions,
-    progress: Progress,
-) -> None:
-    """Run COLMAP's geometric verification on the stored matches of ``pairs``."""
-    list_file = path.with_suffix(".pairs.txt")
-    size = max(len(pairs) // VERIFY_CALLS, MIN_PAIRS_PER_CALL)
-    progress("verify", 0, len(pairs))
-    with image_ids_as_names(path) as new_names:
-        for start in range(0, len(pairs), size):
-            part = pairs[start : start + size]
-            write_pairs(
-                list_file, [(new_names[first], new_names[second]) for first, second in part]
-            )
-            pycolmap.verify_matches(path, list_file, options)
-            progress("verify", start + len(part), len(pairs))
-    list_file.unlink(missing_ok=True)
 
 
 def cameras_without_prior(path: Path) -> bool:

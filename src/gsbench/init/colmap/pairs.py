@@ -10,14 +10,13 @@ of their tracks.
 
 from collections.abc import Callable, Sequence
 from itertools import combinations
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-Pair = tuple[int, int]
+from gsbench.init.options import ColmapOptions
 
-Pairing = Literal["exhaustive", "auto", "sequential"]
+Pair = tuple[int, int]
 
 
 def sequential_pairs(count: int, overlap: int) -> list[Pair]:
@@ -108,3 +107,14 @@ def count_agreements(descriptors: Sequence[NDArray[np.generic]]) -> NDArray[np.i
         distinct = best < SQUARED_RATIO * distances.min(axis=2)  # [S, J]
         agreements[i, i + 1 :] = np.count_nonzero(mutual & distinct.T, axis=1)
     return agreements
+
+
+def select_pairs(names: Sequence[str], options: ColmapOptions) -> list[tuple[str, str]]:
+    """The pairs of image names to match; for ``auto`` and ``lowres`` all pairs, from which features
+    select later."""
+    if options.pairs == "sequential":
+        return [
+            (names[first], names[second])
+            for first, second in sequential_pairs(len(names), options.overlap)
+        ]
+    return list(combinations(names, 2))

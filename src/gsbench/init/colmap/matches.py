@@ -1,5 +1,4 @@
-"""COLMAP's SIFT: extraction, and matching on several cores by processes instead of threads. Run it
-isolated.
+"""COLMAP's matching of SIFT features, on several cores by processes instead of threads.
 
 COLMAP's matcher is not safe with two threads in one process. Its nearest-neighbour search (faiss)
 calls a BLAS that pycolmap's wheels build for one thread and without locks. Two simultaneous calls
@@ -19,61 +18,14 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pycolmap
 
 from gsbench.init.colmap.database import image_ids, rename_images, write_pairs
-from gsbench.init.colmap.reconstruct import verification_options
+from gsbench.init.colmap.geometry import verification_options
+from gsbench.init.options import SiftOptions
 from gsbench.logs import Progress
 from gsbench.system.isolate import run_with_progress
-
-if TYPE_CHECKING:
-    from gsbench.init.sfm import Sfm
-
-# COLMAP reports no progress within a call, so it is called for a few images at a time
-IMAGES_PER_CALL = 8
-IMAGES_PER_THREAD = 2  # least number in a call, so that all threads have work
-
-
-def extract_sift(
-    database: Path,
-    images: Path,
-    names: Sequence[str],
-    sift: Sfm,
-    threads: int,
-    progress: Progress,
-    masks: Path | None = None,
-) -> None:
-    """Detect and describe keypoints in the database's images ``names``.
-
-    ``masks`` is a folder of masks, named as COLMAP expects. Black pixels get no keypoints.
-    """
-    options = pycolmap.FeatureExtractionOptions()
-    options.use_gpu = False
-    options.num_threads = threads
-    options.max_image_size = sift.max_image_size
-    options.sift.max_num_features = sift.max_num_features
-    options.sift.peak_threshold = sift.peak_threshold
-    options.sift.edge_threshold = sift.edge_threshold
-    options.sift.first_octave = sift.first_octave
-    reading = pycolmap.ImageReaderOptions()
-    if masks is not None:
-        reading.mask_path = masks
-    progress("extract", 0, len(names))
-    batch_size = max(IMAGES_PER_CALL, IMAGES_PER_THREAD * threads)
-    for start in range(0, len(names), batch_size):
-        batch = list(names[start : start + batch_size])
-        pycolmap.extract_features(
-            database,
-            images,
-            image_names=batch,
-            reader_options=reading,
-            extraction_options=options,
-            device=pycolmap.Device.cpu,
-        )
-        progress("extract", start + len(batch), len(names))
-
 
 MAX_BLOCK = 16  # images on each side of a part; with more, progress would be reported too rarely
 PARTS_PER_PROCESS = 6  # enough that processes end at about the same time
@@ -97,11 +49,15 @@ class MatchingJob:
     template: Path
     result: Path
     parts: list[list[IdPair]]
-    sift: Sfm
+    sift: SiftOptions
 
 
 def match_sift(
-    database: Path, pairs: Sequence[tuple[str, str]], sift: Sfm, processes: int, progress: Progress
+    database: Path,
+    pairs: Sequence[tuple[str, str]],
+    sift: SiftOptions,
+    processes: int,
+    progress: Progress,
 ) -> None:
     """Match ``pairs`` of image names and verify them.
 

@@ -1,0 +1,116 @@
+"""Similarity transforms between two sets of camera poses."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsbench.scene.types import Array
+
+RANSAC_TRIALS = 500
+# 2.5 sigma, as in least median of squares; the median absolute deviation times 1.4826 estimates
+# sigma.
+INLIER_FACTOR = 2.5 * 1.4826
+# second over first singular value of the centres: below it they count as collinear
+COLLINEAR_RATIO = 1e-2
+
+
+@dataclass(frozen=True, eq=False)
+class Similarity:
+    """``x_target = scale * rotation @ x_source + translation``."""
+
+    scale: float
+    rotation: Array  # [3, 3]
+    translation: Array  # [3]
+
+    def __call__(self, points: Array) -> Array:
+        """Transform ``points`` [N, 3]."""
+        return self.scale * points @ self.rotation.T + self.translation
+
+
+def fit_similarity(source: Array, target: Array) -> Similarity:
+    """The least-squares similarity from ``source`` to ``target`` [N, 3] (Umeyama 1991, eqs. 40 to
+    42)."""
+    source_mean, target_mean = source.mean(axis=0), target.mean(axis=0)
+    source_centered, target_centered = source - source_mean, target - target_mean
+    u, singular_values, vt = np.linalg.svd(target_centered.T @ source_centered / len(source))
+    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
+    rotation = u @ np.diag(signs) @ vt
+    scale = float(singular_values @ signs / np.mean(np.sum(source_centered**2, axis=1)))
+    return Similarity(scale, rotation, target_mean - scale * rotation @ source_mean)
+
+
+def align_poses(
+    source_centers: Array, source_rotations: Array, target_centers: Array, target_rotations: Array
+) -> Similarity:
+    """The similarity that maps the cameras of one model to those of another, robust to wrong
+    cameras.
+
+    Centres are [N, 3] and rotations (world to camera) [N, 3, 3], in the same order of cameras, N >=
+    3. The similarity is fitted to the centres, by the least median of squared residuals over random
+    triples, then by least squares over the inliers. Collinear centres leave the rotation about
+    their line open; then the rotation comes from the cameras' orientations. Raises ``ValueError``
+    if the centres of one model coincide.
+    """
+    if len(source_centers) < 3:
+        raise ValueError(f"a similarity needs at least 3 common cameras, got {len(source_centers)}")
+    spreads = [
+        np.linalg.svd(centers - centers.mean(axis=0), compute_uv=False)
+        for centers in (source_centers, target_centers)
+    ]
+    if min(spread[0] for spread in spreads) <= 1e-12:
+        raise ValueError("a similarity needs cameras at different places")
+    if min(spread[1] / spread[0] for spread in spreads) < COLLINEAR_RATIO:
+        return _fit_with_orientations(
+            source_centers, source_rotations, target_centers, target_rotations
+        )
+    best = _least_median_fit(source_centers, target_centers)
+    residuals = np.linalg.norm(best(source_centers) - target_centers, axis=1)  # [N]
+    inliers = residuals <= max(
+        INLIER_FACTOR * float(np.median(residuals)), 1e-9 * float(spreads[1][0])
+    )
+    # At least three cameras are inliers: residuals up to the median and, of three cameras, the
+    # third one's too, since a least-squares fit leaves residuals that add up to 0.
+    return fit_similarity(source_centers[inliers], target_centers[inliers])
+
+
+def rotation_angles(first: Array, second: Array) -> Array:
+    """Angles [N] in degrees between rotations [N, 3, 3]."""
+    # The chord |A - B| = 2 sqrt(2) sin(angle / 2) is accurate near an angle of 0, the trace formula
+    # is not.
+    chords = np.linalg.norm(first - second, axis=(1, 2))  # Frobenius norm
+    return np.degrees(2 * np.arcsin(np.clip(chords / (2 * np.sqrt(2)), 0.0, 1.0)))
+
+
+def transformed_rotations(similarity: Similarity, rotations: Array) -> Array:
+    """World-to-camera rotations [N, 3, 3] of the same cameras after ``similarity`` has transformed
+    the world."""
+    return rotations @ similarity.rotation.T
+
+
+def _least_median_fit(source: Array, target: Array) -> Similarity:
+    generator = np.random.default_rng(0)  # a fixed seed: the triples only guide the search
+    best = fit_similarity(source, target)
+    best_median = float(np.median(np.linalg.norm(best(source) - target, axis=1)))
+    for _ in range(RANSAC_TRIALS):
+        triple = generator.choice(len(source), 3, replace=False)
+        spread = np.linalg.svd(source[triple] - source[triple].mean(axis=0), compute_uv=False)
+        if spread[1] <= COLLINEAR_RATIO * spread[0]:
+            continue
+        candidate = fit_similarity(source[triple], target[triple])
+        median = float(np.median(np.linalg.norm(candidate(source) - target, axis=1)))
+        if median < best_median:
+            best, best_median = candidate, median
+    return best
+
+
+def _fit_with_orientations(
+    source: Array, source_rotations: Array, target: Array, target_rotations: Array
+) -> Similarity:
+    """Fit the rotation to the cameras' orientations (chordal mean), then scale and translation to
+    the centres."""
+    u, _, vt = np.linalg.svd((np.swapaxes(target_rotations, 1, 2) @ source_rotations).sum(axis=0))
+    rotation = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+    rotated = (source - source.mean(axis=0)) @ rotation.T
+    centered = target - target.mean(axis=0)
+    scale = float(np.linalg.norm(centered) / np.linalg.norm(rotated))
+    return Similarity(scale, rotation, target.mean(axis=0) - scale * rotation @ source.mean(axis=0))
