@@ -1,5 +1,4 @@
-"""The catalogue of public data sets (``catalog.yaml``): archives of scenes, and the files of a
-scene to fetch."""
+"""The catalogue of public data sets (``catalog.yaml``), and the files that a scene needs."""
 
 import os
 import re
@@ -51,8 +50,7 @@ class PublicDataset:
 
 @dataclass(frozen=True)
 class SceneFiles:
-    """Folders that conf/scene/<scene>.yaml needs: ``parts`` in ``folder``, which is below the data
-    folder."""
+    """Folders that conf/scene/<scene>.yaml needs: ``parts`` in ``folder`` below the data folder."""
 
     scene: str
     folder: str
@@ -100,8 +98,7 @@ def _catalogued_scenes() -> dict[str, tuple[str, str]]:
 
 
 def how_to_get(scenes: Iterable[tuple[str, Path]]) -> str:
-    """Advice for missing scenes, given as (scene, folder): the commands that fetch those in the
-    catalogue."""
+    """Advice for missing (scene, folder): the commands that fetch those in the catalogue."""
     wanted = defaultdict(list)
     for scene, folder in scenes:
         dataset, catalogued = _catalogued_scenes().get(scene, ("", ""))

@@ -30,8 +30,7 @@ FAST_PNG = 1  # zlib level; the files are deleted after the training
 def write_training_views(
     folder: Path, views: Sequence[View], cloud: PointCloud, normalization: Normalization = IDENTITY
 ) -> None:
-    """Write ``views`` as a COLMAP folder: PNG files, PINHOLE cameras of their size, and ``cloud``
-    as its points.
+    """Write ``views`` as a COLMAP folder: PNG files, PINHOLE cameras, and ``cloud`` as points.
 
     ``normalization`` is undone: programs get the coordinates in which the scene was given.
 
@@ -50,8 +49,7 @@ def write_training_views(
 def write_test_cameras(
     folder: Path, views: Sequence[View], normalization: Normalization = IDENTITY
 ) -> None:
-    """Write the cameras of ``views``, without images, as a COLMAP model and as nerfstudio's
-    ``transforms.json``.
+    """Write the cameras of ``views`` as a COLMAP model and nerfstudio's ``transforms.json``.
 
     Renders are expected under the names in these files.
     """
@@ -78,8 +76,7 @@ def _frame(name: str, camera: Camera) -> dict[str, Any]:
 def collect_model(
     output: Path, pattern: str, target: Path, normalization: Normalization = IDENTITY
 ) -> Gaussians:
-    """Copy the one file below ``output`` that fits ``pattern`` to ``target``, normalised; return
-    its Gaussians.
+    """Copy the one file that fits ``pattern`` to ``target``, normalised; return its Gaussians.
 
     Raises `TrainingError` if there is not exactly one such file, or if it is not a valid 3DGS PLY.
     """
@@ -103,8 +100,7 @@ def collect_model(
 def collect_renders(
     output: Path, pattern: str, by_order: bool, views: Sequence[View], target: Path
 ) -> None:
-    """Write the pictures below ``output`` that fit ``pattern`` to ``target``, as PNG files named
-    after ``views``.
+    """Write the pictures that fit ``pattern`` to ``target``, as PNG files named after ``views``.
 
     Raises `TrainingError` if a view has no or several pictures, or if a picture is damaged or has
     another size.
@@ -125,8 +121,7 @@ def collect_renders(
             if (width, height) != (camera.width, camera.height):
                 raise InputError(
                     f"{output / matching.pairs[name]} is {width}x{height} px and the view "
-                    f"{camera.width}x"
-                    f"{camera.height}: sizes are never changed here"
+                    f"{camera.width}x{camera.height}: sizes are never changed here"
                 )
             Image.fromarray(picture).save(target / name)
     except InputError as error:
@@ -134,8 +129,7 @@ def collect_renders(
 
 
 def _files(output: Path, pattern: str) -> list[Path]:
-    """The files that fit ``pattern``, sorted; raises `TrainingError` if there are none, naming the
-    existing files."""
+    """The files that fit ``pattern``, sorted; raises `TrainingError` naming others if none."""
     files = sorted(path for path in output.glob(pattern) if path.is_file())
     if not files:
         existing = sorted(path for path in output.rglob("*") if path.is_file())

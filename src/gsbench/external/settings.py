@@ -41,8 +41,7 @@ Command = str | Sequence[str]  # one text is split as a shell would, but no shel
 
 
 def split_command(command: Command, key: str) -> list[str]:
-    """A command's words. Raises InputError, naming the setting ``key``, for an empty command or
-    open quotes."""
+    """A command's words. Raises InputError, naming the setting ``key``, if empty or not closed."""
     try:
         words = (
             shlex.split(command) if isinstance(command, str) else [str(word) for word in command]
@@ -69,8 +68,7 @@ def placeholders_in(texts: Iterable[str]) -> set[str]:
 
 
 def fill_placeholders(text: str, values: Mapping[str, object], key: str) -> str:
-    """Replace every placeholder in ``text`` once. Raises InputError, naming ``key``, for an unknown
-    placeholder."""
+    """Replace each placeholder in ``text`` once. Raises InputError, naming ``key``, if unknown."""
 
     def value(match: re.Match[str]) -> str:
         name = match[1]
@@ -111,8 +109,7 @@ def check_pattern(pattern: str) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class External:
-    """A program that trains on a folder of training views and writes a model, or renders of the
-    test views.
+    """A program that trains on a folder of views and writes a model, or renders of the test views.
 
     ``command`` runs without a shell. ``{data}``, ``{output}``, the other `PLACEHOLDERS` and the
     names of ``options`` are replaced in ``command``, ``result`` and ``environment``. ``result`` is
@@ -160,8 +157,7 @@ class External:
             ):
                 raise InputError(
                     f"densify.options.{name}: an option is one value with a name of its own, none "
-                    "of "
-                    f"{', '.join(PLACEHOLDERS)}"
+                    f"of {', '.join(PLACEHOLDERS)}"
                 )
         check_pattern(
             fill_placeholders(
@@ -204,7 +200,6 @@ class External:
         if program_path is None:
             raise InputError(
                 f"densify.command: this machine has no program {self.program!r}: install it "
-                "(docs/other_trainers.md "
-                "says how), or give its path"
+                "(docs/other_trainers.md says how), or give its path"
             )
         return str(Path(program_path).absolute())

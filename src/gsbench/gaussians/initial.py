@@ -17,8 +17,7 @@ INITIAL_OPACITY = 0.1
 def gaussians_from_cloud(
     points: NDArray[np.float64], colors: NDArray[np.uint8], device: torch.device | str = "cpu"
 ) -> Gaussians:
-    """Make one isotropic Gaussian at each of ``points`` [P, 3] with ``colors`` [P, 3] (0 to 255),
-    float32.
+    """Make one isotropic Gaussian at each of ``points`` [P, 3] of ``colors`` [P, 3] (0 to 255).
 
     The standard deviation is the root of the mean *squared* distance to the 3 nearest other points
     (simple-knn of 3DGS). Raises InputError if there are fewer than 4 points or points that are not

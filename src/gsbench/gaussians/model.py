@@ -15,8 +15,7 @@ NUM_SH_REST = (MAX_SH_DEGREE + 1) ** 2 - 1  # 15 coefficients per channel beside
 
 @dataclass
 class Gaussians:
-    """N Gaussians as raw parameters (before activation), all of one dtype (float32 or float64) and
-    on one device.
+    """N Gaussians as raw parameters (before activation), of one dtype and on one device.
 
     | field          | shape      | activation                                   |
     |----------------|------------|----------------------------------------------|
@@ -65,8 +64,7 @@ class Gaussians:
 
     @property
     def rotations(self) -> Tensor:
-        """Rotation matrices of the normalised quaternions, [N, 3, 3]; the columns are the axes of
-        the ellipsoids."""
+        """Rotation matrices, [N, 3, 3]; the columns are the axes of the ellipsoids."""
         return quaternion_to_matrix(self.quaternions)
 
     def tensors(self) -> dict[str, Tensor]:
@@ -93,8 +91,7 @@ class Gaussians:
 
 
 def quaternion_to_matrix(quaternions: Tensor) -> Tensor:
-    """Rotation matrices [N, 3, 3] of quaternions [N, 4] (w, x, y, z), which need not be
-    normalised."""
+    """Rotation matrices [N, 3, 3] of quaternions [N, 4] (w, x, y, z) of any length."""
     w, x, y, z = torch.nn.functional.normalize(quaternions, dim=-1).unbind(-1)  # each [N]
     rows = [
         torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
@@ -125,8 +122,7 @@ C3 = (
 
 
 def basis(directions: Tensor, degree: int) -> Tensor:
-    """Real spherical harmonics up to ``degree`` at unit ``directions`` [N, 3], as [N, (degree +
-    1)^2]."""
+    """Real spherical harmonics to ``degree`` at unit ``directions`` [N, 3]: [N, (degree + 1)^2]."""
     x, y, z = directions.unbind(-1)  # each [N]
     terms = [torch.full_like(x, C0)]
     if degree >= 1:
@@ -153,8 +149,7 @@ def basis(directions: Tensor, degree: int) -> Tensor:
 
 
 def colors(sh_dc: Tensor, sh_rest: Tensor, directions: Tensor, degree: int) -> Tensor:
-    """RGB [N, 3], at least 0, of coefficients [N, 3] and [N, 15, 3] in view ``directions`` [N, 3]
-    of unit length."""
+    """RGB [N, 3] >= 0 of coefficients [N, 3] and [N, 15, 3] in unit ``directions`` [N, 3]."""
     values = basis(directions, degree)  # [N, K]
     rgb = values[:, :1] * sh_dc
     if degree > 0:

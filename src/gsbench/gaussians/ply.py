@@ -54,8 +54,7 @@ SIZES |= {"float": 4, "float32": 4, "double": 8, "float64": 8}  # bytes; all oth
 
 
 def write_ply(gaussians: Gaussians, path: Path, normalization: Normalization = IDENTITY) -> None:
-    """Write raw parameters as binary little-endian float32 in 3DGS's column order, with zero
-    normals; atomic.
+    """Write raw parameters as binary float32 in 3DGS's column order, with zero normals; atomic.
 
     ``normalization`` is undone. Positions far from the origin are written as float64, because
     float32 has steps of half a unit at UTM coordinates. Others stay float32, which every viewer
@@ -92,16 +91,14 @@ def write_ply(gaussians: Gaussians, path: Path, normalization: Normalization = I
 
 
 def check_ply(path: Path) -> None:
-    """Raise InputError if a file cannot be a PLY of Gaussians, judged only by its header and
-    length."""
+    """Raise InputError if header and length say that a file is no PLY of Gaussians."""
     with _checked(path):
         pass
 
 
 @contextmanager
 def _checked(path: Path) -> Iterator[None]:
-    """Check the length of a file; turn every error that damage can cause into an InputError that
-    names the file."""
+    """Check a file's length; turn every error from damage into an InputError that names it."""
     try:
         _check_length(path)
         yield
@@ -138,8 +135,7 @@ def _check_length(path: Path) -> None:
 
 
 def _with_finite_opacities(vertices: NDArray[Any], path: Path) -> NDArray[Any]:
-    """Replace infinite logits, which are opacities of exactly 0 and 1 in other programs, by
-    `MAX_LOGIT`."""
+    """Replace infinite logits, other programs' opacities of exactly 0 and 1, by `MAX_LOGIT`."""
     logits = vertices["opacity"]
     infinite = np.isinf(logits) if logits.dtype.kind == "f" else np.zeros(len(logits), bool)
     if not infinite.any():
@@ -164,8 +160,7 @@ def _check_finite(column: NDArray[Any], name: str, path: Path) -> None:
     if len(bad):
         raise InputError(
             f"{path}: {name} is not a finite number everywhere: it is {column[bad[0]]} in row "
-            f"{bad[0]} and in "
-            f"{len(bad) - 1} more: export the model again"
+            f"{bad[0]} and in {len(bad) - 1} more: export the model again"
         )
 
 
@@ -222,8 +217,7 @@ def read_ply(
     if present_rest != set(rest) or len(rest) not in REST_COUNTS:
         raise InputError(
             f"{path}: not a 3DGS PLY; its harmonics must be f_rest_0 to 8, to 23 or to 44 (degree "
-            "1 to 3), or none; "
-            f"it has {len(rest)}"
+            f"1 to 3), or none; it has {len(rest)}"
             + (f", with {min(present_rest - set(rest))}" if present_rest != set(rest) else "")
         )
     if missing or len(vertices) == 0:

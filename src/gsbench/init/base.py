@@ -177,8 +177,7 @@ class Preparation:
 
 
 class Initializer(ABC):
-    """Makes cameras and an initial point cloud for a capture. Subclasses are dataclasses whose
-    fields are the settings.
+    """Makes cameras and an initial cloud. Subclasses are dataclasses; their fields are settings.
 
     Examples:
         If only the points are new, derive from `PlacedCloud`. Its ``run`` adds cameras, report and
@@ -207,8 +206,7 @@ class Initializer(ABC):
     random_points: ClassVar[bool] = False
 
     def needs_reference(self, capture: Capture) -> bool:
-        """Return whether `run` needs a ``reference`` model for this capture because it came without
-        cameras."""
+        """Return whether `run` needs a ``reference``, since the capture came without cameras."""
         return False
 
     def content(self) -> str | None:
@@ -224,8 +222,7 @@ class Initializer(ABC):
         reference: Path | None = None,
         work_dir: Path | None = None,
     ) -> InitReport:
-        """Write the model to `MODEL_FOLDER`, the report to `REPORT_FILE` and a picture to
-        `PICTURE_FILE`.
+        """Write a model to `MODEL_FOLDER`, a report to `REPORT_FILE`, a picture to `PICTURE_FILE`.
 
         All are below ``output_dir``. The cameras have the sizes of the files in ``capture.images``.
         ``reference`` is a COLMAP model of the same files whose cameras replace those of the

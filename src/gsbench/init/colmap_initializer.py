@@ -48,8 +48,7 @@ class ColmapInitializer(ColmapOptions):
 
     @abstractmethod
     def fill_database(self, task: DatabaseTask, progress: Progress, timer: Timer) -> dict[str, int]:
-        """Write features, matches and verified geometries, in the isolated process. Returns counts
-        for the report."""
+        """Write features, matches and verified geometries; returns counts for the report."""
 
     def packages(self) -> tuple[str, ...]:
         """The packages whose versions are in the report."""
@@ -91,8 +90,7 @@ class ColmapInitializer(ColmapOptions):
         return report
 
     def check(self, capture: Capture, reference: Path | None) -> None:
-        """Raise ``InputError``, before any work, if this capture cannot be initialised with these
-        settings."""
+        """Raise ``InputError``, before any work, if this capture does not suit these settings."""
         if len(capture.image_names) < MIN_IMAGES:
             raise InputError(
                 f"scene {capture.name} has {counted(len(capture.image_names), 'image')}: "
@@ -112,8 +110,7 @@ class ColmapInitializer(ColmapOptions):
         return Preparation()
 
     def extend(self, model: pycolmap.Reconstruction, report: InitReport) -> InitReport:
-        """Change the model before it is written; returns its report. Runs in the isolated
-        process."""
+        """Change the model before it is written; returns its report. Runs isolated."""
         return report
 
 

@@ -1,5 +1,4 @@
-"""Deep image matching: features and matches from networks, geometry from COLMAP. kornia's SIFT
-takes the same path.
+"""Deep image matching: features and matches from networks or kornia's SIFT, geometry from COLMAP.
 
 The tables below list the weights files of the extractors and of LightGlue.
 """
@@ -81,8 +80,7 @@ NMS_RADII = {"superpoint": 3, "aliked": 2, "disk": 2}  # px
 
 @dataclass(frozen=True, kw_only=True)
 class FeatureInitializer(FeatureOptions, ColmapInitializer):
-    """Base of initialisers with features and matches from outside COLMAP, which verifies and maps
-    or triangulates them.
+    """Base of initialisers whose features and matches come from outside COLMAP.
 
     Features and matches are stored in the ``work_dir`` of `run`, by image and by pair, so an
     interrupted run continues there.
@@ -142,8 +140,7 @@ class FeatureInitializer(FeatureOptions, ColmapInitializer):
 
 @dataclass(frozen=True, kw_only=True)
 class Dim(FeatureInitializer):
-    """Deep image matching: SuperPoint, ALIKED or DISK features, matched by LightGlue or mutual
-    nearest neighbours."""
+    """Deep image matching: SuperPoint, ALIKED or DISK; LightGlue or mutual nearest neighbours."""
 
     name: ClassVar[str] = "dim"
 
@@ -214,8 +211,7 @@ class Dim(FeatureInitializer):
 
 @dataclass(frozen=True, kw_only=True)
 class SiftKornia(FeatureInitializer):
-    """kornia's SIFT, which needs no weights, through the same steps as `Dim`. It is a substitute,
-    not the same."""
+    """kornia's SIFT, without weights, in the same steps as `Dim`: a substitute, not the same."""
 
     name: ClassVar[str] = "sift_kornia"
 

@@ -23,8 +23,7 @@ CAMERA_COLOR = (214, 39, 40)
 
 
 def draw_cloud(model: pycolmap.Reconstruction, path: Path, title: str) -> None:
-    """Draw a model from above into the PNG ``path``: points in their colours, cameras in red with
-    lines of sight."""
+    """Draw a model from above into a PNG: points, and cameras with lines of sight in red."""
     points, colors = model_points(model)
     if len(points) > MAX_POINTS:
         chosen = np.random.default_rng(0).permutation(len(points))[:MAX_POINTS]

@@ -1,5 +1,4 @@
-"""Initialisers that keep the reference cameras and take their points from the data set, at random,
-or from a file.
+"""Initialisers that keep the reference's cameras and take points from elsewhere.
 
 A file holds points of any origin (laser scans, multi-view stereo), or a trained model.
 """
@@ -45,8 +44,7 @@ if TYPE_CHECKING:
 
 
 class GivenCameras(Initializer):
-    """Base of initialisers that keep the reference's cameras and only make points. Subclasses are
-    dataclasses."""
+    """Base of initialisers that keep the reference's cameras and make points, as dataclasses."""
 
     def __post_init__(self) -> None:
         check_settings(self, "init")
@@ -59,8 +57,7 @@ class GivenCameras(Initializer):
         reference: Path | None = None,
         work_dir: Path | None = None,
     ) -> InitReport:
-        """Write model and report; ``work_dir`` is not used. Raises ``InputError`` if there are no
-        cameras."""
+        """Write model and report, without ``work_dir``. Raises ``InputError`` without cameras."""
         if reference is None and capture.model is None:
             raise InputError(
                 f"init={self.name} needs cameras and scene {capture.name} came without: make them "
@@ -107,8 +104,7 @@ def _build(job: tuple[GivenCameras, Capture, Path, Path | None], progress: Progr
 
 @dataclass(frozen=True, kw_only=True)
 class Dataset(GivenCameras):
-    """Uses the capture's own model, restricted to the selected images, with cameras scaled to the
-    files.
+    """Uses the capture's own model, restricted to the selected images and fitted to their files.
 
     ``points_from=train`` keeps the points that at least two training views see, in the colours of
     those views.
@@ -141,8 +137,7 @@ class Dataset(GivenCameras):
 
 
 class PlacedCloud(GivenCameras):
-    """Base of initialisers that put a new cloud under the reference's cameras. Subclasses are
-    dataclasses."""
+    """Base of initialisers that put a new cloud under the reference's cameras, as dataclasses."""
 
     def needs_reference(self, capture: Capture) -> bool:
         """Return whether `run` needs a ``reference`` because the capture came without cameras."""
@@ -166,8 +161,7 @@ class PlacedCloud(GivenCameras):
 
 @dataclass(frozen=True, kw_only=True)
 class Random(PlacedCloud):
-    """Uniform points and colours in a cube around the mean of the training cameras, under the
-    reference cameras.
+    """Uniform points and colours in a cube around the mean of the reference's training cameras.
 
     ``size`` is half the cube's edge in scene extents; 3 and 100,000 points are gsplat's defaults
     for a random start.
@@ -219,9 +213,8 @@ class Carved(Random):
         if not kept.any():
             raise InputError(
                 f"init=carved: of {self.count} points none is in view of {self.seen_by} training "
-                "cameras of scene "
-                f"{capture.name}; take more (init.count), a smaller box (init.size) or fewer "
-                "cameras (init.seen_by)"
+                f"cameras of scene {capture.name}; take more (init.count), a smaller box "
+                "(init.size) or fewer cameras (init.seen_by)"
             )
         return PointCloud(cloud.points[kept], cloud.colors[kept])
 
@@ -229,8 +222,7 @@ class Carved(Random):
 def points_in_view(
     points: Array, name: str, model: pycolmap.Reconstruction
 ) -> tuple[NDArray[np.int64], Array, Array]:
-    """Indices [V], pixels [V, 2] and distances [V] of the ``points`` [P, 3] that project into the
-    image ``name``.
+    """Indices [V], pixels [V, 2] and distances [V] of the ``points`` [P, 3] in view of ``name``.
 
     All three are empty if the image has no pose in the model. Occlusion is ignored.
     """
@@ -259,8 +251,7 @@ TEXT_SUFFIXES = (".xyz", ".txt", ".csv", ".pts")
 
 
 def read_points(path: Path) -> tuple[Array, NDArray[np.uint8] | None]:
-    """Points [P, 3] float64 and their colours [P, 3], None if the file has no colours; the suffix
-    tells the format.
+    """Points [P, 3] float64 and colours [P, 3], or None without; the suffix tells the format.
 
     A ``.ply`` file, text or binary, has vertices with x, y, z in any order and type, and colours as
     whole numbers or in [0, 1]. A text file has the columns x, y, z, optionally followed by red,
@@ -324,8 +315,7 @@ def _columns(table: NDArray[np.generic]) -> tuple[Array, NDArray[np.generic] | N
 
 
 def _eight_bits(colors: NDArray[np.generic]) -> NDArray[np.uint8]:
-    """Colours from 0 to 255: 16-bit values are divided by 257, floats in [0, 1] multiplied by
-    255."""
+    """Colours from 0 to 255: 16-bit values are divided by 257, floats in [0, 1] times 255."""
     values = colors.astype(np.float64)
     if colors.dtype.kind == "f" and values.max() <= 1.0:
         values = values * 255
@@ -392,8 +382,7 @@ class Points(CloudFromFile):
 def seen_colors(
     points: Array, capture: Capture, model: pycolmap.Reconstruction
 ) -> NDArray[np.int16]:
-    """Colours [P, 3] of ``points`` in the photograph of the nearest training camera that has them
-    in view, else -1.
+    """Colours [P, 3] of ``points`` from the nearest training camera that has them in view, else -1.
 
     Occlusion is ignored; the nearest camera is the least likely to be occluded. Pixels that a mask
     ignores give no colour.

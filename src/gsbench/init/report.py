@@ -43,8 +43,7 @@ def make_report(
     warnings: Sequence[str] = (),
     **further: Any,
 ) -> InitReport:
-    """The report on ``model``, with the installed versions of ``packages`` and ``further`` fields
-    of `InitReport`."""
+    """The report on ``model``, with versions of ``packages`` and further fields."""
     placed = set(poses_by_name(model))
     observed = any(point.track.length() > 0 for point in model.points3D.values())
     report = InitReport(
@@ -67,8 +66,7 @@ def make_report(
 
 
 def write_result(model: pycolmap.Reconstruction, report: InitReport, output_dir: Path) -> None:
-    """Write the model, the report and the picture where `gsbench.init.base.Initializer` promises
-    them."""
+    """Write model, report and picture where `gsbench.init.base.Initializer` promises them."""
     save_reconstruction(model, output_dir / MODEL_FOLDER)
     title = (
         f"{report.init}, {report.poses} poses: {report.num_points:,} points, "
@@ -79,8 +77,7 @@ def write_result(model: pycolmap.Reconstruction, report: InitReport, output_dir:
 
 
 def find_warnings(report: InitReport, model: pycolmap.Reconstruction) -> tuple[str, ...]:
-    """List the reasons to doubt a model, one line each. A model can be wrong although all its
-    images have poses."""
+    """List the reasons to doubt a model: it can be wrong although all its images have poses."""
     warnings = []
     if report.num_registered < REGISTERED_SHARE * report.num_images:
         missing = ", ".join(report.unregistered[:5]) + (
@@ -88,8 +85,7 @@ def find_warnings(report: InitReport, model: pycolmap.Reconstruction) -> tuple[s
         )
         warnings.append(
             f"only {report.num_registered} of {report.num_images} images have a pose (missing: "
-            f"{missing}): "
-            "the other photos are not used; more overlap or texture would help"
+            f"{missing}): the other photos are not used; more overlap or texture would help"
         )
     if report.num_points < FEW_POINTS:
         warnings.append(f"only {report.num_points} points: training starts from next to nothing")
@@ -104,10 +100,9 @@ def find_warnings(report: InitReport, model: pycolmap.Reconstruction) -> tuple[s
         truth = "true" if poses.exact else "reference"
         if poses.rotation_mean_deg > ROTATION_WARNING_DEG:
             warnings.append(
-                f"the cameras are turned {poses.rotation_mean_deg:.1f} degrees against the "
-                f"{truth} ones on average: "
-                "the model is wrong although its images are placed (views at most 7.5 degrees "
-                "apart are safe)"
+                f"the cameras are turned {poses.rotation_mean_deg:.1f} degrees against the {truth} "
+                "ones on average: the model is wrong although its images are placed (views at most "
+                "7.5 degrees apart are safe)"
             )
         if poses.center_rmse_relative is not None and poses.center_rmse_relative > CENTER_WARNING:
             warnings.append(
@@ -121,7 +116,6 @@ def find_warnings(report: InitReport, model: pycolmap.Reconstruction) -> tuple[s
         if not FIELD_OF_VIEW_DEG[0] < view < FIELD_OF_VIEW_DEG[1]:
             warnings.append(
                 f"estimated focal length {camera.mean_focal_length():.0f} px (field of view "
-                f"{view:.0f} degrees) is "
-                "implausible: give init.focal_length in px"
+                f"{view:.0f} degrees) is implausible: give init.focal_length in px"
             )
     return tuple(warnings)

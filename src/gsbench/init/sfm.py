@@ -65,8 +65,7 @@ class Sfm(SiftOptions, ColmapInitializer):
 
 @dataclass(frozen=True, kw_only=True)
 class SfmDense(Sfm):
-    """`Sfm` with loose detection thresholds, for many more points: a substitute for deep image
-    matching."""
+    """`Sfm` with loose thresholds, for many more points: a substitute for deep image matching."""
 
     name: ClassVar[str] = "sfm_dense"
     is_own_reference: ClassVar[bool] = False
@@ -106,8 +105,7 @@ class Jittered(Sfm):
 
 
 def shifted_copies(points: Array, copies: int, shift: float, seed: int) -> Array:
-    """Shifted copies [copies P, 3] of ``points`` [P, 3]; each repetition holds all points in their
-    order."""
+    """Shifted copies [copies P, 3] of ``points`` [P, 3]; each repetition has all in their order."""
     from scipy.spatial import cKDTree  # takes a while to load
 
     distances, _ = cKDTree(points).query(

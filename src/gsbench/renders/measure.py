@@ -1,5 +1,4 @@
-"""The work of ``gsbench evaluate``: measuring renders of any program, and importing them into an
-experiment.
+"""The work of ``gsbench evaluate``: measuring renders of any program, and importing them.
 
 Renders are compared with the photographs of a trial, of a scene as a trial would see it, or of a
 folder. An imported trial has only metrics and pictures: no model, no times, and an unknown number
@@ -87,8 +86,7 @@ class ReferenceImages:
 
 @dataclass(frozen=True)
 class Destination:
-    """The trial that renders become: experiment, scene, arm (initialiser and densifier) and
-    seed."""
+    """The trial that renders become: experiment, scene, arm (initialiser, densifier), seed."""
 
     experiment: str
     scene: str
@@ -106,8 +104,7 @@ def measure_renders(options: argparse.Namespace, runs: Path) -> None:
 def _measure(
     options: argparse.Namespace, renders: Path, photographs: Path | None, runs: Path
 ) -> None:
-    """Measure the pictures in the folder ``renders``; ``photographs`` is used if the command names
-    none."""
+    """Measure the pictures in ``renders``; ``photographs`` serve if the command names none."""
     if options.truth is not None:
         truth = _reference_images(options, runs)
     elif photographs is not None:
@@ -147,8 +144,7 @@ def _measure(
 
 
 def _reference_images(options: argparse.Namespace, runs: Path) -> ReferenceImages:
-    """The photographs; those of a scene come from the trials of the experiment in ``--as``, if it
-    has any."""
+    """The photographs; those of a scene come from trials of the experiment in ``--as``, if any."""
     overrides = [
         word for word in options.settings if not word.startswith(("eval", f"{PERMISSIONS}="))
     ]
@@ -167,8 +163,7 @@ def _reference_images(options: argparse.Namespace, runs: Path) -> ReferenceImage
 
 
 def _evaluator(truth: ReferenceImages, protocol: str | None, settings: Sequence[str]) -> Evaluator:
-    """The evaluator with the settings of the photographs' trial or scene, unless the command gives
-    others."""
+    """The evaluator with the settings of the photographs' trial or scene, or with the command's."""
     allowed = typed_permissions([word for word in settings if word.startswith(f"{PERMISSIONS}=")])
     allow_modules(allowed)
     config: Mapping[str, Any] = truth.config
@@ -228,8 +223,7 @@ def _as_dict(
 
 
 def find_reference_images(place: str, settings: Sequence[str], runs: Path) -> ReferenceImages:
-    """The photographs of ``place``: a folder, a trial (folder or EXPERIMENT:SCENE:DENSIFY), or the
-    name of a scene.
+    """The photographs of a folder, a trial (folder or EXPERIMENT:SCENE:DENSIFY), or a scene.
 
     ``settings`` are overrides of the configuration. Raises `InputError` if ``place`` is none of
     these.
@@ -252,8 +246,7 @@ def find_reference_images(place: str, settings: Sequence[str], runs: Path) -> Re
 
 
 def reference_images_of(trial: TrialResult) -> ReferenceImages:
-    """The reference images of a finished trial, with the names and in the order of its own
-    evaluation."""
+    """The reference images of a finished trial, as its own evaluation names and orders them."""
     photographs = {view: trial.path / GROUND_TRUTH / png_name(view) for view in read_views(trial)}
     if trial.record.resolution is None or "data" not in trial.record.hashes:
         raise InputError(f"{trial.label} does not say what it was tested on: run this trial again")
@@ -361,18 +354,16 @@ def find_destination(
 
 
 def check_destination(destination: Destination, truth: ReferenceImages, runs: Path) -> None:
-    """Raise `InputError` if the experiment's trials of the scene were tested on other
-    photographs."""
+    """Raise `InputError` if the experiment tests the scene on other photographs."""
     for trial in _trials(runs / destination.experiment, destination.scene):
         conditions = trial.conditions
         size = "x".join(map(str, truth.resolution))
         if conditions["data"] != truth.data or conditions["resolution"] != size:
             raise InputError(
-                f"{destination.experiment} tests {destination.scene} on other photographs (such "
-                f"as {trial.label}, "
-                f"{conditions['resolution']} px) than {truth.what} ({size} px), so nothing could "
-                "be compared: give "
-                f"--truth {destination.experiment}:{destination.scene}:{trial.init}-{trial.densify}"
+                f"{destination.experiment} tests {destination.scene} on other photographs (such as "
+                f"{trial.label}, {conditions['resolution']} px) than {truth.what} ({size} px), so "
+                "nothing could be compared: give --truth "
+                f"{destination.experiment}:{destination.scene}:{trial.init}-{trial.densify}"
             )
 
 
@@ -404,8 +395,7 @@ def import_trial(
     if taken := [other for other in arm.glob(f"*{SEED}{destination.seed}") if other != folder]:
         raise InputError(
             f"seed {destination.seed} of {destination.init}-{destination.densify} on "
-            f"{destination.scene} is taken "
-            f"({taken[0]}): give another --seed, or remove that folder"
+            f"{destination.scene} is taken ({taken[0]}): give another --seed, or remove that folder"
         )
     for name, files in (
         (RENDERS, {png_name(pair.view): pair.picture for pair in pairs}),

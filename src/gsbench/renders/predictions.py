@@ -1,5 +1,4 @@
-"""Predictions of nerfbaselines: a folder, a .tar.gz, or the zip of a published result, with its
-names.
+"""Predictions of nerfbaselines: a folder, a .tar.gz, or the zip of a published result.
 
 ``color/`` has the renders and ``gt-color/`` the photographs, each as ``<name of the
 photograph>.png``, beside ``info.json`` (`save_predictions` of nerfbaselines 1.2). A published zip
@@ -26,8 +25,7 @@ CHUNK = 1 << 20
 
 @contextmanager
 def opened_renders(place: Path) -> Iterator[tuple[Path, Path | None]]:
-    """The folder of renders at ``place``, and that of photographs if nerfbaselines wrote them; an
-    archive is unpacked.
+    """The folders of renders and, from nerfbaselines, of photographs; an archive is unpacked.
 
     Raises InputError if ``place`` is neither a folder nor such an archive.
     """
@@ -58,8 +56,7 @@ def opened_renders(place: Path) -> Iterator[tuple[Path, Path | None]]:
 
 
 def _unpack(archive: Path, scratch: Path) -> None:
-    """Write the renders and photographs of an archive below ``scratch``; no other member is
-    read."""
+    """Write the renders and photographs of an archive below ``scratch``, and no other member."""
     if zipfile.is_zipfile(archive):
         with zipfile.ZipFile(archive) as packed:
             sizes = {
@@ -84,8 +81,7 @@ def _unpack(archive: Path, scratch: Path) -> None:
 
 
 def _wanted(archive: Path, sizes: dict[str, int]) -> dict[str, str]:
-    """The names of the members that are renders or photographs, with the places to write them
-    to."""
+    """The members that are renders or photographs, with the places to write them to."""
     home = _home(archive, list(sizes))
     wanted = {}
     for name in sizes:
@@ -104,14 +100,12 @@ def _wanted(archive: Path, sizes: dict[str, int]) -> dict[str, str]:
 
 
 def _home(archive: Path, names: Sequence[str]) -> str:
-    """The folder in the archive that has renders and photographs, with a slash at its end; "" for
-    the archive."""
+    """The folder in the archive that has both, with a slash at its end; "" for the archive."""
     both = sorted(_parents(names, RENDERED) & _parents(names, PHOTOGRAPHS))
     if len(both) != 1:
         raise InputError(
-            f"{archive} must have one folder with {RENDERED}/ and {PHOTOGRAPHS}/, as "
-            "nerfbaselines writes it, and has "
-            f"{len(both) or 'none'}"
+            f"{archive} must have one folder with {RENDERED}/ and {PHOTOGRAPHS}/, as nerfbaselines "
+            f"writes it, and has {len(both) or 'none'}"
         )
     return both[0]
 
@@ -123,8 +117,7 @@ def _parents(names: Sequence[str], folder: str) -> set[str]:
 
 
 def _write(source: IO[bytes], target: Path, size: int) -> None:
-    """Copy exactly ``size`` bytes; raises ValueError for a member that has more or fewer than the
-    archive says."""
+    """Copy exactly ``size`` bytes; raises ValueError for a member with more or fewer."""
     target.parent.mkdir(parents=True, exist_ok=True)
     written = 0
     with target.open("wb") as file:

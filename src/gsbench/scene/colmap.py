@@ -1,5 +1,4 @@
-"""Reading COLMAP models safely, fitting them to the image files, converting their cameras, and
-writing models."""
+"""Reading COLMAP models safely, fitting them to image files, and writing models."""
 
 import codecs
 import tempfile
@@ -25,8 +24,7 @@ MIN_TRACK = 2  # images that must see a 3D point, as in COLMAP
 
 
 def read_model(folder: Path) -> pycolmap.Reconstruction:
-    """Read a COLMAP model, binary or text, of the current (rigs, frames) or the older three-file
-    layout.
+    """Read a COLMAP model, binary or text, with rigs and frames or in the older three files.
 
     Raises `InputError`, one line, if it is missing or damaged.
     """
@@ -64,8 +62,7 @@ def _read(folder: Path) -> pycolmap.Reconstruction:
 
 
 def _normalize_quaternions(model: pycolmap.Reconstruction) -> None:
-    """Give the quaternions of rigs and frames unit length. COLMAP normalises only those of
-    images."""
+    """Give quaternions of rigs and frames unit length; COLMAP normalises only those of images."""
     for rig in model.rigs.values():
         for sensor, pose in rig.non_ref_sensors.items():
             if pose is not None and abs(pose.rotation.norm() - 1) > UNIT_TOLERANCE:
@@ -107,8 +104,7 @@ def normalize_capture(capture: Capture, folder: Path) -> Capture:
 def normalize_model(
     model: pycolmap.Reconstruction, normalization: Normalization, undo: bool = False
 ) -> None:
-    """Move ``model`` from the coordinates in which it was given to those of the training; ``undo``
-    moves it back."""
+    """Move ``model`` from given coordinates to those of the training; ``undo`` moves it back."""
     to_training = pycolmap.Sim3d(
         normalization.scale,
         pycolmap.Rotation3d(),
@@ -204,8 +200,7 @@ def plain_camera(camera: pycolmap.Camera) -> CameraModel:
 
 
 def pinhole_camera(camera: pycolmap.Camera, cam_from_world: pycolmap.Rigid3d) -> Camera:
-    """Convert a COLMAP camera and pose to a `Camera`; raises `InputError` if the camera is
-    distorted."""
+    """Convert a COLMAP camera and pose to a `Camera`; raises `InputError` if it is distorted."""
     plain = plain_camera(camera)
     if plain.distorted:
         raise InputError(
@@ -216,8 +211,7 @@ def pinhole_camera(camera: pycolmap.Camera, cam_from_world: pycolmap.Rigid3d) ->
 
 
 def reference_cameras(model: pycolmap.Reconstruction, names: Iterable[str]) -> list[Camera]:
-    """Cameras with the poses of the registered images ``names``; distortion and principal points
-    are ignored.
+    """Cameras with the poses of the images ``names``, without distortion or principal points.
 
     They tell where cameras stand and look. They are not for rendering.
     """
@@ -246,8 +240,7 @@ def write_model(
     text: bool = False,
     cloud: tuple[Array, NDArray[np.uint8]] | None = None,
 ) -> None:
-    """Write PINHOLE cameras with their poses as a COLMAP model; images with equal intrinsics share
-    one camera.
+    """Write PINHOLE cameras with their poses as a COLMAP model; equal intrinsics share a camera.
 
     ``cloud``, positions [P, 3] and colours [P, 3], becomes the model's points, without tracks. By
     default the model has no points.
@@ -267,8 +260,7 @@ def write_frames(
     text: bool = False,
     cloud: tuple[Array, NDArray[np.uint8]] | None = None,
 ) -> None:
-    """Write cameras of any camera model with their world-to-camera rotations [3, 3] and
-    translations [3].
+    """Write cameras of any model with world-to-camera rotations [3, 3] and translations [3].
 
     Images with equal intrinsics share one camera. ``cloud`` is as in `write_model`.
     """

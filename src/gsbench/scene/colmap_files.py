@@ -73,8 +73,7 @@ def model_files(folder: Path) -> list[Path]:
 
 
 def check_model(folder: Path) -> None:
-    """Raise `InputError`, one line, if a file of the model is truncated, has extra bytes, or has
-    impossible values."""
+    """Raise `InputError`, one line, for a file that is cut, too long or has impossible values."""
     checks = ModelChecks()
     for file in model_files(folder):  # in this order: images refer to cameras, points to images
         binary_record, text_record = _RECORDS[file.stem]
@@ -96,8 +95,7 @@ def check_model(folder: Path) -> None:
 def _walk_binary(
     file: Path, record: Callable[[bytes, int, ModelChecks], int], checks: ModelChecks
 ) -> None:
-    """Check a file of a count and records; ``record`` checks the one at an offset and returns the
-    offset after it."""
+    """Check a count and records; ``record`` checks one at an offset and returns the next offset."""
     data = file.read_bytes()
     (count,) = _COUNT.unpack_from(data)
     offset = _COUNT.size
@@ -166,8 +164,7 @@ DECIMAL_COMMA = re.compile(r"(?:^|(?<=\s))-?\d+,\d+(?=\s|$)", re.MULTILINE)
 def _walk_text(
     file: Path, record: Callable[[str, Lines, ModelChecks], None], checks: ModelChecks
 ) -> None:
-    """Check a file line by line, without comments; ``record`` gets a line and the lines after
-    it."""
+    """Check a file by lines, without comments; ``record`` gets a line and the lines after it."""
     text = without_byte_order_mark(file.read_bytes()).decode()
     lines = (line.strip() for line in text.split("\n") if not line.lstrip().startswith("#"))
     try:
@@ -182,16 +179,14 @@ def _walk_text(
 
 
 def text_names(folder: Path) -> dict[int, str]:
-    """The names of the images of the text model in ``folder`` by their ids, with the blanks that
-    they may contain."""
+    """The names of the images of a text model by id, with the blanks that they may contain."""
     checks = _NamesOnly()
     _walk_text(folder / "images.txt", _text_image, checks)
     return checks.names
 
 
 def count_images(folder: Path) -> int:
-    """The number of images with a pose in the model in ``folder``; raises `InputError` if it cannot
-    be read."""
+    """The number of posed images of the model in ``folder``; raises `InputError` if unreadable."""
     file = next(file for file in model_files(folder) if file.stem == "images")
     try:
         if file.suffix == ".txt":
@@ -267,8 +262,7 @@ MAX_POINT_ID = 2**64 - 2  # ids of 3D points are 64-bit
 
 
 class ModelChecks:
-    """Checks the records of a model one by one, cameras first; raises `InputError` for the first
-    impossible one."""
+    """Checks records one by one, cameras first; raises `InputError` for the first bad one."""
 
     def __init__(self) -> None:
         self._cameras: set[int] = set()

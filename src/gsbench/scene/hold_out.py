@@ -1,5 +1,4 @@
-"""Dividing photographs into training and test views by a rule or by lists, and the rest again for
-validation.
+"""Dividing photographs into training and test views, and the rest again for validation.
 
 Sectors need an order of cameras in which neighbours stand beside each other. Cameras that surround
 the scene are ordered by azimuth around its centre and up direction. Other cameras are ordered along
@@ -35,8 +34,7 @@ class Arrangement:
 
 
 def arrange_cameras(cameras: Sequence[Camera]) -> Arrangement:
-    """Order cameras by azimuth around the scene if they surround it, else along the principal axis
-    of their centres.
+    """Order cameras by azimuth if they surround the scene, else along their principal axis.
 
     The azimuths start at the first camera, or after a gap of more than 30 degrees.
     """
@@ -69,8 +67,7 @@ def arrange_cameras(cameras: Sequence[Camera]) -> Arrangement:
 
 
 def sector_range(count: int, sector: int, sectors: int, exactly: int | None = None) -> range:
-    """The positions of sector number ``sector`` when ``count`` ordered views are cut into
-    ``sectors`` contiguous ones.
+    """The positions of one of ``sectors`` contiguous parts of ``count`` ordered views.
 
     The sizes of sectors differ by at most one. With ``exactly``, only so many positions from the
     sector's start.
@@ -84,8 +81,7 @@ def sector_range(count: int, sector: int, sectors: int, exactly: int | None = No
 
 
 def along_principal_axis(centers: Array) -> Array:
-    """Coordinates [V] of camera centres [V, 3] on their principal axis, which points away from the
-    first camera."""
+    """Coordinates [V] of centres [V, 3] on their principal axis, away from the first camera."""
     offsets = centers - centers.mean(axis=0)
     _, _, axes = np.linalg.svd(offsets, full_matrices=False)
     coordinates: Array = offsets @ axes[0]
@@ -95,8 +91,7 @@ def along_principal_axis(centers: Array) -> Array:
 
 
 def point_looked_at(cameras: Sequence[Camera], centers: Array) -> Array | None:
-    """The point [3] nearest to all viewing axes, in least squares; None if the axes are
-    parallel."""
+    """The point [3] nearest to all viewing axes in least squares; None if they are parallel."""
     forwards = np.array([camera.rotation[2] for camera in cameras])  # [V, 3]
     across = np.eye(3) - forwards[:, :, None] * forwards[:, None, :]  # [V, 3, 3]
     normal = across.mean(axis=0)
@@ -107,8 +102,7 @@ def point_looked_at(cameras: Sequence[Camera], centers: Array) -> Array | None:
 
 
 def scene_up(cameras: Sequence[Camera], centers: Array) -> Array:
-    """The mean of the cameras' up directions [3] or, if they cancel out, the normal of the plane of
-    the centres."""
+    """The mean up direction [3] or, if directions cancel out, the normal of the centres' plane."""
     mean = -np.array([camera.rotation[1] for camera in cameras]).mean(axis=0)
     length = float(np.linalg.norm(mean))
     if length > 0.5:
@@ -120,8 +114,7 @@ def scene_up(cameras: Sequence[Camera], centers: Array) -> Array:
 
 
 def _azimuths(cameras: Sequence[Camera], centers: Array) -> tuple[Array | None, str]:
-    """Azimuths [V] in [0, 360) degrees from the first camera, counter-clockwise from above; or None
-    and the reason."""
+    """Azimuths [V] in [0, 360) from the first camera, counter-clockwise; or None and the reason."""
     center = point_looked_at(cameras, centers)
     if center is None:
         return None, "the cameras look in one direction"
@@ -138,8 +131,7 @@ def _azimuths(cameras: Sequence[Camera], centers: Array) -> tuple[Array | None, 
 
 
 def select_images(names: Sequence[str], max_images: int, least: int = MIN_IMAGES) -> list[str]:
-    """Select at most ``max_images`` of n names, evenly spaced: the k-th of m selected names has
-    index ``k * n // m``.
+    """Select at most ``max_images`` of n names: the k-th of m selected has index ``k * n // m``.
 
     The first name is always kept, and views on a closed ring stay evenly spaced. Images are
     selected before the split.
@@ -272,8 +264,7 @@ def _sector(
     if cameras is None:
         raise InputError(
             "scene.split=sector needs the cameras, and these photographs came without: give a "
-            "COLMAP model "
-            "(scene=colmap; gsbench export writes that of a trial)"
+            "COLMAP model (scene=colmap; gsbench export writes that of a trial)"
         )
     if len(names) < rule.sectors:
         raise InputError(

@@ -1,5 +1,4 @@
-"""Loading a `Scene` with pinhole cameras and images at their final size, from a capture and a
-COLMAP model.
+"""Loading a `Scene` of pinhole cameras and final images from a capture and a COLMAP model.
 
 Prepared images are cached below ``cache_dir`` as PNG files, one folder for each set. The folder's
 name is a digest of everything that the pixels depend on. A folder appears by one rename, so a set
@@ -180,8 +179,7 @@ def _publish(work: Path, folder: Path) -> None:
 def _model_cameras(
     capture: Capture, model_dir: Path
 ) -> dict[str, tuple[CameraModel, list[list[float]]]]:
-    """The COLMAP camera at the file's size and the 3x4 pose of every image of the capture that has
-    a pose."""
+    """The COLMAP camera at the file's size and the 3x4 pose of every posed image of the capture."""
     # not needed if the views are cached
     from gsbench.scene.colmap import plain_camera, read_model, rescaled_camera
 
@@ -237,8 +235,7 @@ def _camera(entry: dict[str, object]) -> Camera:
 def _cache_key(
     capture: Capture, model_dir: Path, downscaling: Downscaling, made_by: Mapping[str, str | None]
 ) -> str:
-    """A digest of the images, the model's cameras and poses, the settings, and the versions that
-    prepare the images."""
+    """A digest of images, cameras, poses, settings, and versions of what prepares the images."""
     digest = hashlib.sha256()
     for file in sorted(model_files(model_dir)):
         if file.stem != "points3D":
@@ -302,8 +299,7 @@ def prepare_chunk(images: Sequence[ImageToPrepare]) -> list[Camera]:
 
 
 def prepare_image(image: ImageToPrepare) -> Camera:
-    """Read, undistort if needed, downscale, and write one image as PNG; returns its final camera,
-    at the origin."""
+    """Read, undistort if needed, shrink and write one image; returns its final camera."""
     pixels = read_image(image.source)  # [H, W, 3]
     if pixels.shape[:2] != (image.camera.height, image.camera.width):
         raise InputError(f"{image.source}: the image changed its size while it was read: run again")
@@ -321,8 +317,7 @@ def prepare_image(image: ImageToPrepare) -> Camera:
 
 
 def _prepare_mask(source: Path, image: ImageToPrepare, width: int, height: int) -> None:
-    """Undistort and shrink the mask as the image: a pixel counts if no ignored pixel contributes to
-    its area."""
+    """Treat the mask as the image: a pixel counts if no ignored pixel contributes to its area."""
     mask = read_mask(source)
     if image.camera.distorted:
         levels = np.repeat(mask[..., None].astype(np.uint8) * WHITE, 3, axis=2)  # [H, W, 3]
@@ -350,8 +345,7 @@ def undistort(image: NDArray[np.uint8], camera: CameraModel) -> tuple[NDArray[np
     )
     refusal = (
         f"images of the camera model {camera.name} with parameters {camera.params} cannot be made "
-        "pinhole images: "
-        "use another camera model"
+        "pinhole images: use another camera model"
     )
     if source.is_spherical():
         raise InputError(refusal)

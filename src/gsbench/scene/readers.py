@@ -50,8 +50,7 @@ def read_colmap(
     exact_poses: bool = False,
     masks: str | None = None,
 ) -> Capture:
-    """Read a COLMAP folder: ``path/<images>`` (else "images") and ``path/<sparse>`` (else
-    "sparse/0" or "sparse").
+    """Read a COLMAP folder: ``path/<images>`` ("images"), ``path/<sparse>`` ("sparse/0", "sparse").
 
     The photographs are the files in the folder that have a pose in the model; their extensions may
     differ from the model's names. `select_images` chooses the ones that are kept, `SplitRule` the
@@ -121,8 +120,7 @@ def read_transforms(
     split: SplitRule = EVERY_NTH,
     masks: str | None = None,
 ) -> Capture:
-    """Read the photographs that ``transforms.json`` in ``path`` names, with the cameras in the
-    COLMAP folder ``model``.
+    """Read the photographs that ``transforms.json`` names, with cameras of the COLMAP ``model``.
 
     ``transforms`` is the content of the file (`gsbench.scene.transforms.read_transforms`), and
     ``model`` was written from it (`gsbench.scene.colmap.write_frames`). ``split=list`` holds out
@@ -168,8 +166,7 @@ def read_photos(
     split: SplitRule = EVERY_NTH,
     masks: str | None = None,
 ) -> Capture:
-    """Read bare photographs: all images in ``path/<images>``, or ``path/images`` if there is one,
-    or ``path``.
+    """Read bare photographs: all in ``path/<images>``, else ``path/images``, else ``path``.
 
     Sub-folders are read too, except ``masks``, the folder of the masks below ``path``. A COLMAP
     model beside the photographs is ignored.
@@ -210,8 +207,7 @@ def _masks_and_images(root: Path, folder: Path, masks: str | None) -> tuple[Path
 
 
 def existing_folder(name: str, path: Path | str) -> Path:
-    """The folder ``path`` of the scene ``name``; raises `InputError` if it is not set or does not
-    exist."""
+    """The folder ``path`` of the scene ``name``; raises `InputError` if missing or not set."""
     if path is None or str(path) == "":
         raise InputError(f"scene {name}: scene.path is not set: give the folder of the photos")
     root = Path(path).expanduser()
@@ -226,8 +222,7 @@ def missing_folder(name: str, root: Path) -> str:
 
 
 def missing_model(name: str, root: Path, sparse: str | None) -> str:
-    """The reason why the folder ``root`` of the scene ``name`` has no COLMAP model, or "" if it has
-    one."""
+    """The reason why ``root`` of the scene ``name`` has no COLMAP model, or "" if it has one."""
     try:
         _find_sparse(root, sparse)
     except InputError as error:
@@ -241,8 +236,7 @@ def fingerprint(
     model_files: Iterable[Path] = (),
     masks: Mapping[str, Path] = MappingProxyType({}),
 ) -> str:
-    """sha256 over the names and contents of images, model files and masks, independent of their
-    folders."""
+    """sha256 over names and contents of images, model files and masks, wherever they lie."""
     digest = hashlib.sha256()
     entries = [(f"image/{name}", folder / name) for name in sorted(names)]
     entries += [(f"model/{file.name}", file) for file in sorted(model_files)]
@@ -304,8 +298,7 @@ def _make_capture(
 
 
 def _resolve(wanted: Sequence[str], names: Sequence[str], folder: Path) -> list[str]:
-    """The image files that the names in a split list mean; names may lack an extension or have
-    another one."""
+    """The image files that a split list names; extensions may lack or differ."""
     matches = match_names(wanted, names)
     if unknown := [name for name in wanted if name not in matches]:
         raise InputError(
@@ -316,8 +309,7 @@ def _resolve(wanted: Sequence[str], names: Sequence[str], folder: Path) -> list[
 
 
 def _read_lists(root: Path, split: SplitRule) -> tuple[list[str] | None, list[str] | None]:
-    """The training and the test list; ``split=list`` without file names reads the lists that
-    nerfbaselines writes."""
+    """The training and the test list; ``split=list`` alone reads those of nerfbaselines."""
     train, test = split.train_list, split.test_list
     if split.split == "list" and train is None and test is None:
         train, test = (
@@ -326,8 +318,7 @@ def _read_lists(root: Path, split: SplitRule) -> tuple[list[str] | None, list[st
         if train is None and test is None:
             raise InputError(
                 f"scene.split=list: neither {TRAIN_LIST} nor {TEST_LIST} is in {root}: name the "
-                "files with "
-                "scene.train_list and scene.test_list"
+                "files with scene.train_list and scene.test_list"
             )
     return _read_list(root, train, "scene.train_list"), _read_list(root, test, "scene.test_list")
 
@@ -359,8 +350,7 @@ def _subfolder(root: Path, folder: str, key: str) -> Path:
 
 
 def _find_sparse(root: Path, sparse: str | None) -> tuple[Path, list[str]]:
-    """The folder of the COLMAP model, and the others that were found, each with its number of
-    images.
+    """The folder of the COLMAP model, and the others found, each with its number of images.
 
     COLMAP writes a folder sparse/0, sparse/1, … for each part that it could not connect, in no
     order of size. The model with the most images is taken, and of equal ones the first.

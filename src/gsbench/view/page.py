@@ -1,5 +1,4 @@
-"""A trained model as one HTML page that turns in any browser without a network, with the test
-cameras.
+"""A trained model as one HTML page that turns in any browser without a network.
 
 The page is the SuperSplat viewer, written by ``@playcanvas/splat-transform`` (MIT), which npx
 downloads and starts. Its settings, in the viewer's version 2, hold each test view as an annotation
@@ -75,8 +74,7 @@ def _by_hand(trial: TrialResult, settings: dict[str, Any], out: Path, cause: str
 
 
 def page_settings(trial: TrialResult) -> dict[str, Any]:
-    """The viewer's settings: the background of the training, and a camera for each test view, the
-    first first."""
+    """The viewer's settings: the training's background, and a camera for each test view."""
     folder = model_folder(trial)
     points, _ = model_points(read_model(folder))
     cameras = [
@@ -99,8 +97,7 @@ def page_settings(trial: TrialResult) -> dict[str, Any]:
 
 
 def _flight(cameras: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """The path through the cameras and back to the first, which the page shows until somebody takes
-    the mouse."""
+    """The path through the cameras and back, shown until somebody takes the mouse."""
     stops = [*cameras, cameras[0]]
     values = {
         "position": [number for camera in stops for number in camera["position"]],
@@ -136,8 +133,7 @@ EFFECTS: dict[str, dict[str, Any]] = {  # all are off; the viewer wants their va
 def _camera(
     view: View, points: NDArray[np.floating], normalization: Normalization
 ) -> dict[str, Any]:
-    """The place of a test view, the point that it looks at, and its angle (degrees) along the
-    longer side.
+    """The place of a test view, the point that it looks at, and its longer angle in degrees.
 
     The point lies at the median depth of the initial ``points`` [P, 3] before the camera. The
     viewer turns models by half a turn about z, since its y points up.

@@ -47,8 +47,7 @@ MAX_DISTANCE = 1e9  # world units
 
 
 class Viewer:
-    """Serves ``painters`` (one or two) on a loopback port until ``stop``; port 0 selects a free
-    port."""
+    """Serves ``painters`` (one or two) on a loopback port until ``stop``; port 0: a free one."""
 
     def __init__(self, painters: Sequence[TrialPainter], port: int) -> None:
         import viser
@@ -77,8 +76,7 @@ class Viewer:
         self.server.stop()
 
     def draw(self, camera: Camera, layers: Layers, view: View | None) -> Picture:
-        """The page's picture from ``camera``: one pane for each trial and, if ``view`` is given,
-        its photograph."""
+        """The page's picture from ``camera``: a pane for each trial, and a photograph."""
         panes = [] if view is None else [(f"photograph {view.name}", photograph_at(camera, view))]
         for painter in self.painters:
             label = f"{painter.trial.label}: {len(painter.trial.gaussians):,} Gaussians"
@@ -174,8 +172,7 @@ class Viewer:
 
 
 class Session:
-    """One browser page, whose thread draws the newest state: coarsely while it changes, sharply
-    when it rests."""
+    """One browser page; its thread draws coarsely while things change, sharply at rest."""
 
     def __init__(self, viewer: Viewer, client: Any) -> None:
         self.viewer, self.client = viewer, client
@@ -199,8 +196,7 @@ class Session:
             self._thread.join(timeout=10)
 
     def go_to(self, view: View) -> None:
-        """Move the page's camera to that of ``view``, with a field of view that shows the whole
-        view."""
+        """Move the page's camera to that of ``view``, so that the whole view is seen."""
         own, camera = view.camera, self.client.camera
         aspect = float(camera.aspect or 1.0) / self._panes()
         forward = own.rotation[2]  # [3] world
@@ -278,8 +274,7 @@ def page_camera(
 
 
 def fitting_fov(camera: Camera, aspect: float) -> float:
-    """The vertical field of view (radians) with which a pane of ``aspect`` shows the whole image of
-    ``camera``."""
+    """The vertical angle (radians) at which a pane of ``aspect`` shows all that ``camera`` does."""
     half_height = max(camera.cy, camera.height - camera.cy) / camera.fy
     half_width = max(camera.cx, camera.width - camera.cx) / camera.fx
     return 2 * math.atan(max(half_height, half_width / aspect))
@@ -293,8 +288,7 @@ def mean_up(views: Sequence[View]) -> NDArray[np.float64]:
 
 
 def level_up(camera: Camera, up: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The upward direction nearest to ``up`` that keeps the picture of ``camera`` upright, a unit
-    vector [3].
+    """The direction nearest to ``up`` that keeps the picture of ``camera`` upright, a unit [3].
 
     A page rotates around its upward direction. Around the camera's own one, the horizon would tilt.
     """
@@ -306,8 +300,7 @@ def level_up(camera: Camera, up: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def orbit_distance(views: Sequence[View]) -> float:
-    """The distance from a page's camera to its pivot: the mean distance of the views from their
-    centre, world units."""
+    """A page's distance to its pivot: the views' mean distance from their centre, world units."""
     centers = np.stack([view.camera.center for view in views])  # [V, 3]
     return max(float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).mean()), 1e-3)
 
@@ -325,8 +318,7 @@ def check_port(port: int) -> None:
 
 
 def is_own_page(hosts: list[str], origins: list[str]) -> bool:
-    """Return whether ``Host`` and ``Origin`` headers belong to the viewer's own page or to a
-    program without a page.
+    """Return whether the headers are of the viewer's own page or of a program without a page.
 
     Any port is allowed, since connections may be forwarded, but both headers must have the same
     port.
@@ -343,8 +335,7 @@ def is_own_page(hosts: list[str], origins: list[str]) -> bool:
 
 @contextmanager
 def refuse_other_pages() -> Iterator[None]:
-    """Make the server that viser starts within the block refuse foreign pages, for files and for
-    connections.
+    """Make the server that viser starts within the block refuse foreign pages.
 
     Raises GsbenchError if viser did not start its server through `SERVE`.
     """

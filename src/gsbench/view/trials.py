@@ -1,5 +1,4 @@
-"""Trials as the viewer shows them: read from their folders and the store, and drawn from any
-camera.
+"""Trials as the viewer shows them: read from folders and store, drawn from any camera.
 
 A picture is the render, the initial cloud, or large Gaussians coloured by their causes.
 """
@@ -113,8 +112,7 @@ def model_file(trial: TrialResult) -> Path:
 
 
 def load_viewed(trial: TrialResult, device: torch.device) -> ViewedTrial:
-    """Read everything that the viewer draws of ``trial``; raises InputError naming a missing or
-    damaged file."""
+    """Read all that the viewer draws; raises InputError naming a missing or damaged file."""
     # A page's numbers are float32, so the viewer works in the coordinates of the training.
     gaussians = read_ply(model_file(trial), device, trial.record.to_training)
     model_dir = model_folder(trial)
@@ -165,8 +163,7 @@ def model_folder(trial: TrialResult) -> Path:
 
 
 def read_test_views(trial: TrialResult, model_dir: Path) -> tuple[View, ...]:
-    """The test views in the order of their names, with the photographs and cameras of the
-    evaluation."""
+    """The test views in the order of names, as the evaluation saw them."""
     import pycolmap
 
     model = read_model(model_dir)
@@ -204,8 +201,7 @@ class Layers:
 
 
 class TrialPainter:
-    """Draws one trial from any camera. Like its rasterizer, it can be called from several
-    threads."""
+    """Draws one trial from any camera, and from several threads at once, as its rasterizer can."""
 
     def __init__(self, trial: ViewedTrial, rasterizer: Rasterizer) -> None:
         self.trial, self.rasterizer = trial, rasterizer
@@ -237,8 +233,7 @@ class TrialPainter:
         return Gaussians(**(self.trial.gaussians.tensors() | {"sh_dc": rgb_to_dc(colors)}))
 
     def draw(self, camera: Camera, layers: Layers) -> Picture:
-        """The trial from ``camera``, [H, W, 3] uint8. With default ``layers`` this is the
-        evaluation's render."""
+        """The trial from ``camera``, [H, W, 3] uint8; by default as the evaluation renders it."""
         gaussians = self._initial if layers.cloud else self.trial.gaussians
         if not layers.cloud and layers.share < 100:
             count = max(1, round(layers.share / 100 * len(gaussians)))
@@ -269,8 +264,7 @@ class TrialPainter:
 
 
 def photograph_at(camera: Camera, view: View) -> Picture:
-    """The photograph of ``view`` resampled for the intrinsics of ``camera``, black outside the
-    photograph."""
+    """The photograph of ``view`` resampled for the intrinsics of ``camera``, black outside."""
     own, photograph = view.camera, Image.fromarray(view.image)
     shrink = max(own.fx / camera.fx, own.fy / camera.fy)
     # shrink with a filter first, because the transform below only interpolates neighbouring pixels
@@ -310,8 +304,7 @@ def side_by_side(panes: Sequence[tuple[str, Picture]]) -> Picture:
 
 
 def _fitted(label: str, size: float, width: int) -> tuple[str, float]:
-    """The label in lines that fit into ``width`` px, and the text size, which is reduced if a word
-    does not fit."""
+    """The label in lines that fit ``width`` px, and the text size, reduced for a long word."""
     length, room = ImageFont.load_default(size).getlength, width - 2 * MARGIN * size
     first, *rest = label.split()
     lines = [first]

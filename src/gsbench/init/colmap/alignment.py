@@ -23,8 +23,7 @@ from gsbench.scene.types import Capture, extent_of_centers
 
 @dataclass(frozen=True)
 class Alignment:
-    """The place of a model against the reference; gauge and errors are None if it was not aligned
-    or not compared."""
+    """The place of a model against the reference; None where it was not compared or aligned."""
 
     scale_to_reference: float | None = None  # None without a reference
     own_gauge: Gauge | None = None
@@ -39,8 +38,7 @@ def align(
     exact: bool,
     own_gauge: Path | None,
 ) -> Alignment:
-    """Compare estimated poses with the reference and, with ``own_gauge``, move the model into its
-    gauge.
+    """Compare estimated poses with the reference; with ``own_gauge``, move the model into its.
 
     ``own_gauge`` is the folder for a copy of the model as it was before. ``exact`` says that the
     reference is the truth.
@@ -65,8 +63,7 @@ def align(
 def similarity_to(
     model: pycolmap.Reconstruction, reference: pycolmap.Reconstruction
 ) -> Similarity | None:
-    """The similarity from ``model`` to ``reference``, or None if they have too few cameras in
-    common."""
+    """The similarity from ``model`` to ``reference``; None for too few common cameras."""
     try:
         return align_poses(*common_poses(model, reference))
     except ValueError:
@@ -74,8 +71,7 @@ def similarity_to(
 
 
 def training_extent(model: pycolmap.Reconstruction, capture: Capture) -> float:
-    """3DGS's ``cameras_extent`` of the training images with a pose in the model, or 0 if there are
-    none."""
+    """3DGS's ``cameras_extent`` of the training images with a pose in the model, else 0."""
     poses = poses_by_name(model)
     centers = [poses[name][0] for name in capture.train_names if name in poses]
     return extent_of_centers(np.array(centers)) if centers else 0.0
@@ -104,8 +100,7 @@ def compare_poses(
     reference_extent: float,
     exact: bool,
 ) -> PoseErrors:
-    """Pose errors of ``model`` after ``similarity``, over the images that have a pose in both
-    models."""
+    """Pose errors of ``model`` after ``similarity``, over the images with a pose in both models."""
     centers, rotations, reference_centers, reference_rotations = common_poses(model, reference)
     distances = np.linalg.norm(similarity(centers) - reference_centers, axis=1)  # [N]
     angles = rotation_angles(

@@ -1,5 +1,4 @@
-"""COLMAP's database: creating it with cameras and images, and adding keypoints and matches of any
-extractor."""
+"""COLMAP's database: creating it, and adding keypoints and matches of any extractor."""
 
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
@@ -27,8 +26,7 @@ CameraGroups = Sequence[tuple[pycolmap.Camera, Sequence[str]]]
 
 @dataclass(frozen=True)
 class DatabaseTask:
-    """A database with cameras and images, to be filled with matches, and the pairs of images to
-    match.
+    """A database with cameras and images, to be filled with matches of the ``pairs``.
 
     ``images`` is a folder with the names of the capture in which COLMAP can read every file.
     """
@@ -85,8 +83,7 @@ def readable_images(images: Path, names: Sequence[str], work_dir: Path) -> Path:
 
 
 def colmap_masks(masks: Mapping[str, Path], work_dir: Path) -> Path | None:
-    """A folder below ``work_dir`` with links to the masks, named as COLMAP expects; None if there
-    are no masks."""
+    """A folder below ``work_dir`` of links to the masks, named as COLMAP expects; None if none."""
     if not masks:
         return None
     folder = work_dir / "masks"
@@ -101,8 +98,7 @@ def colmap_masks(masks: Mapping[str, Path], work_dir: Path) -> Path | None:
 def reference_camera_groups(
     reference: pycolmap.Reconstruction,
 ) -> list[tuple[pycolmap.Camera, list[str]]]:
-    """The reference's cameras, as known ones, each with the sorted names of its images that have a
-    pose."""
+    """The reference's cameras, as known ones, each with the sorted names of its posed images."""
     groups: dict[int, list[str]] = {}
     for image in reference.images.values():
         if image.has_pose:
@@ -186,8 +182,7 @@ def write_keypoints(path: Path, keypoints: Mapping[str, NDArray[np.float32]]) ->
 
 
 def write_matches(path: Path, matches: Mapping[tuple[str, str], NDArray[np.uint32]]) -> None:
-    """Add ``matches`` [M, 2] by pairs of image names: indices of keypoints in the first and the
-    second image."""
+    """Add ``matches`` [M, 2] by pairs of names: indices of keypoints in both images."""
     ids = image_ids(path)
     with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
         for (first, second), indices in matches.items():
@@ -195,8 +190,7 @@ def write_matches(path: Path, matches: Mapping[tuple[str, str], NDArray[np.uint3
 
 
 def cameras_without_prior(path: Path) -> bool:
-    """Return whether the focal length of at least one camera is neither given nor in the EXIF
-    data."""
+    """Return whether a camera's focal length is neither given nor in the EXIF data."""
     with pycolmap.Database.open(path) as database:
         return any(not camera.has_prior_focal_length for camera in database.read_all_cameras())
 
@@ -226,8 +220,7 @@ def assume_focal_lengths(path: Path, factor: float) -> list[tuple[str, str]]:
 
 
 def write_pairs(path: Path, pairs: Sequence[tuple[str, str]]) -> None:
-    """Write COLMAP's list of image pairs, two names on each line; names must have no spaces
-    (`image_ids_as_names`)."""
+    """Write COLMAP's list of pairs, two names a line, without spaces (`image_ids_as_names`)."""
     path.write_text("".join(f"{first} {second}\n" for first, second in pairs), encoding="utf-8")
 
 
@@ -261,8 +254,7 @@ def rename_images(path: Path, names: Mapping[int, str]) -> None:
 
 
 def strongest_descriptors(path: Path, name: str, count: int) -> NDArray[np.uint8]:
-    """The descriptors [K, 128] of the ``count`` features with the largest scales of an image,
-    largest first."""
+    """The descriptors [K, 128] of an image's ``count`` features of the largest scales, in order."""
     image_id = image_ids(path)[name]
     with pycolmap.Database.open(path) as database:
         keypoints, descriptors = (

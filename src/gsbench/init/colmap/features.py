@@ -1,5 +1,4 @@
-"""COLMAP's SIFT features. Extraction calls native code that can abort the process: run it
-isolated."""
+"""COLMAP's SIFT features. Extraction calls native code that can abort: run it isolated."""
 
 from __future__ import annotations
 

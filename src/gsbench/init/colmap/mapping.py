@@ -1,5 +1,4 @@
-"""Cameras and points from verified matches: triangulation under the reference's cameras, or
-mapping.
+"""Cameras and points from verified matches: triangulation under known cameras, or mapping.
 
 COLMAP's defaults need an initial pair that sees points under 16 degrees. Forward-facing captures
 with a small baseline have no such pair; COLMAP's global mapper, smaller angles or assumed focal
@@ -33,16 +32,14 @@ FOCAL_FACTORS = (0.75, 1.0, 1.4)
 # median over points of the widest triangulation angle; below it depth is not determined
 MIN_ANGLE_DEG = 0.5
 NO_PAIR = (
-    "structure from motion found no pair of images to start from: the photos need more overlap "
-    "(60 % and more "
-    "between neighbours), more texture, or a focal length (init.focal_length, px)"
+    "structure from motion found no pair of images to start from: the photos need more overlap (60 "
+    "% and more between neighbours), more texture, or a focal length (init.focal_length, px)"
 )
 
 
 @dataclass(frozen=True)
 class MappingResult:
-    """The best model, its strategy, the number of models of that strategy, and the images that each
-    strategy placed."""
+    """The best model, its strategy with its number of models, and what each strategy placed."""
 
     model: pycolmap.Reconstruction
     models: int
@@ -65,8 +62,7 @@ class MappingResult:
 def map_images(
     database: Path, images: Path, output: Path, options: ColmapOptions, progress: Progress
 ) -> MappingResult:
-    """Estimate cameras and points from the matches in ``database``; returns the model with the most
-    images.
+    """Estimate cameras and points from the matches in ``database``: the model with the most images.
 
     With ``mapper=auto``, the strategies are COLMAP's incremental mapper, the same from a smaller
     initial angle, the global mapper, and assumed focal lengths. The first that places
@@ -91,8 +87,7 @@ def map_images(
     if best[0].num_reg_images() < MIN_IMAGES:
         raise InputError(
             f"structure from motion placed only {best[0].num_reg_images()} of {total} images: the "
-            "photos need more "
-            "overlap, more texture, or a focal length (init.focal_length, px)"
+            "photos need more overlap, more texture, or a focal length (init.focal_length, px)"
         )
     return MappingResult(*best, tuple(tried))
 
@@ -112,8 +107,7 @@ class _Mapper:
     total: int
 
     def strategies(self) -> Iterator[tuple[str, Callable[[], Models]]]:
-        """The strategies that ``init.mapper`` allows, in the order of trying: names and
-        functions."""
+        """The strategies of ``init.mapper`` in the order of trying: names and functions."""
         mapper = self.options.mapper
         if mapper in ("auto", "incremental"):
             yield "incremental", lambda: self.incremental(self.database)
@@ -132,8 +126,7 @@ class _Mapper:
                 )
 
     def incremental(self, database: Path, initial_angle: float | None = None) -> Models:
-        """Map image by image, from a pair that sees points under ``initial_angle`` degrees (None:
-        COLMAP's default)."""
+        """Map image by image, from a pair under ``initial_angle`` degrees (None: COLMAP's)."""
         registered = 0
 
         def count_image() -> None:
@@ -159,8 +152,7 @@ class _Mapper:
         return self._run(partial(pycolmap.global_mapping, self.database), options)
 
     def with_assumed_focal_lengths(self, factor: float) -> Models:
-        """Map image by image after setting unknown focal lengths to ``factor`` times the longest
-        side.
+        """Map image by image, with unknown focal lengths of ``factor`` times the longest side.
 
         The pairs are verified again under these focal lengths.
         """
@@ -192,8 +184,7 @@ def _model_size(model: pycolmap.Reconstruction) -> tuple[int, int]:
 
 
 def _is_plausible(model: pycolmap.Reconstruction) -> bool:
-    """Return whether triangulation angles determine the depth of points; copies of one photograph
-    have none."""
+    """Return whether angles determine the depth of points; copies of one photograph have none."""
     centers = {
         image.image_id: image.projection_center()
         for image in model.images.values()
@@ -225,8 +216,7 @@ def triangulate(
     options: ColmapOptions,
     progress: Progress,
 ) -> pycolmap.Reconstruction:
-    """Triangulate the verified matches of the images ``names`` under the reference's cameras, which
-    do not change.
+    """Triangulate the verified matches of the images ``names`` under the reference's fixed cameras.
 
     The other images of the database are in the model with their cameras, but see no point.
     """

@@ -37,8 +37,7 @@ IdPair = tuple[int, int]
 
 @dataclass(frozen=True)
 class MatchingJob:
-    """Inputs of one matching process: ``parts`` are lists of pairs of image ids, whose matches go
-    into ``result``.
+    """Inputs of a matching process: ``parts``, lists of pairs of ids, to match into ``result``.
 
     ``features`` is the database with keypoints and descriptors. ``template`` is a copy without
     them, whose images are named by their ids, because COLMAP splits the lines of its pair lists at
@@ -87,8 +86,7 @@ def match_sift(
 
 
 def match_parts(job: MatchingJob, progress: Progress) -> None:
-    """Match and verify the parts of ``job`` one after another. Calls native code that can abort:
-    run it isolated."""
+    """Match and verify the parts in turn. Calls native code that can abort: run it isolated."""
     pycolmap.logging.minloglevel = int(pycolmap.logging.Level.WARNING)
     options = pycolmap.FeatureMatchingOptions()
     options.use_gpu = False
@@ -124,8 +122,7 @@ def match_parts(job: MatchingJob, progress: Progress) -> None:
 
 
 def divide_pairs(pairs: Sequence[IdPair], block: int) -> list[list[IdPair]]:
-    """Divide ``pairs`` into parts with few images: pairs between ``block`` neighbours and ``block``
-    neighbours.
+    """Divide ``pairs`` into parts with few images, between two groups of ``block`` neighbours.
 
     Small parts are merged up to the size of a full part.
 
@@ -146,8 +143,7 @@ def divide_pairs(pairs: Sequence[IdPair], block: int) -> list[list[IdPair]]:
 
 
 def distribute_parts(parts: Sequence[list[IdPair]], processes: int) -> list[list[list[IdPair]]]:
-    """Distribute parts over processes, with about equal numbers of pairs; a process gets at least
-    one part."""
+    """Distribute parts over processes, about equally many pairs each, and at least one part."""
     shares: list[list[list[IdPair]]] = [[] for _ in range(max(1, min(processes, len(parts))))]
     for part in sorted(parts, key=len, reverse=True):
         min(shares, key=lambda share: sum(map(len, share))).append(part)
@@ -155,8 +151,7 @@ def distribute_parts(parts: Sequence[list[IdPair]], processes: int) -> list[list
 
 
 def _block_size(images: int, processes: int) -> int:
-    """Images on each side of a part such that all pairs of ``images`` make `PARTS_PER_PROCESS`
-    parts per process."""
+    """Images on each side of a part, so that there are `PARTS_PER_PROCESS` per process."""
     # k blocks of images make k (k + 1) / 2 parts
     blocks = math.ceil(math.sqrt(2 * PARTS_PER_PROCESS * processes))
     return min(max(math.ceil(images / blocks), 2), MAX_BLOCK)
@@ -189,8 +184,7 @@ def _copy_without_features(database: Path, target: Path) -> None:
 def _insert(
     target: Path, source: Path, tables: Sequence[str], images: Sequence[int] | None = None
 ) -> None:
-    """Copy the rows of ``tables`` from one database to another, of all images or only of the ids
-    ``images``."""
+    """Copy rows of ``tables`` from one database to another, of all images or of some ids."""
     condition = "" if images is None else f" WHERE image_id IN ({', '.join(map(str, images))})"
     with closing(sqlite3.connect(target)) as connection:
         connection.execute("ATTACH DATABASE ? AS source", (str(source),))

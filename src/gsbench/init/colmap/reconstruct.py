@@ -1,5 +1,4 @@
-"""Operations on COLMAP models. They call native code that can abort the process: run them
-isolated."""
+"""Operations on COLMAP models. They call native code that can abort: run them isolated."""
 
 from __future__ import annotations
 
@@ -17,8 +16,7 @@ from gsbench.scene.types import Array, Capture
 
 
 def load_reference(capture: Capture, reference: Path | None) -> pycolmap.Reconstruction | None:
-    """The reference model, scaled to the image files and restricted to the capture's images; None
-    if there is none."""
+    """The reference model, fitted to the image files and the capture's images; None if none."""
     if reference is not None:
         capture = replace(capture, model=reference)
     return None if capture.model is None else read_reference(capture)
@@ -36,8 +34,7 @@ def poses_by_name(model: pycolmap.Reconstruction) -> dict[str, tuple[Array, Arra
 def common_poses(
     model: pycolmap.Reconstruction, reference: pycolmap.Reconstruction
 ) -> tuple[Array, Array, Array, Array]:
-    """Centres [N, 3] and rotations [N, 3, 3] of the model, then of the reference, for images with a
-    pose in both."""
+    """Centres [N, 3] and rotations [N, 3, 3] of model, then reference, for images posed in both."""
     model_poses, reference_poses = poses_by_name(model), poses_by_name(reference)
     names = sorted(model_poses.keys() & reference_poses.keys())
     poses = [source[name] for source in (model_poses, reference_poses) for name in names]
@@ -55,8 +52,7 @@ def save_reconstruction(model: pycolmap.Reconstruction, folder: Path) -> None:
 def keep_training_points(
     model: pycolmap.Reconstruction, names: Collection[str], images: Path
 ) -> TrainingPoints:
-    """Keep the points of ``model`` that at least two of the images ``names`` see, with those
-    observations alone.
+    """Keep the points that at least two of the images ``names`` see, with those observations alone.
 
     Positions do not change. Colours are read again, from the photographs in the folder ``images``.
     """
@@ -86,7 +82,6 @@ def keep_training_points(
     if count == 0:
         raise InputError(
             "init.points_from=train: no point is left that two training views see; take "
-            "init.points_from=all, or hold "
-            "out fewer views"
+            "init.points_from=all, or hold out fewer views"
         )
     return TrainingPoints("train", count, before, 1 - count / before if before else 0.0)

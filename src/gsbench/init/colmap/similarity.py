@@ -28,8 +28,7 @@ class Similarity:
 
 
 def fit_similarity(source: Array, target: Array) -> Similarity:
-    """The least-squares similarity from ``source`` to ``target`` [N, 3] (Umeyama 1991, eqs. 40 to
-    42)."""
+    """The least-squares similarity of ``source`` to ``target`` [N, 3] (Umeyama 1991, eq. 40-42)."""
     source_mean, target_mean = source.mean(axis=0), target.mean(axis=0)
     source_centered, target_centered = source - source_mean, target - target_mean
     u, singular_values, vt = np.linalg.svd(target_centered.T @ source_centered / len(source))
@@ -42,8 +41,7 @@ def fit_similarity(source: Array, target: Array) -> Similarity:
 def align_poses(
     source_centers: Array, source_rotations: Array, target_centers: Array, target_rotations: Array
 ) -> Similarity:
-    """The similarity that maps the cameras of one model to those of another, robust to wrong
-    cameras.
+    """The similarity from one model's cameras to another's, robust to wrong cameras.
 
     Centres are [N, 3] and rotations (world to camera) [N, 3, 3], in the same order of cameras, N >=
     3. The similarity is fitted to the centres, by the least median of squared residuals over random
@@ -82,8 +80,7 @@ def rotation_angles(first: Array, second: Array) -> Array:
 
 
 def transformed_rotations(similarity: Similarity, rotations: Array) -> Array:
-    """World-to-camera rotations [N, 3, 3] of the same cameras after ``similarity`` has transformed
-    the world."""
+    """World-to-camera rotations [N, 3, 3] after ``similarity`` has transformed the world."""
     return rotations @ similarity.rotation.T
 
 
@@ -106,8 +103,7 @@ def _least_median_fit(source: Array, target: Array) -> Similarity:
 def _fit_with_orientations(
     source: Array, source_rotations: Array, target: Array, target_rotations: Array
 ) -> Similarity:
-    """Fit the rotation to the cameras' orientations (chordal mean), then scale and translation to
-    the centres."""
+    """Fit the rotation to orientations (chordal mean), the rest to the centres."""
     u, _, vt = np.linalg.svd((np.swapaxes(target_rotations, 1, 2) @ source_rotations).sum(axis=0))
     rotation = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
     rotated = (source - source.mean(axis=0)) @ rotation.T

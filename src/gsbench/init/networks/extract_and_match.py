@@ -35,8 +35,7 @@ LOWRES_MATCHES = 20  # pairs with more matches are matched at full size
 
 @dataclass(frozen=True)
 class NetworkJob:
-    """Inputs of the isolated process. The weights are checked files, or None if a network needs
-    none."""
+    """Inputs of the isolated process. Weights are checked files, or None where none is needed."""
 
     options: FeatureOptions
     settings: FeatureSettings

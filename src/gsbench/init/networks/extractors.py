@@ -28,8 +28,7 @@ Extractor = Callable[[torch.Tensor], tuple[torch.Tensor, torch.Tensor, torch.Ten
 def extract_features(
     path: Path, extractor: Extractor, max_image_size: int, max_keypoints: int, device: torch.device
 ) -> Features:
-    """The ``max_keypoints`` strongest features of an image file, shrunk to ``max_image_size`` px
-    for the network.
+    """The ``max_keypoints`` strongest features of an image, shrunk to ``max_image_size`` px.
 
     Raises ``InputError`` if the image cannot be read or the device runs out of memory.
     """
@@ -63,8 +62,7 @@ def extract_features(
 def load_into(
     network: torch.nn.Module, state: Mapping[str, torch.Tensor], path: Path, device: torch.device
 ) -> None:
-    """Load ``state`` into ``network``, for use on ``device``. It must hold every parameter; buffers
-    may be absent."""
+    """Load ``state``, with all parameters, into ``network`` on ``device``; buffers may lack."""
     try:
         missing, unexpected = network.load_state_dict(dict(state), strict=False)
     except RuntimeError as error:
@@ -77,8 +75,7 @@ def load_into(
         example = (missing or unexpected)[0]
         raise MissingWeightsError(
             f"weights file {path} is for another network ({len(missing)} tensors missing, "
-            f"{len(unexpected)} foreign, "
-            f"for example {example}): replace it"
+            f"{len(unexpected)} foreign, for example {example}): replace it"
         )
     network.to(device).eval()
 

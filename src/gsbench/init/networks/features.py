@@ -1,5 +1,4 @@
-"""Local features of an image, the settings that they depend on, and a store of features and matches
-on disk.
+"""Local features of an image, the settings that they depend on, and a store of them on disk.
 
 The store has one file for each image and each pair, so that an interrupted run continues from
 there. A file's name is a hash of everything that its content depends on: the image's bytes, the
@@ -61,8 +60,7 @@ class Features:
 
 @dataclass(frozen=True, kw_only=True)
 class FeatureSettings:
-    """Names and settings of an extractor and a matcher, each of which ignores the fields that it
-    does not read."""
+    """Names and settings of an extractor and a matcher, which ignore fields that are not theirs."""
 
     extractor: str
     matcher: str
@@ -94,8 +92,7 @@ FORMAT_VERSION = 1  # to be raised when the same settings give different feature
 
 
 class FeatureStore:
-    """Store of features and matches below ``folder``: ``features/<key>.npz`` and
-    ``matches/<key>.npy``.
+    """Store of features and matches in ``folder``: ``features/<key>.npz``, ``matches/<key>.npy``.
 
     ``extraction`` and ``matching`` are the settings (plain values) that features and matches depend
     on. ``masks`` are mask files by image name.

@@ -20,8 +20,7 @@ Matcher = Callable[[Features, Features], NDArray[np.uint32]]
 
 
 def mutual_nearest_matcher(max_ratio: float, device: torch.device) -> Matcher:
-    """Match descriptors that are each other's nearest neighbour and pass the ratio test in both
-    directions."""
+    """Match descriptors that are each other's nearest and pass the ratio test both ways."""
     from kornia.feature import match_smnn
 
     def match_features(first: Features, second: Features) -> NDArray[np.uint32]:

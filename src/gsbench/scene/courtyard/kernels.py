@@ -1,5 +1,4 @@
-"""Ray casting for the courtyard, compiled with numba; all functions are scalar and share no
-state."""
+"""Ray casting for the courtyard, compiled with numba; all functions are scalar and pure."""
 
 from math import exp, floor, inf, sqrt
 
@@ -49,8 +48,7 @@ def enter_box(lx, ly, lz, hx, hy, hz, ox, oy, oz, ix, iy, iz):
 
 @inlined
 def hit_tube(outer, half, inner, ox, oy, oz, dx, dy, dz):
-    """The first distance > 0 at which a ray meets a capped cylinder, solid or with a bore; inf if
-    it misses."""
+    """The first distance > 0 of a ray to a capped cylinder, solid or bored; inf for a miss."""
     best = inf
     a = dx * dx + dy * dy
     for radius in (outer, inner):
@@ -151,8 +149,7 @@ def signed_distance(kind, size, x, y, z):
 
 @inlined
 def nearest_surface(layout, x, y, z, limit):
-    """The smallest |distance| from a point to any surface, the ground included, if below ``limit``,
-    else ``limit``."""
+    """The smallest |distance| from a point to any surface or the ground, at most ``limit``."""
     best = min(abs(z), limit)
     for g in range(len(layout.group_low)):
         low, high = layout.group_low[g], layout.group_high[g]
@@ -175,8 +172,7 @@ def nearest_surface(layout, x, y, z, limit):
 
 @inlined
 def local_normal(kind, size, x, y, z):
-    """The outward normal (3 values) at a local surface point, and coordinates (u, v) in m along the
-    face."""
+    """The outward normal (3 values) at a local surface point, and (u, v) in m along the face."""
     if kind == SPHERE:
         r = size[0]
         return x / r, y / r, z / r, (x + y) * 0.8, z + 0.4 * (x - y)
@@ -225,8 +221,7 @@ def sky(dx, dy, dz, seed):
 
 @inlined
 def shade(layout, ox, oy, oz, dx, dy, dz, pixel, seed):
-    """The linear colour that a camera ray sees; ``pixel`` is the angle that one subsample covers,
-    in rad."""
+    """The linear colour that a camera ray sees; ``pixel`` is the angle of one subsample, in rad."""
     t, i = cast(layout, ox, oy, oz, dx, dy, dz, False)
     if i == SKY:
         return sky(dx, dy, dz, seed)

@@ -1,5 +1,4 @@
-"""Objects of the procedural courtyard: solid primitives with materials, in metres, z up, the lawn
-at z = 0."""
+"""Objects of the courtyard: solid primitives with materials, in metres, z up, the lawn at z = 0."""
 
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -105,8 +104,7 @@ class _Builder:
 
 
 def build_layout(seed: int) -> Layout:
-    """The courtyard. The plan is fixed; the seed varies angles and tints of small objects and the
-    shrubs."""
+    """The courtyard. The plan is fixed; the seed varies small objects and shrubs."""
     rng = np.random.default_rng(seed)
     build = _Builder()
     # Objects near the cameras come first: a ray that hits one skips the groups behind it.
@@ -302,8 +300,7 @@ def _sundial(build: _Builder, rng: np.random.Generator) -> None:
 
 
 def _rotation(yaw: float = 0.0, tilt: float = 0.0, roll: float = 0.0) -> NDArray[np.float64]:
-    """The rotation [3, 3] by ``roll`` about x, then ``tilt`` about y, then ``yaw`` about z, in
-    degrees."""
+    """The rotation [3, 3] by ``roll`` about x, ``tilt`` about y, then ``yaw`` about z, degrees."""
     a, b, c = radians(yaw), radians(tilt), radians(roll)
     about_z = np.array([[cos(a), -sin(a), 0], [sin(a), cos(a), 0], [0, 0, 1]])
     about_y = np.array([[cos(b), 0, sin(b)], [0, 1, 0], [-sin(b), 0, cos(b)]])

@@ -56,15 +56,13 @@ def noise3(x, y, z, seed):
 
 @inlined
 def visible(cell, footprint):
-    """The weight of a detail of size ``cell`` if a pixel covers ``footprint``: 0 up to one pixel, 1
-    from two pixels."""
+    """The weight of a detail of size ``cell``: 0 up to one pixel of ``footprint``, 1 from two."""
     return min(1.0, max(0.0, cell / footprint - 1.0))
 
 
 @inlined
 def octaves2(x, y, cell, count, gain, footprint, seed):
-    """Noise octaves over the plane, about [-1, 1]; the cells of the first are ``cell`` m, each next
-    half as large."""
+    """Noise octaves over the plane, about [-1, 1]; cells of ``cell`` m, each next half as large."""
     total, amplitude = 0.0, 1.0
     for k in range(count):
         weight = visible(cell, footprint)
@@ -78,8 +76,7 @@ def octaves2(x, y, cell, count, gain, footprint, seed):
 
 @inlined
 def octaves3(x, y, z, cell, count, gain, footprint, seed):
-    """Noise octaves in space, about [-1, 1]; the cells of the first are ``cell`` m, each next half
-    as large."""
+    """Noise octaves in space, about [-1, 1]; cells of ``cell`` m, each next half as large."""
     total, amplitude = 0.0, 1.0
     for k in range(count):
         weight = visible(cell, footprint)
@@ -93,8 +90,7 @@ def octaves3(x, y, z, cell, count, gain, footprint, seed):
 
 @inlined
 def pebbles(x, y, cell, seed):
-    """Cellular noise: (distance to the nearest feature point, distance to the cell's border, shade
-    of the cell)."""
+    """Cellular noise: distances to the nearest feature point and the border, shade of the cell."""
     gx, gy = floor(x / cell), floor(y / cell)
     first, second, shade = 9.0, 9.0, 0.0
     for i in range(gx - 1, gx + 2):
@@ -111,8 +107,7 @@ def pebbles(x, y, cell, seed):
 
 @inlined
 def groove(position, period, width, footprint):
-    """1 on the lines between strips of ``period``, 0 elsewhere, softened to the pixel's
-    footprint."""
+    """1 on the lines between strips of ``period``, else 0, softened to the pixel's footprint."""
     offset = abs(position / period - floor(position / period + 0.5)) * period
     soft = max(width, 0.7 * footprint)
     line = max(0.0, 1.0 - offset / soft)
@@ -170,8 +165,7 @@ def ground(x, y, footprint, seed):
 
 @inlined
 def shade_factors(material, px, py, pz, u, v, footprint, seed):
-    """(lightness, warmth) of a material at a point: local coordinates in m, and (u, v) along the
-    face."""
+    """(lightness, warmth) of a material at a local point in m, with (u, v) along the face."""
     light, warmth = 1.0, 0.0
     if material == STONE:
         row = floor(v / 0.24)
