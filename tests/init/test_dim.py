@@ -408,7 +408,9 @@ class TestErrors:
             raise torch.OutOfMemoryError("CUDA out of memory")
 
         with pytest.raises(InputError, match=r"0000.png: cpu ran out of memory at 320x240 px"):
-            extract_features(courtyard.images / "0000.png", no_gpu, 1600, 10, CPU)
+            extract_features(
+                courtyard.images / "0000.png", no_gpu, SiftKornia().feature_settings(), CPU
+            )
 
     def test_an_empty_image_has_no_matches(self):
         some = Features(

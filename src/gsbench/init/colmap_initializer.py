@@ -149,22 +149,21 @@ def build_model(job: ReconstructionJob, progress: Progress) -> InitReport:
         )
     scratch = job.work_dir / "mapping"
     shutil.rmtree(scratch, ignore_errors=True)
+    mapped = points = None
     if initializer.poses == "shared" and reference is not None:
         with timer.phase("triangulate"):
             model = mapping.triangulate(
                 task.database, task.images, scratch, reference, task.names, initializer, progress
             )
-        points = None
         if initializer.ignores_test_photographs(reference):
             points = TrainingPoints(initializer.points_from, model.num_points3D(), None, None)
-        return finish(job, model, reference, None, timer, counts, points)
-    with timer.phase("map"):
-        mapped = mapping.map_images(task.database, task.images, scratch, initializer, progress)
-    points = None
-    if initializer.points_from == "train":
-        points = reconstruct.keep_training_points(mapped.model, capture.train_names, task.images)
-    counts["models"] = mapped.models
-    return finish(job, mapped.model, reference, mapped, timer, counts, points)
+    else:
+        with timer.phase("map"):
+            mapped = mapping.map_images(task.database, task.images, scratch, initializer, progress)
+        model, counts["models"] = mapped.model, mapped.models
+        if initializer.points_from == "train":
+            points = reconstruct.keep_training_points(model, capture.train_names, task.images)
+    return finish(job, model, reference, mapped, timer, counts, points)
 
 
 def finish(

@@ -30,9 +30,8 @@ def draw_cloud(model: pycolmap.Reconstruction, path: Path, title: str) -> None:
         points, colors = points[chosen], colors[chosen]
     images = [image for _, image in sorted(model.images.items()) if image.has_pose]
     centers = np.array([image.projection_center() for image in images]).reshape(-1, 3)
-    rotations = np.array([image.cam_from_world().rotation.matrix() for image in images]).reshape(
-        -1, 3, 3
-    )
+    poses = [image.cam_from_world() for image in images]
+    rotations = np.array([pose.rotation.matrix() for pose in poses]).reshape(-1, 3, 3)
     axes = view_from_above(centers, rotations, points)  # [3, 3]
     # the highest points are drawn last, over lower ones
     order = np.argsort(points @ axes[2], kind="stable")
@@ -47,8 +46,9 @@ def draw_cloud(model: pycolmap.Reconstruction, path: Path, title: str) -> None:
     columns, rows = np.floor(pixels(flat)).astype(np.int64).T  # [P] each
     size = 1 if len(flat) > 50_000 else 2 if len(flat) > 5_000 else 3  # px of a point
     for dx, dy in np.ndindex(size, size):
-        inside = (columns + dx >= 0) & (columns + dx < SIDE) & (rows + dy >= 0) & (rows + dy < SIDE)
-        canvas[rows[inside] + dy, columns[inside] + dx] = colors[order][inside]
+        x, y = columns + dx, rows + dy
+        inside = (x >= 0) & (x < SIDE) & (y >= 0) & (y < SIDE)
+        canvas[y[inside], x[inside]] = colors[order][inside]
     picture = Image.fromarray(canvas)
     draw = ImageDraw.Draw(picture)
     sights = flat_centers + VIEW_LINE * (high - low).max() * rotations[:, 2] @ axes[:2].T  # [V, 2]
@@ -72,11 +72,8 @@ def view_from_above(centers: Array, rotations: Array, points: Array) -> Array:
     """
     image_up = -rotations[:, 1].mean(axis=0)  # [3]: y points down in the image
     _, spread, directions = np.linalg.svd(centers - centers.mean(axis=0), full_matrices=False)
-    in_plane = (
-        len(centers) >= 3
-        and spread[1] > LINE_RATIO * spread[0]
-        and spread[2] < PLANE_RATIO * spread[1]
-    )
+    in_line = len(centers) < 3 or spread[1] <= LINE_RATIO * spread[0]
+    in_plane = not in_line and spread[2] < PLANE_RATIO * spread[1]
     up = directions[2] if in_plane else image_up
     towards = image_up
     if abs(up @ image_up) < 0.5 and len(points) > 0:
@@ -85,7 +82,8 @@ def view_from_above(centers: Array, rotations: Array, points: Array) -> Array:
     # the first camera's right is the picture's right
     right = rotations[0, 0] - (rotations[0, 0] @ up) * up
     if np.linalg.norm(right) < 1e-6:
-        right = np.eye(3)[np.argmin(np.abs(up))] - up[np.argmin(np.abs(up))] * up
+        across = np.argmin(np.abs(up))
+        right = np.eye(3)[across] - up[across] * up
     right /= np.linalg.norm(right)
     return np.stack([right, np.cross(up, right), up])
 
@@ -93,10 +91,9 @@ def view_from_above(centers: Array, rotations: Array, points: Array) -> Array:
 def _limits(flat: Array, centers: Array) -> tuple[Array, Array]:
     """Lower left and upper right corner: all cameras, and most of the points."""
     tail = (1 - VISIBLE_SHARE) / 2
-    corners = (
-        [centers] if len(flat) == 0 else [centers, np.quantile(flat, [tail, 1 - tail], axis=0)]
-    )
-    together = np.concatenate(corners)
-    low, high = together.min(axis=0), together.max(axis=0)
+    corners = centers
+    if len(flat):
+        corners = np.concatenate([centers, np.quantile(flat, [tail, 1 - tail], axis=0)])
+    low, high = corners.min(axis=0), corners.max(axis=0)
     margin = 0.05 * max(float((high - low).max()), 1e-9)
     return low - margin, high + margin

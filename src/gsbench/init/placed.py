@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import shutil
 from abc import abstractmethod
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from io import StringIO
 from pathlib import Path
@@ -175,20 +176,17 @@ class Random(PlacedCloud):
     seed: Seed = 0
 
     def cloud(self, capture: Capture, model: pycolmap.Reconstruction) -> PointCloud:
-        from gsbench.init.colmap.alignment import training_extent
-        from gsbench.init.colmap.reconstruct import poses_by_name
+        from gsbench.init.colmap.alignment import training_centers, training_extent
 
-        poses = poses_by_name(model)
-        centers = [poses[name][0] for name in capture.train_names if name in poses]
         extent = training_extent(model, capture)
         if extent == 0:
             raise InputError(
                 f"init=random: the training cameras of scene {capture.name} are all at one place"
             )
         generator = np.random.default_rng(self.seed)
-        points = np.mean(centers, axis=0) + self.size * extent * generator.uniform(
-            -1.0, 1.0, (self.count, 3)
-        )
+        center = training_centers(model, capture).mean(axis=0)
+        cube = generator.uniform(-1.0, 1.0, (self.count, 3))
+        points = center + self.size * extent * cube
         return PointCloud(points, generator.integers(0, 256, (self.count, 3), dtype=np.uint8))
 
 
@@ -265,9 +263,8 @@ def read_points(path: Path) -> tuple[Array, NDArray[np.uint8] | None]:
             points, colors = _read_ply(path)
         elif suffix in TEXT_SUFFIXES:
             content = without_byte_order_mark(path.read_bytes()).decode()
-            points, colors = _columns(
-                np.loadtxt(StringIO(content), delimiter="," if suffix == ".csv" else None, ndmin=2)
-            )
+            between = "," if suffix == ".csv" else None
+            points, colors = _columns(np.loadtxt(StringIO(content), delimiter=between, ndmin=2))
         else:
             raise ValueError(f"known are .ply, {', '.join(TEXT_SUFFIXES)}")
     # readers may raise any exception on a damaged file, numpy even tokenizer errors
@@ -292,16 +289,19 @@ def read_points(path: Path) -> tuple[Array, NDArray[np.uint8] | None]:
 
 def _read_ply(path: Path) -> tuple[Array, NDArray[np.generic] | None]:
     vertices = read_ply_data(path)["vertex"].data
-    present = vertices.dtype.names or ()
-    lacking = [name for name in "xyz" if name not in present]
-    if lacking:
+    present = set(vertices.dtype.names or ())
+    if lacking := [name for name in "xyz" if name not in present]:
         raise ValueError(f"its vertices have no property {', '.join(lacking)}")
+
+    def columns(names: Iterable[str]) -> NDArray[np.generic]:
+        return np.stack([vertices[name] for name in names], axis=1)
+
     points = np.stack([vertices[name].astype(np.float64) for name in "xyz"], axis=1)
     for names in COLOR_NAMES:
-        if all(name in present for name in names):
-            return points, np.stack([vertices[name] for name in names], axis=1)
-    if all(name in present for name in DC_NAMES):  # a model of Gaussians
-        dc = np.stack([vertices[name] for name in DC_NAMES], axis=1).astype(np.float64)
+        if present.issuperset(names):
+            return points, columns(names)
+    if present.issuperset(DC_NAMES):  # a model of Gaussians
+        dc = columns(DC_NAMES).astype(np.float64)
         return points, np.clip(0.5 + SH_C0 * dc, 0.0, 1.0)  # NaN stays, and is refused
     return points, None
 
@@ -362,11 +362,9 @@ class Points(CloudFromFile):
 
     def cloud(self, capture: Capture, model: pycolmap.Reconstruction) -> PointCloud:
         points, colors = read_points(self.file)
-        points = capture.normalization.apply(points)
-        chosen = np.sort(
-            np.random.default_rng(self.seed).permutation(len(points))[: self.max_points]
-        )
-        points, colors = points[chosen], None if colors is None else colors[chosen]
+        order = np.random.default_rng(self.seed).permutation(len(points))
+        chosen = np.sort(order[: self.max_points])
+        points = capture.normalization.apply(points)[chosen]
         seen = seen_colors(points, capture, model)
         if (seen < 0).all():
             raise InputError(
@@ -375,8 +373,8 @@ class Points(CloudFromFile):
                 "lies in other coordinates; bring it into those of the cameras"
             )
         if colors is None:
-            colors = np.where(seen < 0, GREY, seen).astype(np.uint8)
-        return PointCloud(points, colors)
+            return PointCloud(points, np.where(seen < 0, GREY, seen).astype(np.uint8))
+        return PointCloud(points, colors[chosen])
 
 
 def seen_colors(
@@ -424,13 +422,11 @@ class Ply(CloudFromFile):
     ) -> TrainingPoints | None:
         from gsbench.gaussians.ply import read_ply, write_ply
 
-        if capture.normalization.is_identity:
-            shutil.copyfile(self.file, output_dir / GAUSSIANS_FILE)
+        target, normalization = output_dir / GAUSSIANS_FILE, capture.normalization
+        if normalization.is_identity:
+            shutil.copyfile(self.file, target)
         else:
-            write_ply(
-                read_ply(self.file, normalization=capture.normalization),
-                output_dir / GAUSSIANS_FILE,
-            )
+            write_ply(read_ply(self.file, normalization=normalization), target)
         return super().set_points(model, capture, output_dir)
 
     def cloud(self, capture: Capture, model: pycolmap.Reconstruction) -> PointCloud:

@@ -80,9 +80,8 @@ def find_warnings(report: InitReport, model: pycolmap.Reconstruction) -> tuple[s
     """List the reasons to doubt a model: it can be wrong although all its images have poses."""
     warnings = []
     if report.num_registered < REGISTERED_SHARE * report.num_images:
-        missing = ", ".join(report.unregistered[:5]) + (
-            " …" if len(report.unregistered) > 5 else ""
-        )
+        missing = ", ".join(report.unregistered[:5])
+        missing += " …" if len(report.unregistered) > 5 else ""
         warnings.append(
             f"only {report.num_registered} of {report.num_images} images have a pose (missing: "
             f"{missing}): the other photos are not used; more overlap or texture would help"
@@ -110,9 +109,8 @@ def find_warnings(report: InitReport, model: pycolmap.Reconstruction) -> tuple[s
                 f"the {truth} ones"
             )
     for camera in model.cameras.values():
-        view = 2 * math.degrees(
-            math.atan(max(camera.width, camera.height) / (2 * camera.mean_focal_length()))
-        )
+        longest = max(camera.width, camera.height)
+        view = 2 * math.degrees(math.atan(longest / (2 * camera.mean_focal_length())))
         if not FIELD_OF_VIEW_DEG[0] < view < FIELD_OF_VIEW_DEG[1]:
             warnings.append(
                 f"estimated focal length {camera.mean_focal_length():.0f} px (field of view "

@@ -18,7 +18,7 @@ from gsbench.init.colmap.similarity import (
     rotation_angles,
     transformed_rotations,
 )
-from gsbench.scene.types import Capture, extent_of_centers
+from gsbench.scene.types import Array, Capture, extent_of_centers
 
 
 @dataclass(frozen=True)
@@ -72,13 +72,22 @@ def similarity_to(
 
 def training_extent(model: pycolmap.Reconstruction, capture: Capture) -> float:
     """3DGS's ``cameras_extent`` of the training images with a pose in the model, else 0."""
+    centers = training_centers(model, capture)
+    return extent_of_centers(centers) if len(centers) else 0.0
+
+
+def training_centers(model: pycolmap.Reconstruction, capture: Capture) -> Array:
+    """The centres [V, 3] of the training images with a pose in the model."""
     poses = poses_by_name(model)
-    centers = [poses[name][0] for name in capture.train_names if name in poses]
-    return extent_of_centers(np.array(centers)) if centers else 0.0
+    return np.array([poses[name][0] for name in capture.train_names if name in poses])
 
 
 def measure_gauge(extent: float, scale_to_reference: float | None) -> Gauge:
     """Express the paper's V_th in a model with this scene extent."""
+    in_reference = None
+    if scale_to_reference is not None:
+        in_reference = VOLUME_THRESHOLD * scale_to_reference**3
+    # of the sphere 4/3 pi r^3 = V_th
     radius = (3 * VOLUME_THRESHOLD / (4 * math.pi)) ** (1 / 3)
     return Gauge(
         scene_extent=extent,
@@ -87,9 +96,7 @@ def measure_gauge(extent: float, scale_to_reference: float | None) -> Gauge:
         threshold_over_extent_cubed=VOLUME_THRESHOLD / extent**3 if extent > 0 else None,
         threshold_radius=radius,
         threshold_radius_over_extent=radius / extent if extent > 0 else None,
-        threshold_in_reference=None
-        if scale_to_reference is None
-        else VOLUME_THRESHOLD * scale_to_reference**3,
+        threshold_in_reference=in_reference,
     )
 
 
@@ -103,9 +110,8 @@ def compare_poses(
     """Pose errors of ``model`` after ``similarity``, over the images with a pose in both models."""
     centers, rotations, reference_centers, reference_rotations = common_poses(model, reference)
     distances = np.linalg.norm(similarity(centers) - reference_centers, axis=1)  # [N]
-    angles = rotation_angles(
-        transformed_rotations(similarity, rotations), reference_rotations
-    )  # [N]
+    turned = transformed_rotations(similarity, rotations)
+    angles = rotation_angles(turned, reference_rotations)  # [N]
     rmse = float(np.sqrt(np.mean(distances**2)))
     return PoseErrors(
         num_images=len(distances),

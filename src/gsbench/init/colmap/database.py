@@ -143,6 +143,13 @@ def unknown_camera_groups(
     return result
 
 
+@contextmanager
+def writable(path: Path) -> Iterator[pycolmap.Database]:
+    """The open database in one transaction: all changes within the context, or none."""
+    with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
+        yield database
+
+
 def create_database(path: Path, groups: CameraGroups) -> dict[str, int]:
     """Create a database with cameras and images but no features; returns the image ids by name.
 
@@ -150,22 +157,19 @@ def create_database(path: Path, groups: CameraGroups) -> dict[str, int]:
     same database on any number of threads. Each camera gets its own rig.
     """
     path.unlink(missing_ok=True)
-    camera_ids: dict[str, int] = {}
-    rig_ids: dict[str, int] = {}
+    ids_of: dict[str, tuple[int, int]] = {}  # of camera and rig
     image_ids: dict[str, int] = {}
-    with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
+    with writable(path) as database:
         for camera, names in groups:
             camera.camera_id = database.write_camera(camera)
             rig = pycolmap.Rig()
             rig.add_ref_sensor(camera.sensor_id)
-            rig_id = database.write_rig(rig)
-            camera_ids |= dict.fromkeys(names, camera.camera_id)
-            rig_ids |= dict.fromkeys(names, rig_id)
-        for name in sorted(camera_ids):
-            image = pycolmap.Image(name=name, camera_id=camera_ids[name])
+            ids_of |= dict.fromkeys(names, (camera.camera_id, database.write_rig(rig)))
+        for name, (camera_id, rig_id) in sorted(ids_of.items()):
+            image = pycolmap.Image(name=name, camera_id=camera_id)
             image.image_id = database.write_image(image)
             frame = pycolmap.Frame()
-            frame.rig_id = rig_ids[name]
+            frame.rig_id = rig_id
             frame.add_data_id(image.data_id)
             database.write_frame(frame)
             image_ids[name] = image.image_id
@@ -176,7 +180,7 @@ def write_keypoints(path: Path, keypoints: Mapping[str, NDArray[np.float32]]) ->
     """Add ``keypoints`` [K, 2] by image name, in px of the image file; the centre of the first
     pixel is (0.5, 0.5)."""
     ids = image_ids(path)
-    with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
+    with writable(path) as database:
         for name, points in keypoints.items():
             database.write_keypoints(ids[name], points)
 
@@ -184,7 +188,7 @@ def write_keypoints(path: Path, keypoints: Mapping[str, NDArray[np.float32]]) ->
 def write_matches(path: Path, matches: Mapping[tuple[str, str], NDArray[np.uint32]]) -> None:
     """Add ``matches`` [M, 2] by pairs of names: indices of keypoints in both images."""
     ids = image_ids(path)
-    with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
+    with writable(path) as database:
         for (first, second), indices in matches.items():
             database.write_matches(ids[first], ids[second], indices)
 
@@ -201,7 +205,7 @@ def assume_focal_lengths(path: Path, factor: float) -> list[tuple[str, str]]:
     Drops the geometries that were verified before, and returns the pairs of image names that have
     matches.
     """
-    with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
+    with writable(path) as database:
         for camera in database.read_all_cameras():
             if not camera.has_prior_focal_length:
                 for index in camera.focal_length_idxs():
@@ -211,11 +215,8 @@ def assume_focal_lengths(path: Path, factor: float) -> list[tuple[str, str]]:
         names = {image.image_id: image.name for image in database.read_all_images()}
         pair_ids, matches = database.read_all_matches()
         database.clear_two_view_geometries()
-        ids = [
-            pycolmap.pair_id_to_image_pair(pair_id)
-            for pair_id, indices in zip(pair_ids, matches, strict=True)
-            if len(indices)
-        ]
+        matched = [pair for pair, indices in zip(pair_ids, matches, strict=True) if len(indices)]
+    ids = map(pycolmap.pair_id_to_image_pair, matched)
     return sorted((names[first], names[second]) for first, second in ids)
 
 
@@ -247,7 +248,7 @@ def image_ids(path: Path) -> dict[str, int]:
 
 def rename_images(path: Path, names: Mapping[int, str]) -> None:
     """Rename the database's images; ``names`` are the new names by image id."""
-    with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
+    with writable(path) as database:
         for image in database.read_all_images():
             image.name = names[image.image_id]
             database.update_image(image)
@@ -257,10 +258,8 @@ def strongest_descriptors(path: Path, name: str, count: int) -> NDArray[np.uint8
     """The descriptors [K, 128] of an image's ``count`` features of the largest scales, in order."""
     image_id = image_ids(path)[name]
     with pycolmap.Database.open(path) as database:
-        keypoints, descriptors = (
-            database.read_keypoints(image_id),
-            database.read_descriptors(image_id).data,
-        )
+        keypoints = database.read_keypoints(image_id)
+        descriptors = database.read_descriptors(image_id).data
     if len(keypoints) == 0:
         return np.zeros((0, descriptors.shape[1]), dtype=np.uint8)
     # The determinant of a keypoint's affine shape orders keypoints as their scales do.

@@ -185,24 +185,17 @@ def _model_size(model: pycolmap.Reconstruction) -> tuple[int, int]:
 
 def _is_plausible(model: pycolmap.Reconstruction) -> bool:
     """Return whether angles determine the depth of points; copies of one photograph have none."""
-    centers = {
-        image.image_id: image.projection_center()
-        for image in model.images.values()
-        if image.has_pose
-    }
-    angles = [
-        _widest_angle(point, centers)
-        for point in model.points3D.values()
-        if point.track.length() > 1
-    ]
+    posed = [image for image in model.images.values() if image.has_pose]
+    centers = {image.image_id: image.projection_center() for image in posed}
+    seen_twice = [point for point in model.points3D.values() if point.track.length() > 1]
+    angles = [_widest_angle(point, centers) for point in seen_twice]
     return bool(angles) and float(np.median(angles)) >= MIN_ANGLE_DEG
 
 
 def _widest_angle(point: pycolmap.Point3D, centers: dict[int, np.ndarray]) -> float:
     """The widest angle between two rays from a point to its cameras, in degrees."""
-    rays = (
-        np.array([centers[element.image_id] for element in point.track.elements]) - point.xyz
-    )  # [T, 3]
+    seen_from = np.array([centers[element.image_id] for element in point.track.elements])
+    rays = seen_from - point.xyz  # [T, 3]
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     return float(np.degrees(np.arccos(np.clip(rays @ rays.T, -1, 1)).max()))
 
@@ -254,9 +247,8 @@ def triangulate(
         )
     # On some processors the solver changes the fixed poses by a rounding error.
     for image in model.images.values():
-        image.frame.set_cam_from_world(
-            image.camera_id, reference.find_image_with_name(image.name).cam_from_world()
-        )
+        pose = reference.find_image_with_name(image.name).cam_from_world()
+        image.frame.set_cam_from_world(image.camera_id, pose)
     for image, pose in unused:
         model.add_image_with_trivial_frame(image, pose)
     return model
@@ -266,16 +258,14 @@ def pipeline_options(options: ColmapOptions) -> pycolmap.IncrementalPipelineOpti
     """The options of COLMAP's incremental mapper, which its triangulator reads too."""
     pipeline = pycolmap.IncrementalPipelineOptions()
     pipeline.num_threads = pipeline.mapper.num_threads = options.mapper_threads
-    pipeline.random_seed = pipeline.mapper.random_seed = pipeline.triangulation.random_seed = (
-        options.seed
-    )
     pipeline.triangulation.ignore_two_view_tracks = not options.two_view_tracks
+    for part in (pipeline, pipeline.mapper, pipeline.triangulation):
+        part.random_seed = options.seed
     # mapping must not stop at a first model of a few images (see map_images)
     pipeline.multiple_models = True
     pipeline.min_model_size = options.min_model_size
     refine = options.intrinsics == "estimate"
     pipeline.ba_refine_focal_length = pipeline.ba_refine_extra_params = refine
-    pipeline.mapper.abs_pose_refine_focal_length = pipeline.mapper.abs_pose_refine_extra_params = (
-        refine
-    )
+    mapper = pipeline.mapper
+    mapper.abs_pose_refine_focal_length = mapper.abs_pose_refine_extra_params = refine
     return pipeline

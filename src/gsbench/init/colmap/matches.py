@@ -17,6 +17,7 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 
 import pycolmap
@@ -67,9 +68,8 @@ def match_sift(
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir()
     ids = image_ids(database)
-    parts = divide_pairs(
-        [(ids[first], ids[second]) for first, second in pairs], _block_size(len(ids), processes)
-    )
+    id_pairs = [(ids[first], ids[second]) for first, second in pairs]
+    parts = divide_pairs(id_pairs, _block_size(len(ids), processes))
     _copy_without_features(database, folder / "empty.db")
     jobs = [
         MatchingJob(database, folder / "empty.db", folder / f"matches-{index}.db", share, sift)
@@ -101,12 +101,8 @@ def match_parts(job: MatchingJob, progress: Progress) -> None:
     part_database = job.result.with_suffix(".part.db")
     for part in job.parts:
         shutil.copyfile(job.template, part_database)
-        _insert(
-            part_database,
-            job.features,
-            FEATURE_TABLES,
-            sorted({image for pair in part for image in pair}),
-        )
+        images = sorted(set(chain.from_iterable(part)))
+        _insert(part_database, job.features, FEATURE_TABLES, images)
         write_pairs(pairing.match_list_path, [(str(first), str(second)) for first, second in part])
         pycolmap.match_image_pairs(
             part_database,

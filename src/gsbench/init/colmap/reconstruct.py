@@ -62,17 +62,13 @@ def keep_training_points(
     }
     for point_id in sorted(model.points3D):
         point = model.points3D[point_id]
-        observations = [
-            (element.image_id, element.point2D_idx)
-            for element in point.track.elements
-            if element.image_id in kept
-        ]
-        track = pycolmap.Track(
-            [pycolmap.TrackElement(*observation) for observation in observations]
-        )
+        seen = [element for element in point.track.elements if element.image_id in kept]
+        observations = [(element.image_id, element.point2D_idx) for element in seen]
+        track = pycolmap.Track([pycolmap.TrackElement(*one) for one in observations])
         copy = pycolmap.Point3D(xyz=np.array(point.xyz), error=point.error, track=track)
-        model.delete_point3D(point_id)  # `point` is a view into the model, and invalid from here on
-        if len({image_id for image_id, _ in observations}) < MIN_TRACK:
+        # `point` and `seen` are views into the model, and invalid from here on
+        model.delete_point3D(point_id)
+        if len(dict(observations)) < MIN_TRACK:  # images, not observations
             continue
         model.add_point3D_with_id(point_id, copy)
         for image_id, index in observations:

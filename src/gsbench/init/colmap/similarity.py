@@ -29,13 +29,32 @@ class Similarity:
 
 def fit_similarity(source: Array, target: Array) -> Similarity:
     """The least-squares similarity of ``source`` to ``target`` [N, 3] (Umeyama 1991, eq. 40-42)."""
-    source_mean, target_mean = source.mean(axis=0), target.mean(axis=0)
-    source_centered, target_centered = source - source_mean, target - target_mean
-    u, singular_values, vt = np.linalg.svd(target_centered.T @ source_centered / len(source))
+    offsets, target_offsets = _centered(source), _centered(target)
+    u, singular_values, vt = np.linalg.svd(target_offsets.T @ offsets / len(source))
     signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
     rotation = u @ np.diag(signs) @ vt
-    scale = float(singular_values @ signs / np.mean(np.sum(source_centered**2, axis=1)))
-    return Similarity(scale, rotation, target_mean - scale * rotation @ source_mean)
+    scale = float(singular_values @ signs / np.mean(np.sum(offsets**2, axis=1)))
+    return _with_means(scale, rotation, source, target)
+
+
+def _with_means(scale: float, rotation: Array, source: Array, target: Array) -> Similarity:
+    """The similarity that moves the mean of ``source`` to that of ``target``."""
+    return Similarity(scale, rotation, target.mean(axis=0) - scale * rotation @ source.mean(axis=0))
+
+
+def _centered(points: Array) -> Array:
+    return points - points.mean(axis=0)
+
+
+def _spread(centers: Array) -> Array:
+    """The singular values [3] of centres around their mean, largest first."""
+    spread: Array = np.linalg.svd(_centered(centers), compute_uv=False)
+    return spread
+
+
+def _distances(fit: Similarity, source: Array, target: Array) -> Array:
+    distances: Array = np.linalg.norm(fit(source) - target, axis=1)  # [N]
+    return distances
 
 
 def align_poses(
@@ -51,10 +70,7 @@ def align_poses(
     """
     if len(source_centers) < 3:
         raise ValueError(f"a similarity needs at least 3 common cameras, got {len(source_centers)}")
-    spreads = [
-        np.linalg.svd(centers - centers.mean(axis=0), compute_uv=False)
-        for centers in (source_centers, target_centers)
-    ]
+    spreads = [_spread(centers) for centers in (source_centers, target_centers)]
     if min(spread[0] for spread in spreads) <= 1e-12:
         raise ValueError("a similarity needs cameras at different places")
     if min(spread[1] / spread[0] for spread in spreads) < COLLINEAR_RATIO:
@@ -62,7 +78,7 @@ def align_poses(
             source_centers, source_rotations, target_centers, target_rotations
         )
     best = _least_median_fit(source_centers, target_centers)
-    residuals = np.linalg.norm(best(source_centers) - target_centers, axis=1)  # [N]
+    residuals = _distances(best, source_centers, target_centers)
     inliers = residuals <= max(
         INLIER_FACTOR * float(np.median(residuals)), 1e-9 * float(spreads[1][0])
     )
@@ -87,14 +103,14 @@ def transformed_rotations(similarity: Similarity, rotations: Array) -> Array:
 def _least_median_fit(source: Array, target: Array) -> Similarity:
     generator = np.random.default_rng(0)  # a fixed seed: the triples only guide the search
     best = fit_similarity(source, target)
-    best_median = float(np.median(np.linalg.norm(best(source) - target, axis=1)))
+    best_median = np.median(_distances(best, source, target))
     for _ in range(RANSAC_TRIALS):
         triple = generator.choice(len(source), 3, replace=False)
-        spread = np.linalg.svd(source[triple] - source[triple].mean(axis=0), compute_uv=False)
+        spread = _spread(source[triple])
         if spread[1] <= COLLINEAR_RATIO * spread[0]:
             continue
         candidate = fit_similarity(source[triple], target[triple])
-        median = float(np.median(np.linalg.norm(candidate(source) - target, axis=1)))
+        median = np.median(_distances(candidate, source, target))
         if median < best_median:
             best, best_median = candidate, median
     return best
@@ -106,7 +122,6 @@ def _fit_with_orientations(
     """Fit the rotation to orientations (chordal mean), the rest to the centres."""
     u, _, vt = np.linalg.svd((np.swapaxes(target_rotations, 1, 2) @ source_rotations).sum(axis=0))
     rotation = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
-    rotated = (source - source.mean(axis=0)) @ rotation.T
-    centered = target - target.mean(axis=0)
-    scale = float(np.linalg.norm(centered) / np.linalg.norm(rotated))
-    return Similarity(scale, rotation, target.mean(axis=0) - scale * rotation @ source.mean(axis=0))
+    rotated = _centered(source) @ rotation.T
+    scale = float(np.linalg.norm(_centered(target)) / np.linalg.norm(rotated))
+    return _with_means(scale, rotation, source, target)

@@ -85,29 +85,17 @@ def extract_and_match(job: NetworkJob, progress: Progress) -> Preparation:
             f"{options.name}: no pair of images has a match: the photos need more overlap or "
             "texture"
         )
-    warnings = []
+    counts = {"pairs_selected": len(pairs)}
+    if options.pairs in ("auto", "lowres"):
+        counts["pairs_left_out"] = candidates - len(pairs)
+    counts |= {"pairs_without_matches": len(without), "images_without_keypoints": len(empty)}
+    warnings: tuple[str, ...] = ()
     if empty:
-        warnings.append(f"no keypoint in {some_of(empty)}: no point comes from these images")
+        warnings = (f"no keypoint in {some_of(empty)}: no point comes from these images",)
     weights = [path for path in (job.extractor_weights, job.matcher_weights) if path is not None]
-    return Preparation(
-        seconds=timer.seconds,
-        counts={
-            "pairs_selected": len(pairs),
-            **(
-                {"pairs_left_out": candidates - len(pairs)}
-                if options.pairs in ("auto", "lowres")
-                else {}
-            ),
-            "pairs_without_matches": len(without),
-            "images_without_keypoints": len(empty),
-        },
-        settings={
-            **job.settings.extraction(),
-            **job.settings.matching(),
-            "weights_sha256": {path.name: file_sha256(path) for path in weights},
-        },
-        warnings=tuple(warnings),
-    )
+    digests = {path.name: file_sha256(path) for path in weights}
+    settings = job.settings.extraction() | job.settings.matching() | {"weights_sha256": digests}
+    return Preparation(timer.seconds, counts, settings, warnings)
 
 
 def choose_pairs(
@@ -127,11 +115,12 @@ def choose_pairs(
 
 def at_low_resolution(job: NetworkJob) -> NetworkJob:
     """The same job on small images, to find the pairs that overlap."""
+    own = job.settings
     settings = replace(
-        job.settings,
-        max_image_size=min(job.settings.max_image_size, LOWRES_SIZE),
-        max_keypoints=min(job.settings.max_keypoints, LOWRES_KEYPOINTS),
-        filter_threshold=max(job.settings.filter_threshold, LOWRES_FILTER),
+        own,
+        max_image_size=min(own.max_image_size, LOWRES_SIZE),
+        max_keypoints=min(own.max_keypoints, LOWRES_KEYPOINTS),
+        filter_threshold=max(own.filter_threshold, LOWRES_FILTER),
     )
     return replace(job, settings=settings)
 
@@ -148,10 +137,7 @@ def _extract_all(
             extractor = extractor or EXTRACTORS[settings.extractor](
                 settings, job.extractor_weights, device
             )
-            path = job.capture.images / name
-            features = extract_features(
-                path, extractor, settings.max_image_size, settings.max_keypoints, device
-            )
+            features = extract_features(job.capture.images / name, extractor, settings, device)
             if name in job.capture.masks:
                 features = features.within(read_mask(job.capture.masks[name]))
             store.write_features(name, features)
@@ -186,10 +172,8 @@ def _cached_reader(
     """`FeatureStore.require_features` with a cache of about `CACHE_BYTES` of descriptors."""
     if not pairs:
         return store.require_features
-    example = store.require_features(pairs[0][0])
-    return lru_cache(maxsize=2 + CACHE_BYTES // max(example.descriptors.nbytes, 1))(
-        store.require_features
-    )
+    bytes_each = max(store.require_features(pairs[0][0]).descriptors.nbytes, 1)
+    return lru_cache(maxsize=2 + CACHE_BYTES // bytes_each)(store.require_features)
 
 
 def _digest(path: Path | None) -> str | None:

@@ -26,37 +26,28 @@ Extractor = Callable[[torch.Tensor], tuple[torch.Tensor, torch.Tensor, torch.Ten
 
 
 def extract_features(
-    path: Path, extractor: Extractor, max_image_size: int, max_keypoints: int, device: torch.device
+    path: Path, extractor: Extractor, settings: FeatureSettings, device: torch.device
 ) -> Features:
-    """The ``max_keypoints`` strongest features of an image, shrunk to ``max_image_size`` px.
+    """The strongest features of an image, shrunk to the size that ``settings`` has for the network.
 
     Raises ``InputError`` if the image cannot be read or the device runs out of memory.
     """
     pixels = read_image(path)  # [H, W, 3]
     height, width = pixels.shape[:2]
-    network_size = downscaled_size(width, height, max_size=max_image_size)
+    network_size = downscaled_size(width, height, max_size=settings.max_image_size)
     pixels = resize_image(pixels, *network_size)
-    image = torch.from_numpy(pixels.astype(np.float32) / 255.0).permute(2, 0, 1)[
-        None
-    ]  # [1, 3, h, w]
+    image = torch.from_numpy(pixels.astype(np.float32) / 255.0).permute(2, 0, 1)[None]
     try:
         with torch.inference_mode():
-            keypoints, descriptors, scores = (
-                part.float().cpu() for part in extractor(image.to(device))
-            )
+            found = [part.float().cpu() for part in extractor(image.to(device))]
     except torch.OutOfMemoryError as error:
         size = f"{network_size[0]}x{network_size[1]}"
         raise InputError(
             f"{path.name}: {device} ran out of memory at {size} px: {GPU_MEMORY_HINT}"
         ) from error
-    order = torch.sort(scores, descending=True, stable=True).indices[:max_keypoints]
-    return Features(
-        keypoints[order].numpy(),
-        descriptors[order].numpy(),
-        scores[order].numpy(),
-        network_size,
-        (width, height),
-    )
+    order = torch.sort(found[2], descending=True, stable=True).indices[: settings.max_keypoints]
+    keypoints, descriptors, scores = (part[order].numpy() for part in found)
+    return Features(keypoints, descriptors, scores, network_size, (width, height))
 
 
 def load_into(
@@ -100,12 +91,9 @@ def _superpoint(settings: FeatureSettings, weights: Path | None, device: torch.d
     )
     state = load_state(weights)
     prefix = LIGHTGLUE_DETECTOR_PREFIX
-    if any(name.startswith(prefix) for name in state):
-        state = {
-            name.removeprefix(prefix): value
-            for name, value in state.items()
-            if name.startswith(prefix)
-        }
+    detector = [name for name in state if name.startswith(prefix)]
+    if detector:
+        state = {name.removeprefix(prefix): state[name] for name in detector}
     load_into(network, state, weights, device)
 
     def extract(image: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -118,9 +106,8 @@ def _superpoint(settings: FeatureSettings, weights: Path | None, device: torch.d
         keypoints = (output.keypoints[0] * size).round()  # [K, 2]
         # The network's own border removal is off, because it tests the right and bottom borders in
         # the wrong unit.
-        inside = ((keypoints >= SUPERPOINT_BORDER) & (keypoints < size - SUPERPOINT_BORDER)).all(
-            dim=1
-        )
+        border = SUPERPOINT_BORDER
+        inside = ((keypoints >= border) & (keypoints < size - border)).all(dim=1)
         keep = inside & output.mask[0].bool()
         return keypoints[keep], output.descriptors[0][keep], output.scores[0][keep]
 

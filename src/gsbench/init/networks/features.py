@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cache
 from pathlib import Path
 from types import MappingProxyType
@@ -72,19 +72,23 @@ class FeatureSettings:
     filter_threshold: float = 0.0  # LightGlue only
     max_ratio: float = 1.0  # mutual nearest neighbours only
 
+    @classmethod
+    def of(cls, options: object, **others: Any) -> FeatureSettings:
+        """The settings that ``options`` has under the same names, unless ``others`` has them."""
+        names = [entry.name for entry in fields(cls) if hasattr(options, entry.name)]
+        return cls(**({name: getattr(options, name) for name in names} | others))
+
     def extraction(self) -> dict[str, object]:
         """The settings that features depend on."""
         names = ["extractor", "max_image_size", "max_keypoints", "keypoint_threshold", "nms_radius"]
-        return {
-            name: getattr(self, name)
-            for name in names + ["aliked_model"] * (self.extractor == "aliked")
-        }
+        if self.extractor == "aliked":
+            names.append("aliked_model")
+        return {name: getattr(self, name) for name in names}
 
     def matching(self) -> dict[str, object]:
         """The settings that matches depend on, in addition to the features."""
-        if self.matcher == "lightglue":
-            return {"matcher": self.matcher, "filter_threshold": self.filter_threshold}
-        return {"matcher": self.matcher, "max_ratio": self.max_ratio}
+        limit = "filter_threshold" if self.matcher == "lightglue" else "max_ratio"
+        return {name: getattr(self, name) for name in ("matcher", limit)}
 
 
 KEY_DIGITS = 24
