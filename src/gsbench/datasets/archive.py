@@ -121,12 +121,11 @@ def wanted_members(
             )
         members[name] = info
     for name in members:
-        if folder_of := next(
-            (str(above) for above in PurePosixPath(name).parents if str(above) in members), None
-        ):
-            raise InputError(
-                f"{where}: {folder_of} is a file and a folder in one: give another --mirror"
-            )
+        for above in map(str, PurePosixPath(name).parents):
+            if above in members:
+                raise InputError(
+                    f"{where}: {above} is a file and a folder in one: give another --mirror"
+                )
     for part in wanted:
         if not any(name.startswith(f"{part}/") for name in members):
             raise InputError(
@@ -201,9 +200,8 @@ def _cause(error: Exception, member: zipfile.ZipInfo) -> Exception:
         return cause if isinstance(cause, Exception) else error
     # An OSError with EINVAL is a seek before the start of the file; bzip2 raises one without a
     # number.
-    if isinstance(error, (*DAMAGE, RemoteZipError)) or (
-        isinstance(error, OSError) and error.errno in (None, EINVAL)
-    ):
+    bad_seek = isinstance(error, OSError) and error.errno in (None, EINVAL)
+    if bad_seek or isinstance(error, (*DAMAGE, RemoteZipError)):
         return DamagedMemberError(str(error) or type(error).__name__)
     if isinstance(error, NotImplementedError | RuntimeError):
         return InputError(
@@ -239,11 +237,12 @@ def fetch_scene(
     for path in [path for path in staging.rglob("*") if path.is_file()]:
         if path.relative_to(staging).as_posix() not in members:
             path.unlink()  # from an earlier fetch of other folders
+    # members that an interrupted fetch completed are not fetched again
     missing = {
         name: info
         for name, info in members.items()
         if not is_complete(staging / name, info.file_size, info.CRC)
-    }  # members that an interrupted fetch completed are not fetched again
+    }
     total, done = sum(info.file_size for info in missing.values()), 0
 
     def advance(count: int) -> None:

@@ -24,8 +24,8 @@ class Archive:
     """One zip file of scenes."""
 
     url: str
-    size: str  # approximate, in words; "" if unknown
     scenes: Mapping[str, str]  # the folder of each scene in the archive
+    size: str = ""  # approximate, in words; "" if unknown
 
     @property
     def name(self) -> str:
@@ -74,10 +74,10 @@ def read_catalog() -> dict[str, PublicDataset]:
     content: dict[str, Any] = yaml.safe_load(CATALOG_FILE.read_text(encoding="utf-8"))
     datasets = {}
     for name, entry in content.items():
-        archives = tuple(
-            Archive(one["url"], one.get("size", ""), one["scenes"]) for one in entry.pop("archives")
-        )
-        datasets[name] = PublicDataset(name=name, archives=archives, **entry)
+        archives = []
+        for one in entry.pop("archives"):
+            archives.append(Archive(one["url"], one["scenes"], one.get("size", "")))
+        datasets[name] = PublicDataset(name=name, archives=tuple(archives), **entry)
     return datasets
 
 
@@ -89,12 +89,12 @@ def data_dir() -> Path:
 @cache
 def _catalogued_scenes() -> dict[str, tuple[str, str]]:
     """The data set and the folder of each scene in the catalogue."""
-    return {
-        scene: (dataset.name, folder)
-        for dataset in read_catalog().values()
-        for archive in dataset.archives
-        for scene, folder in archive.scenes.items()
-    }
+    found = {}
+    for dataset in read_catalog().values():
+        for archive in dataset.archives:
+            for scene, folder in archive.scenes.items():
+                found[scene] = (dataset.name, folder)
+    return found
 
 
 def how_to_get(scenes: Iterable[tuple[str, Path]]) -> str:

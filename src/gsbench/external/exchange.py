@@ -39,9 +39,8 @@ def write_training_views(
     check_picture_names([view.name for view in views], folder / IMAGES)
     (folder / IMAGES).mkdir(parents=True)
     for view in views:
-        Image.fromarray(view.image).save(
-            folder / IMAGES / png_name(view.name), compress_level=FAST_PNG
-        )
+        target = folder / IMAGES / png_name(view.name)
+        Image.fromarray(view.image).save(target, compress_level=FAST_PNG)
     points = cloud.points if normalization.is_identity else normalization.undo(cloud.points)
     write_model(folder / MODEL_FOLDER, _cameras(views, normalization), cloud=(points, cloud.colors))
 
@@ -55,10 +54,8 @@ def write_test_cameras(
     """
     cameras = _cameras(views, normalization)
     write_model(folder / MODEL_FOLDER, cameras)
-    write_json(
-        folder / TRANSFORMS,
-        {"camera_model": "OPENCV", "frames": [_frame(*item) for item in cameras.items()]},
-    )
+    frames = [_frame(name, camera) for name, camera in cameras.items()]
+    write_json(folder / TRANSFORMS, {"camera_model": "OPENCV", "frames": frames})
 
 
 def _cameras(views: Sequence[View], normalization: Normalization) -> dict[str, Camera]:
@@ -68,9 +65,16 @@ def _cameras(views: Sequence[View], normalization: Normalization) -> dict[str, C
 def _frame(name: str, camera: Camera) -> dict[str, Any]:
     world_from_camera = np.eye(4)
     world_from_camera[:3, :3], world_from_camera[:3, 3] = camera.rotation.T, camera.center
-    intrinsics = {"w": camera.width, "h": camera.height, "fl_x": camera.fx, "fl_y": camera.fy}
-    pose = {"transform_matrix": (world_from_camera @ OPENGL).tolist()}
-    return {"file_path": name} | intrinsics | {"cx": camera.cx, "cy": camera.cy} | pose
+    return {
+        "file_path": name,
+        "w": camera.width,
+        "h": camera.height,
+        "fl_x": camera.fx,
+        "fl_y": camera.fy,
+        "cx": camera.cx,
+        "cy": camera.cy,
+        "transform_matrix": (world_from_camera @ OPENGL).tolist(),
+    }
 
 
 def collect_model(
@@ -110,11 +114,10 @@ def collect_renders(
     wanted = [png_name(view.name) for view in views]
     target.mkdir()
     try:
-        matching = (
-            match_by_order(wanted, names)
-            if by_order
-            else match_pictures(wanted, names, "densify.by_order=true")
-        )
+        if by_order:
+            matching = match_by_order(wanted, names)
+        else:
+            matching = match_pictures(wanted, names, "densify.by_order=true")
         for name, view in zip(wanted, views, strict=True):
             picture = read_image(output / matching.pairs[name])  # [H, W, 3]
             (height, width), camera = picture.shape[:2], view.camera

@@ -43,13 +43,10 @@ Command = str | Sequence[str]  # one text is split as a shell would, but no shel
 def split_command(command: Command, key: str) -> list[str]:
     """A command's words. Raises InputError, naming the setting ``key``, if empty or not closed."""
     try:
-        words = (
-            shlex.split(command) if isinstance(command, str) else [str(word) for word in command]
-        )
+        words = shlex.split(command) if isinstance(command, str) else list(map(str, command))
     except ValueError as error:
-        raise InputError(
-            f"{key} cannot be split into words ({error}): write it as a list"
-        ) from error
+        what = f"{key} cannot be split into words ({error})"
+        raise InputError(f"{what}: write it as a list") from error
     if not words or not words[0]:
         raise InputError(f"{key} is empty: name the program to run")
     return words
@@ -150,22 +147,15 @@ class External:
         for name, value in self.options.items():
             if value == MISSING:
                 raise InputError(f"densify.options.{name} is not set: give it a value")
-            if (
-                not str(name).isidentifier()
-                or name in PLACEHOLDERS
-                or isinstance(value, Mapping | list)
-            ):
+            own_name = str(name).isidentifier() and name not in PLACEHOLDERS
+            if not own_name or isinstance(value, Mapping | list):
                 raise InputError(
                     f"densify.options.{name}: an option is one value with a name of its own, none "
                     f"of {', '.join(PLACEHOLDERS)}"
                 )
-        check_pattern(
-            fill_placeholders(
-                self.result,
-                dict.fromkeys(PLACEHOLDERS, "1") | dict.fromkeys(FOLDERS, "/") | self.options,
-                "densify.result",
-            )
-        )
+        examples = dict.fromkeys(PLACEHOLDERS, "1") | dict.fromkeys(FOLDERS, "/")
+        pattern = fill_placeholders(self.result, examples | self.options, "densify.result")
+        check_pattern(pattern)
         known = dict.fromkeys((*PLACEHOLDERS, *self.options))
         for key, text in [("command", word) for word in self.words] + [("result", self.result)]:
             fill_placeholders(text, known, f"densify.{key}")

@@ -31,9 +31,8 @@ def gaussians_from_cloud(
         raise InputError(
             "the initial cloud has points that are not finite; rebuild it or clean the COLMAP model"
         )
-    distances, _ = cKDTree(points).query(
-        points, k=NEIGHBOURS + 1
-    )  # [P, 4], the first is the point itself
+    # [P, 4], the first neighbour is the point itself
+    distances, _ = cKDTree(points).query(points, k=NEIGHBOURS + 1)
     squared = np.maximum((distances[:, 1:] ** 2).mean(axis=1), MIN_SQUARED_DISTANCE)  # [P]
     n = len(points)
     log_scales = torch.from_numpy(0.5 * np.log(squared)).float()

@@ -45,11 +45,9 @@ class Gaussians:
             "sh_rest": (n, NUM_SH_REST, 3),
         }
         for name, shape in expected.items():
-            if tuple(getattr(self, name).shape) != shape:
-                raise ValueError(
-                    f"gaussians: {name} has shape {tuple(getattr(self, name).shape)}, expected "
-                    f"{shape}"
-                )
+            given = tuple(getattr(self, name).shape)
+            if given != shape:
+                raise ValueError(f"gaussians: {name} has shape {given}, expected {shape}")
 
     def __len__(self) -> int:
         return self.means.shape[0]
@@ -84,10 +82,8 @@ class Gaussians:
 
     @staticmethod
     def concatenate(parts: list[Gaussians]) -> Gaussians:
-        names = [field.name for field in fields(Gaussians)]
-        return Gaussians(
-            **{name: torch.cat([getattr(part, name) for part in parts]) for name in names}
-        )
+        columns = zip(*(part.tensors().values() for part in parts), strict=True)
+        return Gaussians(*map(torch.cat, columns))
 
 
 def quaternion_to_matrix(quaternions: Tensor) -> Tensor:

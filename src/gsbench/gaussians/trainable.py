@@ -51,15 +51,11 @@ class TrainableGaussians:
             "sh_dc": rates.sh_dc,
             "sh_rest": rates.sh_rest,
         }
-        self.adam = {
-            name: AdamState(
-                initial[name],
-                torch.zeros((), dtype=torch.float32, device=tensor.device),
-                torch.zeros_like(tensor, requires_grad=False),
-                torch.zeros_like(tensor, requires_grad=False),
-            )
-            for name, tensor in self.values.tensors().items()
-        }
+        self.adam = {}
+        for name, tensor in self.values.tensors().items():
+            step = torch.zeros((), dtype=torch.float32, device=tensor.device)
+            first, second = torch.zeros_like(tensor.detach()), torch.zeros_like(tensor.detach())
+            self.adam[name] = AdamState(initial[name], step, first, second)
 
     def __len__(self) -> int:
         return len(self.values)
@@ -132,10 +128,8 @@ class TrainableGaussians:
         """Replace the parameter ``name``, and edit its moments alike; the step count stays."""
         state = self.adam[name]
         zeros = None if added is None else torch.zeros_like(added)
-        state.first, state.second = (
-            _edited(state.first, keep, zeros),
-            _edited(state.second, keep, zeros),
-        )
+        state.first = _edited(state.first, keep, zeros)
+        state.second = _edited(state.second, keep, zeros)
         setattr(self.values, name, values.contiguous().requires_grad_(True))
 
     def state_dict(self) -> dict[str, object]:

@@ -21,6 +21,8 @@ RENDERED, PHOTOGRAPHS = "color", "gt-color"
 # Archives may come from strangers: this stops one that unpacks to far more than test views need.
 MAX_TOTAL_BYTES = 20 << 30
 CHUNK = 1 << 20
+# what the two libraries raise for damaged, encrypted or foreign archives
+DAMAGE = (tarfile.TarError, zipfile.BadZipFile, EOFError, OSError, ValueError, RuntimeError)
 
 
 @contextmanager
@@ -30,10 +32,11 @@ def opened_renders(place: Path) -> Iterator[tuple[Path, Path | None]]:
     Raises InputError if ``place`` is neither a folder nor such an archive.
     """
     if place.is_dir():
-        home = next(
-            (one for one in (place, place / "predictions") if (one / PHOTOGRAPHS).is_dir()), None
-        )
-        yield (place, None) if home is None else (home / RENDERED, home / PHOTOGRAPHS)
+        for home in (place, place / "predictions"):
+            if (home / PHOTOGRAPHS).is_dir():
+                yield home / RENDERED, home / PHOTOGRAPHS
+                return
+        yield place, None
         return
     if not place.exists():
         raise InputError(f"{place} is not a folder of renders")
@@ -41,14 +44,7 @@ def opened_renders(place: Path) -> Iterator[tuple[Path, Path | None]]:
     with tempfile.TemporaryDirectory(prefix="gsbench-") as scratch:
         try:
             _unpack(place, Path(scratch))
-        except (
-            tarfile.TarError,
-            zipfile.BadZipFile,
-            EOFError,
-            OSError,
-            ValueError,
-            RuntimeError,
-        ) as error:
+        except DAMAGE as error:
             raise InputError(
                 f"{place} cannot be unpacked ({error}): give a folder, a .zip or a .tar.gz"
             ) from None
@@ -59,19 +55,15 @@ def _unpack(archive: Path, scratch: Path) -> None:
     """Write the renders and photographs of an archive below ``scratch``, and no other member."""
     if zipfile.is_zipfile(archive):
         with zipfile.ZipFile(archive) as packed:
-            sizes = {
-                member.filename: member.file_size
-                for member in packed.infolist()
-                if not member.is_dir()
-            }
+            files = [member for member in packed.infolist() if not member.is_dir()]
+            sizes = {member.filename: member.file_size for member in files}
             for name, target in _wanted(archive, sizes).items():
                 with packed.open(name) as source:
                     _write(source, scratch / target, sizes[name])
     else:
         with tarfile.open(archive) as packed_tar:
-            members = {
-                member.name.removeprefix("./"): member for member in packed_tar if member.isfile()
-            }
+            regular = [member for member in packed_tar if member.isfile()]
+            members = {member.name.removeprefix("./"): member for member in regular}
             sizes = {name: member.size for name, member in members.items()}
             for name, target in _wanted(archive, sizes).items():
                 content = packed_tar.extractfile(members[name])
@@ -85,9 +77,9 @@ def _wanted(archive: Path, sizes: dict[str, int]) -> dict[str, str]:
     home = _home(archive, list(sizes))
     wanted = {}
     for name in sizes:
-        inside = (
-            PurePosixPath(name.removeprefix(home)) if name.startswith(home) else PurePosixPath()
-        )
+        if not name.startswith(home):
+            continue
+        inside = PurePosixPath(name.removeprefix(home))
         if inside.parts[:1] in ((RENDERED,), (PHOTOGRAPHS,)) and inside.suffix == ".png":
             if ".." in inside.parts or "\\" in name:
                 raise InputError(f"{archive}: {name!r} leads out of the archive")

@@ -277,8 +277,7 @@ class ModelChecks:
         is_size = 1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE
         if not is_size or not all(map(math.isfinite, params)) or min(focal_lengths) <= 0:
             raise InputError(
-                f"camera {camera_id} is damaged ({width}x{height} px, parameters "
-                f"{', '.join(f'{p:g}' for p in params)})"
+                f"camera {camera_id} is damaged ({width}x{height} px, parameters {_listed(params)})"
             )
         _check_id(camera_id, self._cameras, "camera", MAX_ID)
         self._cameras.add(camera_id)
@@ -299,18 +298,13 @@ class ModelChecks:
         """Check a pose: quaternion (w, x, y, z) and translation."""
         sound = len(pose) == 7 and all(map(math.isfinite, pose))
         if not sound or not 1 / MAX_LENGTH < math.hypot(*pose[:4]) < MAX_LENGTH:
-            raise InputError(
-                f"{owner} has no pose that can be used "
-                f"({', '.join(f'{value:g}' for value in pose)})"
-            )
+            raise InputError(f"{owner} has no pose that can be used ({_listed(pose)})")
 
     def point(
         self, point_id: int, position: Sequence[float], track: Iterable[Sequence[int]]
     ) -> None:
         if not all(map(math.isfinite, position)):
-            raise InputError(
-                f"point {point_id} lies nowhere ({', '.join(f'{value:g}' for value in position)})"
-            )
+            raise InputError(f"point {point_id} lies nowhere ({_listed(position)})")
         _check_id(point_id, self._points, "point", MAX_POINT_ID)
         self._points.add(point_id)
         for image_id, index in track:
@@ -332,6 +326,10 @@ class _NamesOnly(ModelChecks):
         self, image_id: int, pose: Sequence[float], camera_id: int, name: str, num_points: int
     ) -> None:
         self.names[image_id] = name
+
+
+def _listed(numbers: Sequence[float]) -> str:
+    return ", ".join(f"{number:g}" for number in numbers)
 
 
 def _check_id(number: int, earlier: Collection[int], what: str, largest: int) -> None:

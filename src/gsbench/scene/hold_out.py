@@ -42,9 +42,8 @@ def arrange_cameras(cameras: Sequence[Camera]) -> Arrangement:
     azimuths, fault = _azimuths(cameras, centers)
     if azimuths is not None:
         order = np.argsort(azimuths, kind="stable")
-        gaps = np.diff(
-            azimuths[order], append=azimuths[order[0]] + 360.0
-        )  # [V] after each camera, degrees
+        around = azimuths[order]
+        gaps = np.diff(around, append=around[0] + 360.0)  # [V] after each camera, degrees
         widest = int(gaps.argmax())
         gap = float(gaps[widest])
         if gap >= SURROUNDED:
@@ -54,16 +53,15 @@ def arrange_cameras(cameras: Sequence[Camera]) -> Arrangement:
             )
     if fault:
         description = f"by planes across the principal axis of the cameras' centres, since {fault}"
-        return Arrangement(
-            tuple(np.argsort(along_principal_axis(centers), kind="stable").tolist()), description
-        )
+        order = np.argsort(along_principal_axis(centers), kind="stable")
+        return Arrangement(tuple(order.tolist()), description)
     if gap > OPEN_RING:
         order = np.roll(order, -(widest + 1))
-    return Arrangement(
-        tuple(int(index) for index in order),
+    description = (
         "by azimuth around the scene's up and centre, as the cameras surround it (gaps up to "
-        f"{gap:.0f} degrees)",
+        f"{gap:.0f} degrees)"
     )
+    return Arrangement(tuple(order.tolist()), description)
 
 
 def sector_range(count: int, sector: int, sectors: int, exactly: int | None = None) -> range:
@@ -224,10 +222,9 @@ def hold_out(
     split = _divide(names, rule, lists, cameras)
     if not rule.validation:
         return split
-    again = (
-        replace(rule, split="every_nth", train_list=None, test_list=None) if rule.by_lists else rule
-    )
-    validation = _divide(split.train, again, (None, None), cameras)
+    if rule.by_lists:  # they are used up
+        rule = replace(rule, split="every_nth", train_list=None, test_list=None)
+    validation = _divide(split.train, rule, (None, None), cameras)
     away = f"the {counted(len(split.test), 'test view')} ({split.description}) put away unseen"
     return replace(validation, description=f"for validation {validation.description}, with {away}")
 
@@ -238,23 +235,19 @@ def _divide(
     matched = max(1, len(names) // rule.sectors) if rule.match_views else None
     if rule.by_lists:
         train, test = split_names(names, rule.test_every, *lists)
-        return Split(tuple(train), tuple(test), "by lists")
-    if rule.split == "sector":
-        test, description = _sector(names, rule, matched, cameras)
-    elif matched is not None:
-        test = select_images(names, matched, least=1)
-        description = (
-            f"{matched} evenly spread over the sorted names, as many as in a sector of "
-            f"{rule.sectors}"
-        )
-    else:
+        description = "by lists"
+    elif rule.split != "sector" and matched is None:
         train, test = split_names(names, rule.test_every)
-        return Split(
-            tuple(train),
-            tuple(test),
-            f"every {rule.test_every}th image" if rule.test_every else "none",
-        )
-    train, test = split_names(names, test=test)
+        description = f"every {rule.test_every}th image" if rule.test_every else "none"
+    else:
+        if rule.split == "sector":
+            chosen, description = _sector(names, rule, matched, cameras)
+        else:
+            assert matched is not None
+            chosen = select_images(names, matched, least=1)
+            spread = f"{matched} evenly spread over the sorted names"
+            description = f"{spread}, as many as in a sector of {rule.sectors}"
+        train, test = split_names(names, test=chosen)
     return Split(tuple(train), tuple(test), description)
 
 

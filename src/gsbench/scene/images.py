@@ -82,11 +82,8 @@ def list_images(folder: Path) -> list[str]:
             elif Path(entry.name).suffix.lower() in HEIC_SUFFIXES:
                 unread += 1
     if unread:
-        log.warning(
-            "%s: %s not read: save as JPEG",
-            folder,
-            f"{counted(unread, 'HEIC file')} {'is' if unread == 1 else 'are'}",
-        )
+        files = f"{counted(unread, 'HEIC file')} {'is' if unread == 1 else 'are'}"
+        log.warning("%s: %s not read: save as JPEG", folder, files)
     return sorted(names)
 
 
@@ -297,19 +294,14 @@ def read_mask(path: Path) -> Mask:
     with open_image(path) as image:
         try:
             image.load()
-            if (
-                image.has_transparency_data
-                and np.asarray(image.convert("RGBA"))[..., 3].min() < 255
-            ):
+            transparent = image.has_transparency_data
+            if transparent and np.asarray(image.convert("RGBA"))[..., 3].min() < 255:
                 raise InputError(
                     f"{path}: a mask says by black what is ignored, not by transparency: save it "
                     "as grey"
                 )
-            pixels = np.asarray(
-                image.convert("RGB")
-                if image.mode in ("P", "CMYK", "YCbCr", "RGBA", "LA")
-                else image
-            )
+            in_colors = image.mode in ("P", "CMYK", "YCbCr", "RGBA", "LA")
+            pixels = np.asarray(image.convert("RGB") if in_colors else image)
         except InputError:
             raise
         except Exception as error:  # Pillow's readers may raise any exception on a damaged file
@@ -400,9 +392,8 @@ def _pull_push(image: NDArray[np.float32], mask: Mask) -> NDArray[np.float32]:
     weights = np.pad(mask, to_even).astype(np.float32)
     rows, columns = weights.shape[0] // 2, weights.shape[1] // 2
     blocks = (rows, 2, columns, 2)
-    sums = (
-        (np.pad(image * mask[..., None], (*to_even, (0, 0)))).reshape(*blocks, 3).sum((1, 3))
-    )  # [H/2, W/2, 3]
+    padded = np.pad(image * mask[..., None], (*to_even, (0, 0)))
+    sums = padded.reshape(*blocks, 3).sum((1, 3))  # [H/2, W/2, 3]
     counted = weights.reshape(blocks).sum((1, 3))  # [H/2, W/2]
     coarse = _pull_push(sums / np.maximum(counted, 1)[..., None], counted > 0)
     pushed = _double(_double(coarse, 0), 1)[:height, :width]

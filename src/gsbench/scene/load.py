@@ -149,15 +149,12 @@ def _prepare_views(
             file = f"{index:05d}.png" if changed else ""
             entries[name] = {"file": file, "pose": pose}
             if changed:
-                mask = capture.masks.get(name)
-                changes[name] = ImageToPrepare(
-                    capture.images / name, model, work / file, downscaling, mask
-                )
+                source, mask = capture.images / name, capture.masks.get(name)
+                changes[name] = ImageToPrepare(source, model, work / file, downscaling, mask)
             else:
                 entries[name] |= _intrinsics(to_pinhole(model))
-        for name, camera in zip(
-            changes, prepare_all(list(changes.values()), progress), strict=True
-        ):
+        prepared = prepare_all(list(changes.values()), progress)
+        for name, camera in zip(changes, prepared, strict=True):
             entries[name] |= _intrinsics(camera)
         document = {"version": CACHE_VERSION, "scene": capture.name, "views": entries}
         (work / CAMERAS_FILE).write_text(json.dumps(document, indent=1), encoding="utf-8")
@@ -210,16 +207,10 @@ def _model_cameras(
 
 def _report_unregistered(capture: Capture, registered: set[str]) -> None:
     for kind, names in (("training", capture.train_names), ("test", capture.test_names)):
-        missing = [name for name in names if name not in registered]
-        if missing:
-            log.warning(
-                "scene %s: %d of %d %s views have no pose and are left out: %s",
-                capture.name,
-                len(missing),
-                len(names),
-                kind,
-                some_of(missing),
-            )
+        if missing := [name for name in names if name not in registered]:
+            share = f"{len(missing)} of {len(names)} {kind} views"
+            what = "have no pose and are left out"
+            log.warning("scene %s: %s %s: %s", capture.name, share, what, some_of(missing))
 
 
 def _intrinsics(camera: Camera) -> dict[str, float]:
@@ -238,14 +229,12 @@ def _cache_key(
     """A digest of images, cameras, poses, settings, and versions of what prepares the images."""
     digest = hashlib.sha256()
     for file in sorted(model_files(model_dir)):
-        if file.stem != "points3D":
-            digest.update(
-                f"{file.name}\0{hashlib.sha256(file.read_bytes()).hexdigest()}\n".encode()
-            )
+        if file.stem != "points3D":  # views do not depend on points
+            content = hashlib.sha256(file.read_bytes()).hexdigest()
+            digest.update(f"{file.name}\0{content}\n".encode())
     settings = [*vars(downscaling).values(), sorted(made_by.items())]
-    digest.update(
-        json.dumps([CACHE_VERSION, capture.fingerprint, capture.image_names, *settings]).encode()
-    )
+    parts = [CACHE_VERSION, capture.fingerprint, capture.image_names, *settings]
+    digest.update(json.dumps(parts).encode())
     return digest.hexdigest()[:32]
 
 
@@ -340,9 +329,8 @@ def undistort(image: NDArray[np.uint8], camera: CameraModel) -> tuple[NDArray[np
 
     from gsbench.scene.colmap import plain_camera
 
-    source = pycolmap.Camera(
-        model=camera.name, width=camera.width, height=camera.height, params=list(camera.params)
-    )
+    size = {"width": camera.width, "height": camera.height}
+    source = pycolmap.Camera(model=camera.name, params=list(camera.params), **size)
     refusal = (
         f"images of the camera model {camera.name} with parameters {camera.params} cannot be made "
         "pinhole images: use another camera model"

@@ -34,13 +34,15 @@ def downscaled_size(
     if max_size is not None and max_size < 1:
         raise InputError(f"scene.max_size must be at least 1 px, got {max_size}")
     longest = max(width, height)
-    # One fraction for both sides, so that the longest side becomes exactly max_size.
-    numerator, denominator = (
-        (max_size, longest) if max_size and max_size * downscale < longest else (1, downscale)
-    )
-    return tuple(
-        max(1, math.floor(side * numerator / denominator + 0.5)) for side in (width, height)
-    )  # type: ignore[return-value]
+    numerator, denominator = 1, downscale
+    if max_size and max_size * downscale < longest:
+        # One fraction for both sides, so that the longest side becomes exactly max_size.
+        numerator, denominator = max_size, longest
+
+    def scaled(side: int) -> int:
+        return max(1, math.floor(side * numerator / denominator + 0.5))
+
+    return scaled(width), scaled(height)
 
 
 def check_final_size(
@@ -49,12 +51,10 @@ def check_final_size(
     """Raise InputError if ``what``, of ``size`` (width, height), would have a side below 16 px."""
     width, height = downscaled_size(*size, downscale, max_size)
     if min(width, height) < MIN_SIZE:
-        cause = f"scene.downscale={downscale}" + (
-            "" if max_size is None else f" with scene.max_size={max_size}"
-        )
+        limit = "" if max_size is None else f" with scene.max_size={max_size}"
         raise InputError(
-            f"{cause} leaves {width}x{height} px of {what} ({size[0]}x{size[1]} px): at least "
-            f"{MIN_SIZE} px are needed"
+            f"scene.downscale={downscale}{limit} leaves {width}x{height} px of {what} "
+            f"({size[0]}x{size[1]} px): at least {MIN_SIZE} px are needed"
         )
 
 

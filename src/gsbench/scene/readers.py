@@ -66,28 +66,18 @@ def read_colmap(
     root = existing_folder(name, path)
     model_folder, others = _find_sparse(root, sparse)
     if others:
-        log.warning(
-            "%s has %s; %s is read because it has the most images (%s); scene.sparse chooses "
-            "another",
-            root,
-            counted(len(others) + 1, "COLMAP model"),
-            model_folder.relative_to(root),
-            ", ".join(others),
-        )
+        found = counted(len(others) + 1, "COLMAP model")
+        why = f"is read because it has the most images ({', '.join(others)})"
+        chosen = model_folder.relative_to(root)
+        log.warning("%s has %s; %s %s; scene.sparse chooses another", root, found, chosen, why)
     folder = _subfolder(root, images or "images", "scene.images")
     model = read_model(model_folder)
     wanted = registered_names(model)
     mask_folder, files = _masks_and_images(root, folder, masks)
     matches = match_names(wanted, files)
-    missing = [image for image in wanted if image not in matches]
-    if missing:
-        log.warning(
-            "%s: %d of %d images of the model have no file: %s",
-            folder,
-            len(missing),
-            len(wanted),
-            some_of(missing),
-        )
+    if missing := [image for image in wanted if image not in matches]:
+        share = f"{len(missing)} of {len(wanted)} images of the model"
+        log.warning("%s: %s have no file: %s", folder, share, some_of(missing))
     _require_enough(len(matches), folder, f"that the model {model_folder} has a pose for")
     model_names = {file: image for image, file in matches.items()}
     capture = _make_capture(
@@ -104,11 +94,9 @@ def read_colmap(
     )
     # A scene with exact poses is the courtyard, whose units are those of the paper's threshold as
     # they are.
-    return (
-        capture
-        if exact_poses
-        else replace(capture, advised_normalization=find_normalization(camera_centers(model)))
-    )
+    if exact_poses:
+        return capture
+    return replace(capture, advised_normalization=find_normalization(camera_centers(model)))
 
 
 def read_transforms(
@@ -179,9 +167,8 @@ def read_photos(
     else:
         folder = root / "images" if (root / "images").is_dir() else root
     mask_folder, names = _masks_and_images(root, folder, masks)
-    _require_enough(
-        len(names), folder, f"({', '.join(sorted(suffix[1:] for suffix in IMAGE_SUFFIXES))})"
-    )
+    formats = ", ".join(sorted(suffix[1:] for suffix in IMAGE_SUFFIXES))
+    _require_enough(len(names), folder, f"({formats})")
     return _make_capture(
         name, folder, names, None, False, max_images, split, root, None, mask_folder
     )
@@ -198,12 +185,8 @@ def _masks_and_images(root: Path, folder: Path, masks: str | None) -> tuple[Path
             f"scene.masks: {mask_folder} is the folder of the images: put the masks into one of "
             "their own"
         )
-    images = [
-        name
-        for name in list_images(folder)
-        if not (folder / name).resolve().is_relative_to(resolved)
-    ]
-    return mask_folder, images
+    paths = {name: (folder / name).resolve() for name in list_images(folder)}
+    return mask_folder, [name for name in paths if not paths[name].is_relative_to(resolved)]
 
 
 def existing_folder(name: str, path: Path | str) -> Path:
@@ -281,6 +264,7 @@ def _make_capture(
         len(kept), folder, "in the split lists" if split.by_lists else "left by the split"
     )
     masks = {} if mask_folder is None else find_masks(mask_folder, folder, kept)
+    files = [] if model is None else model_files(model)
     return Capture(
         name=name,
         images=folder,
@@ -288,9 +272,7 @@ def _make_capture(
         test_names=held_out.test,
         model=model,
         exact_poses=exact_poses,
-        fingerprint=fingerprint(
-            folder, kept, model_files(model) if model is not None else (), masks
-        ),
+        fingerprint=fingerprint(folder, kept, files, masks),
         held_out=held_out.description,
         masks=masks,
         left_out=left_out | copies,
@@ -359,25 +341,19 @@ def _find_sparse(root: Path, sparse: str | None) -> tuple[Path, list[str]]:
         model_files(root / sparse)
         return root / sparse, []
     for parent in (root / "sparse", root / "colmap" / "sparse"):
-        numbered = [
-            folder for folder in parent.glob("*") if folder.name.isdecimal() and folder.is_dir()
-        ]
-        found = [
-            folder
-            for folder in (*sorted(numbered, key=lambda path: int(path.name)), parent)
-            if _is_model(folder)
-        ]
+        numbered = [folder for folder in parent.glob("*") if folder.name.isdecimal()]
+        ordered = [*sorted(numbered, key=lambda path: int(path.name)), parent]
+        found = [folder for folder in ordered if _is_model(folder)]
         if len(found) == 1:
-            return found[0], []
+            return found[0], []  # not counted: a damaged one gets a better message later
         if found:
             counts = {folder: count_images(folder) for folder in found}
             largest = max(found, key=counts.__getitem__)
-            others = [
-                f"{path.relative_to(root)}: {counted(counts[path], 'image')}"
-                for path in found
-                if path != largest
+            del counts[largest]
+            return largest, [
+                f"{path.relative_to(root)}: {counted(count, 'image')}"
+                for path, count in counts.items()
             ]
-            return largest, others
     raise InputError(
         f"{root}: no COLMAP model in {' or '.join(SPARSE_FOLDERS)}: set scene.sparse, or use "
         "scene=photos"

@@ -184,13 +184,8 @@ def read_transforms(folder: Path) -> Transforms:
             images[name] = _camera(folder / name, path, record, frame), *_pose(path, frame, applied)
             names[split].append(name)
         if missing:
-            log.warning(
-                "%s: %d of %d images have no file: %s",
-                path,
-                len(missing),
-                len(record.frames),
-                some_of(missing),
-            )
+            share = f"{len(missing)} of {len(record.frames)}"
+            log.warning("%s: %s images have no file: %s", path, share, some_of(missing))
         if record.ply_file_path is not None:
             points = folder / _relative_path(path, record.ply_file_path)
             if not points.is_file():

@@ -75,13 +75,10 @@ def check_keys(
     unknown keys.
     """
     unknown: set[str] = set()
-    for place, record, used in (
-        ("", document, file_keys),
-        *(
-            (f" (frame {number})", frame, frame_keys)
-            for number, frame in enumerate(document["frames"])
-        ),
-    ):
+    records = [("", document, file_keys)]
+    for number, frame in enumerate(document["frames"]):
+        records.append((f" (frame {number})", frame, frame_keys))
+    for place, record, used in records:
         for key, value in record.items():
             if key in REFUSED and says_something(key, value):
                 raise InputError(f"{path}: {key}{place}: {REFUSED[key]}")

@@ -227,13 +227,9 @@ def nearest_training_cameras(
         np.array([camera.center for camera in group]) for group in (cameras, training)
     )
     angles = angles_between(directions, training_directions).min(axis=1)  # [V]
-    distances = np.linalg.norm(centers[:, None] - training_centers[None], axis=-1).min(
-        axis=1
-    )  # [V]
-    measured = []
-    for angle, distance in zip(angles, distances, strict=True):
-        values = {ANGLE: float(angle)}
-        if extent > 0:
+    measured = [{ANGLE: float(angle)} for angle in angles]
+    if extent > 0:
+        apart = np.linalg.norm(centers[:, None] - training_centers[None], axis=-1)  # [V, W]
+        for values, distance in zip(measured, apart.min(axis=1), strict=True):
             values[DISTANCE] = float(distance) / extent
-        measured.append(values)
     return measured

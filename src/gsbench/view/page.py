@@ -86,9 +86,7 @@ def page_settings(trial: TrialResult) -> dict[str, Any]:
         "tonemapping": "none",
         "highPrecisionRendering": False,
         "background": {"color": list(trial.config.get("train.background", (0.0, 0.0, 0.0)))},
-        "postEffectSettings": {
-            name: {"enabled": False} | values for name, values in EFFECTS.items()
-        },
+        "postEffectSettings": {name: {"enabled": False, **EFFECTS[name]} for name in EFFECTS},
         "animTracks": [_flight([camera for _, camera in cameras])],
         "cameras": [{"initial": cameras[0][1]}],
         "annotations": [_annotation(name, camera) for name, camera in cameras],
@@ -99,11 +97,8 @@ def page_settings(trial: TrialResult) -> dict[str, Any]:
 def _flight(cameras: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """The path through the cameras and back, shown until somebody takes the mouse."""
     stops = [*cameras, cameras[0]]
-    values = {
-        "position": [number for camera in stops for number in camera["position"]],
-        "target": [number for camera in stops for number in camera["target"]],
-        "fov": [camera["fov"] for camera in stops],
-    }
+    # of each key the numbers of all stops, one after another
+    values = {key: np.ravel([stop[key] for stop in stops]).tolist() for key in cameras[0]}
     times = [SECONDS_PER_VIEW * k for k in range(len(stops))]
     return {
         "name": "test views",
@@ -143,13 +138,10 @@ def _camera(
     depths = points @ forward + camera.translation[2]  # [P]
     before = depths[depths > MIN_DEPTH]
     depth = float(np.median(before)) if len(before) else 1.0
-    ends = normalization.undo(np.stack([camera.center, camera.center + depth * forward])) * (
-        -1,
-        -1,
-        1,
-    )  # [2, 3]
-    longer = (
-        camera.width / camera.fx if camera.width >= camera.height else camera.height / camera.fy
-    )
-    position, target = ends.tolist()
+    ends = normalization.undo(np.stack([camera.center, camera.center + depth * forward]))  # [2, 3]
+    position, target = (ends * (-1, -1, 1)).tolist()
+    if camera.width >= camera.height:
+        longer = camera.width / camera.fx
+    else:
+        longer = camera.height / camera.fy
     return {"position": position, "target": target, "fov": math.degrees(2 * math.atan(longer / 2))}

@@ -103,12 +103,10 @@ class Viewer:
 
     def _add_controls(self) -> None:
         gui = self.server.gui
-        lowest = min(float(painter.trial.log10_volumes.min()) for painter in self.painters)
-        highest = max(float(painter.trial.log10_volumes.max()) for painter in self.painters)
-        lowest, highest = (
-            math.floor(min(lowest, DEFAULT_THRESHOLD)),
-            math.ceil(max(highest, DEFAULT_THRESHOLD)),
-        )
+        volumes = [painter.trial.log10_volumes for painter in self.painters]
+        volumes.append(np.array([DEFAULT_THRESHOLD]))
+        lowest = math.floor(min(part.min() for part in volumes))
+        highest = math.ceil(max(part.max() for part in volumes))
         # Most folders start closed, because the panel covers the picture on a narrow page.
         with gui.add_folder("Test views"):
             self._view = gui.add_dropdown(
@@ -126,8 +124,7 @@ class Viewer:
             )
             self._legend = gui.add_markdown(self._legend_text())
         self._height = gui.add_dropdown("Picture height, px", HEIGHTS, initial_value=HEIGHTS[1])
-        changes = (self._degree, self._share, self._cloud, self._causes, self._height)
-        for control in changes:
+        for control in (self._degree, self._share, self._cloud, self._causes, self._height):
             control.on_update(lambda _: self._redraw())
         self._threshold.on_update(lambda _: self._update_threshold())
         self._view.on_update(self._go_to_view)
@@ -222,9 +219,8 @@ class Session:
             return
         page = self.client.camera
         try:
-            camera = page_camera(
-                page.wxyz, page.position, page.fov, page.aspect, height, self._panes()
-            )
+            seen = (page.wxyz, page.position, page.fov, page.aspect)
+            camera = page_camera(*seen, height, self._panes())
             image = self.viewer.draw(camera, self.viewer.layers(), self.viewer.photograph())
         except Exception as error:  # noqa: BLE001 - a page may send any values, and they must not end this thread
             log.debug("view: %r", error)
@@ -261,16 +257,9 @@ def page_camera(
     width = max(1, round(height * aspect / panes))
     focal = height / 2 / math.tan(fov / 2)
     rotation = world_from_camera.T
-    return Camera(
-        width,
-        height,
-        focal,
-        focal,
-        width / 2,
-        height / 2,
-        rotation,
-        -rotation @ np.asarray(position),
-    )
+    translation = -rotation @ np.asarray(position)
+    intrinsics = (focal, focal, width / 2, height / 2)
+    return Camera(width, height, *intrinsics, rotation, translation)
 
 
 def fitting_fov(camera: Camera, aspect: float) -> float:

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -35,8 +36,10 @@ from gsbench.scene.images import png_name, read_image
 from gsbench.scene.types import PINHOLE_NAMES, Camera, View
 from gsbench.view import ADDRESS
 
+# what numpy raises for a file that is missing or damaged
+DAMAGE = (OSError, ValueError, LookupError, EOFError, zipfile.BadZipFile, zlib.error)
 DIMMED = 0.35  # brightness of the render behind Gaussians coloured by their causes
-TEXT_COLOR, SHADOW_COLOR = (255, 255, 255), (0, 0, 0)
+TEXT_COLOR, SHADOW = (255, 255, 255), (0, 0, 0)
 TEXT_SIZE = 1 / 36  # of a picture's height; smaller if a word does not fit its pane
 MARGIN = 0.5  # of the text's size
 Picture = NDArray[np.uint8]
@@ -81,16 +84,12 @@ def find_trial(address: str, runs: Path) -> TrialResult:
         and (not seed or str(trial.seed) == seed[0])
     ]
     if not matches:
-        addresses = sorted(
-            {f"{name}:{t.scene}:{t.init}-{t.densify}:{t.seed}" for t in experiment.trials}
-        )
-        raise InputError(f"no complete trial {address}; there are {', '.join(addresses)}")
+        arms = {f"{name}:{t.scene}:{t.init}-{t.densify}:{t.seed}" for t in experiment.trials}
+        raise InputError(f"no complete trial {address}; there are {', '.join(sorted(arms))}")
     first = [trial for trial in matches if trial.seed == matches[0].seed]
     if len(first) > 1:
-        raise InputError(
-            f"{address} names {len(first)} trials; give a folder: "
-            f"{', '.join(str(t.path) for t in first)}"
-        )
+        folders = ", ".join(str(trial.path) for trial in first)
+        raise InputError(f"{address} names {len(first)} trials; give a folder: {folders}")
     return matches[0]
 
 
@@ -133,15 +132,7 @@ def read_causes(path: Path, num_gaussians: int) -> NDArray[np.uint8]:
     try:
         with np.load(path) as lineage:
             causes = lineage["causes"][lineage["ids"]]
-    except (
-        OSError,
-        ValueError,
-        KeyError,
-        IndexError,
-        EOFError,
-        zipfile.BadZipFile,
-        zlib.error,
-    ) as error:
+    except DAMAGE as error:
         raise InputError(f"{path} cannot be read ({error}): run this trial again") from error
     if len(causes) != num_gaussians:
         raise InputError(
@@ -206,9 +197,8 @@ class TrialPainter:
     def __init__(self, trial: ViewedTrial, rasterizer: Rasterizer) -> None:
         self.trial, self.rasterizer = trial, rasterizer
         self._device = trial.gaussians.means.device
-        self._background = torch.tensor(
-            trial.background, dtype=torch.float32, device=self._device
-        )  # [3]
+        background = torch.tensor(trial.background, dtype=torch.float32)  # [3]
+        self._background = background.to(self._device)
 
     @cached_property
     def _by_opacity(self) -> Gaussians:
@@ -224,13 +214,9 @@ class TrialPainter:
     @cached_property
     def _by_cause(self) -> Gaussians:
         """The Gaussians in the colours of their causes."""
-        palette = (
-            torch.tensor([cause.color for cause in Cause], device=self._device) / 255
-        )  # [C, 3]
-        colors = palette[
-            torch.from_numpy(self.trial.causes.astype(np.int64)).to(self._device)
-        ]  # [N, 3]
-        return Gaussians(**(self.trial.gaussians.tensors() | {"sh_dc": rgb_to_dc(colors)}))
+        palette = torch.tensor([cause.color for cause in Cause], device=self._device) / 255
+        causes = torch.from_numpy(self.trial.causes.astype(np.int64)).to(self._device)  # [N]
+        return replace(self.trial.gaussians, sh_dc=rgb_to_dc(palette[causes]))
 
     def draw(self, camera: Camera, layers: Layers) -> Picture:
         """The trial from ``camera``, [H, W, 3] uint8; by default as the evaluation renders it."""
@@ -290,15 +276,9 @@ def side_by_side(panes: Sequence[tuple[str, Picture]]) -> Picture:
         text, size = _fitted(label, TEXT_SIZE * height, width)
         if left:
             draw.line([(left, 0), (left, height)], fill=TEXT_COLOR)
-        at, stroke = (left + MARGIN * size, MARGIN * size), max(1, round(size / 8))
-        draw.text(
-            at,
-            text,
-            TEXT_COLOR,
-            ImageFont.load_default(size),
-            stroke_width=stroke,
-            stroke_fill=SHADOW_COLOR,
-        )
+        at, font = (left + MARGIN * size, MARGIN * size), ImageFont.load_default(size)
+        shadow: dict[str, Any] = {"stroke_width": max(1, round(size / 8)), "stroke_fill": SHADOW}
+        draw.text(at, text, TEXT_COLOR, font, **shadow)
         left += width
     return np.asarray(image)
 

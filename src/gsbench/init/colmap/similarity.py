@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gsbench.scene.types import Array
 
@@ -46,10 +47,9 @@ def _centered(points: Array) -> Array:
     return points - points.mean(axis=0)
 
 
-def _spread(centers: Array) -> Array:
+def _spread(centers: Array) -> NDArray[np.floating]:
     """The singular values [3] of centres around their mean, largest first."""
-    spread: Array = np.linalg.svd(_centered(centers), compute_uv=False)
-    return spread
+    return np.linalg.svd(_centered(centers), compute_uv=False)
 
 
 def _distances(fit: Similarity, source: Array, target: Array) -> Array:

@@ -69,10 +69,8 @@ def courtyard_cameras(views: int, width: int, height: int) -> dict[str, Camera]:
             f"scene.width and scene.height must be at least {MIN_SIZE} px, got {width}x{height}"
         )
     step = min(MAX_STEP, 2 * pi / views)
-    return {
-        f"{index:04d}.png": ring_camera(index * step - 0.5 * pi, width, height)
-        for index in range(views)
-    }
+    angles = [index * step - 0.5 * pi for index in range(views)]
+    return {f"{k:04d}.png": ring_camera(angle, width, height) for k, angle in enumerate(angles)}
 
 
 def ring_camera(angle: float, width: int, height: int) -> Camera:
