@@ -18,7 +18,7 @@ from PIL import Image
 from gsbench.cli import run
 from gsbench.init import Dim, Sfm, SiftKornia
 from gsbench.init.base import MODEL_FOLDER
-from gsbench.init.sfm import ColmapInitializer
+from gsbench.init.colmap_initializer import ColmapInitializer
 from gsbench.scene.colmap import read_model
 from gsbench.scene.courtyard.render import render_courtyard
 from gsbench.scene.images import read_mask
