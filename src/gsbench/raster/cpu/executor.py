@@ -232,12 +232,12 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
             request.degree,
             passed.frame,
             rows.reshape(-1),
-            _arrays(gradients),
-            g_screen.numpy(),
-            np.empty((0, 2), np.float32) if request.absolute is None else request.absolute.numpy(),
-            np.empty((0, 9), np.float32)
-            if g_splitting is None
-            else g_splitting.numpy().reshape(-1, 9),
+            (
+                _arrays(gradients),
+                g_screen.numpy(),
+                _rows_or_none(request.absolute, 2),
+                _rows_or_none(g_splitting, 9),
+            ),
         )
 
         def backproject(first: int, past: int) -> None:
@@ -282,6 +282,15 @@ def _edges(count: int) -> NDArray[np.int64]:
 def _tiles(frame: at.CpuFrame, first: int, past: int) -> tuple[Any, ...]:
     """The first arguments of the kernels that process tiles, for a range of shards."""
     return at.kernel_memory(), int(frame.bounds[first]), int(frame.bounds[past]), frame
+
+
+def _rows_or_none(tensor: Tensor | None, columns: int) -> NDArray[np.float32]:
+    """``tensor`` as rows of ``columns``; no rows for None, which kernels cannot take."""
+    return np.empty((0, columns), np.float32) if tensor is None else _flat(tensor, columns)
+
+
+def _flat(tensor: Tensor, columns: int) -> NDArray[np.float32]:
+    return tensor.numpy().reshape(-1, columns)
 
 
 def _arrays(gaussians: Gaussians) -> at.Parameters:
