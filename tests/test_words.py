@@ -242,11 +242,7 @@ def test_no_setting_is_a_question(
 
 
 @pytest.mark.parametrize(
-    "command",
-    [
-        "check {} --dry-run allow_targets=[x]",
-        "check --dry-run allow_targets=[x] {}",
-    ],
+    "command", ["check {} --dry-run allow_targets=[x]", "check --dry-run allow_targets=[x] {}"]
 )
 def test_permission_counts_wherever_it_stands(
     command: str, capsys: pytest.CaptureFixture[str]

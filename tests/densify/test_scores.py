@@ -180,10 +180,8 @@ def at(step: int, trainable: TrainableGaussians, rng: torch.Generator) -> Refine
 def taming_scores(trainable: TrainableGaussians, gradient: np.ndarray) -> np.ndarray:
     """The score over all three views, term by term."""
     room, values = Room(), trainable.values.detach()
-    scales, opacities = (
-        np.exp(values.log_scales.numpy()),
-        1 / (1 + np.exp(-values.opacity_logits.numpy())),
-    )
+    scales = np.exp(values.log_scales.numpy())
+    opacities = 1 / (1 + np.exp(-values.opacity_logits.numpy()))
     total = np.zeros(COUNT)
     for view, camera in enumerate(room.cameras):
         weights = alphas(values, camera)
@@ -233,10 +231,8 @@ def test_taming_round(seed: int) -> None:
     large = np.array([np.exp(row["log_scales"]).max() > 0.01 * EXTENT for row in rows])
     over = gradient >= 2e-4
     event = densifier.refine(600, trainable, torch.Generator().manual_seed(seed))
-    small_share, large_share = (
-        12 * (over & ~large).sum() // over.sum(),
-        12 * (over & large).sum() // over.sum(),
-    )
+    small_share = 12 * (over & ~large).sum() // over.sum()
+    large_share = 12 * (over & large).sum() // over.sum()
     assert (event.cloned, event.split_gradient) == (small_share, large_share)
     assert event.blocked_by_cap == over.sum() - small_share - large_share
 

@@ -128,10 +128,8 @@ def test_threshold_modes() -> None:
     outlier = torch.cat(
         [log_scales, torch.full((3, 3), 2.0, dtype=torch.float64) + torch.tensor([0.0, 0.1, 0.2])]
     )
-    third, first = (
-        torch.quantile(log_volume(outlier), 0.75),
-        torch.quantile(log_volume(outlier), 0.25),
-    )
+    third = torch.quantile(log_volume(outlier), 0.75)
+    first = torch.quantile(log_volume(outlier), 0.25)
     expected = int((log_volume(outlier) > third + 1.5 * (third - first)).sum())
     assert run_volume_rule(outlier, threshold_mode="auto")[1][0].split_volume == expected >= 3
 

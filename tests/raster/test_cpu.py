@@ -168,10 +168,8 @@ def test_tiles_and_blocks_are_those_that_a_contour_reaches() -> None:
     least = math.log2(1 / 255)
     pixel_y, pixel_x = np.divmod(np.arange(96 * 64), 96)
     reached = highest(records, pixel_x, pixel_y, 0.0) >= least
-    needed, needed_blocks = (
-        np.zeros((len(numbers), 24), bool),
-        np.zeros((len(numbers), 24, 16), bool),
-    )
+    needed = np.zeros((len(numbers), 24), bool)
+    needed_blocks = np.zeros((len(numbers), 24, 16), bool)
     np.logical_or.at(needed, (slice(None), pixel_y // 16 * 6 + pixel_x // 16), reached)
     block = pixel_y % 16 // 4 * 4 + pixel_x % 16 // 4
     np.logical_or.at(
@@ -458,10 +456,8 @@ def _gather_and_scatter(array, indices, out):  # type: ignore[no-untyped-def]
 def test_gather_and_scatter() -> None:
     array = np.arange(60, dtype=np.float32).reshape(20, 3)
     before = array.copy()
-    indices, out = (
-        np.array([5, 0, 19, 7, 2, 1, 3, 4, 6, 8, 9, 10, 11, 12, 7, 7]),
-        np.empty(16, np.float32),
-    )
+    indices = np.array([5, 0, 19, 7, 2, 1, 3, 4, 6, 8, 9, 10, 11, 12, 7, 7])
+    out = np.empty(16, np.float32)
     _gather_and_scatter(array, indices, out)
     np.testing.assert_array_equal(out, before[indices, 1])
     before[indices, 2] = before[indices, 1]

@@ -111,10 +111,8 @@ def test_matches_brute_force(shift: tuple[float, float]) -> None:
     gaussians = random_gaussians(60, seed=3, log_scale=(-3.5, -0.5))
     # opaque ones reach both the clamp of alpha and the early stop
     gaussians.opacity_logits[:8] = 6.0
-    camera, background = (
-        front_camera(37, 21, shift),
-        torch.tensor([0.2, 0.5, 0.9], dtype=torch.float64),
-    )
+    camera = front_camera(37, 21, shift)
+    background = torch.tensor([0.2, 0.5, 0.9], dtype=torch.float64)
     out = ReferenceRasterizer().render(gaussians, camera, 0, background)
     image, alpha, covered = brute_force(gaussians, camera, background.numpy())
     np.testing.assert_allclose(out.image.detach().numpy(), image, atol=1e-10)
@@ -197,10 +195,8 @@ def test_projection_matches_gsplat() -> None:
     )
     gaussians, camera = random_gaussians(200, seed=7), front_camera(64, 48)
     matrix = torch.eye(4, dtype=torch.float64)
-    matrix[:3, :3], matrix[:3, 3] = (
-        torch.from_numpy(camera.rotation),
-        torch.from_numpy(camera.translation),
-    )
+    matrix[:3, :3] = torch.from_numpy(camera.rotation)
+    matrix[:3, 3] = torch.from_numpy(camera.translation)
     intrinsics = torch.tensor(
         [[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]], dtype=torch.float64
     )

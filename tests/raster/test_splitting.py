@@ -90,10 +90,8 @@ class Slow:
     def loss(self, s: Tensor) -> Tensor:
         """Of heights [M, P]. The clamp to .99 passes the gradient; the heights decide what is
         skipped."""
-        colour, through = (
-            torch.zeros(len(self.pixels), 3).double(),
-            torch.ones(len(self.pixels)).double(),
-        )
+        colour = torch.zeros(len(self.pixels), 3).double()
+        through = torch.ones(len(self.pixels)).double()
         alive = torch.ones(len(self.pixels), dtype=torch.bool)
         for k in self.order:
             alpha = s[k] + (s[k].detach().clamp_max(CONSTANTS.alpha_max) - s[k].detach())

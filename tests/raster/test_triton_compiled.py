@@ -81,11 +81,7 @@ def step(
     return gaussians, output
 
 
-@pytest.mark.parametrize(
-    "target",
-    TARGETS,
-    ids="sm_{}".format,
-)
+@pytest.mark.parametrize("target", TARGETS, ids="sm_{}".format)
 def test_kernels_compile_without_spills(
     launches: list[Launch], target: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:

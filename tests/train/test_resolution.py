@@ -155,10 +155,8 @@ def test_a_small_picture_is_the_filtered_one_from_the_same_place(
     expected = np.einsum("ih,hwc,jw->ijc", rows, image / 1.0, columns)
     assert np.abs(targets.get(0).numpy() - expected).max() <= 0.5 + 1e-4
     x, y, z = camera.rotation @ np.array([0.1, -0.2, 0.3]) + camera.translation
-    across, down = (
-        (camera.fx * x / z + camera.cx) / camera.width,
-        (camera.fy * y / z + camera.cy) / camera.height,
-    )
+    across = (camera.fx * x / z + camera.cx) / camera.width
+    down = (camera.fy * y / z + camera.cy) / camera.height
     assert (small.fx * x / z + small.cx) / width == pytest.approx(across)
     assert (small.fy * y / z + small.cy) / height == pytest.approx(down)
 

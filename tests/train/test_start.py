@@ -118,10 +118,8 @@ def seen_by_brute_force(points: np.ndarray, scene: Scene) -> float:
         for view in scene.train:
             x, y, z = view.camera.rotation @ point + view.camera.translation
             if z > 0.2:
-                column, row = (
-                    view.camera.fx * x / z + view.camera.cx,
-                    view.camera.fy * y / z + view.camera.cy,
-                )
+                column = view.camera.fx * x / z + view.camera.cx
+                row = view.camera.fy * y / z + view.camera.cy
                 seen += 0 <= column < view.camera.width and 0 <= row < view.camera.height
         shares.append(seen >= 2)
     return float(np.mean(shares))

@@ -217,10 +217,8 @@ class ADC(Budgeted):
     def prune(self, refinement: Refinement) -> None:
         """Remove faint Gaussians and, after the first opacity reset, huge ones."""
         values = refinement.gaussians.values
-        faint, huge = (
-            self.faint(values.opacity_logits),
-            self.huge(refinement.step, values.log_scales),
-        )
+        faint = self.faint(values.opacity_logits)
+        huge = self.huge(refinement.step, values.log_scales)
         self.remove(refinement, faint, huge)
 
     def reset_opacity(self, refinement: Refinement) -> None:

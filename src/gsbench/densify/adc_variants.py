@@ -281,10 +281,8 @@ class SteepGS(ADC):
             saddles.candidates, -saddles.values, 1, self.allowance(refinement)
         )
         indices = selected.nonzero().squeeze(-1)  # [S]
-        parents, is_large = (
-            gaussians.values.detach().select(indices),
-            saddles.large[indices].unsqueeze(-1),
-        )
+        parents = gaussians.values.detach().select(indices)
+        is_large = saddles.large[indices].unsqueeze(-1)
         direction = saddles.directions[indices].to(parents.means)  # [S, 3]
         noise = standard_normal((2 * len(parents), 3), refinement.rng, parents.means)
         lengths = (noise * parents.scales.repeat(2, 1)).norm(dim=-1, keepdim=True)  # [2 S, 1]
@@ -383,10 +381,8 @@ class ResGS(ADC):
             super().observe(step, render)
 
     def rules(self, refinement: Refinement) -> list[Rule]:
-        step, rules = (
-            refinement.step,
-            [rule for rule in super().rules(refinement) if rule != self.reset_opacity],
-        )
+        step = refinement.step
+        rules = [rule for rule in super().rules(refinement) if rule != self.reset_opacity]
         if self.warming_up(step):
             rules = []
         fading = self.iteration_at(self.fade_start) <= step < self.fade_stop

@@ -303,10 +303,8 @@ class MRNF(Budgeted):
 
     def decay(self, refinement: Refinement) -> None:
         """Lower all opacities and scales a little. Adam's moments stay."""
-        values, remaining = (
-            refinement.gaussians.values,
-            max(0.0, 1 - refinement.step / self.decay_until),
-        )
+        values = refinement.gaussians.values
+        remaining = max(0.0, 1 - refinement.step / self.decay_until)
         opacities = values.opacities - self.opacity_decay * remaining
         margin = max(
             MIN_DECAYED, torch.finfo(opacities.dtype).eps

@@ -73,10 +73,8 @@ class FastGS(AbsGS):
         """Compute the count and the pruning score of every Gaussian."""
         values, views = refinement.gaussians.values, self.context.training_views
         indices = draw_views(views, self.score_views, refinement.rng)
-        total, weighted = (
-            torch.zeros_like(values.opacity_logits),
-            torch.zeros_like(values.opacity_logits),
-        )
+        total = torch.zeros_like(values.opacity_logits)
+        weighted = torch.zeros_like(values.opacity_logits)
         for index in indices:
             render = views.render(index, values, refinement.step)
             bad = error_map(render.image, views.image(index)) > self.error_threshold
@@ -95,10 +93,8 @@ class FastGS(AbsGS):
     def prune(self, refinement: Refinement) -> None:
         """Remove some of the faint and huge Gaussians, more likely those with high scores."""
         values, score = refinement.gaussians.values, self.statistics["score"]
-        faint, huge = (
-            self.faint(values.opacity_logits),
-            self.huge(refinement.step, values.log_scales),
-        )
+        faint = self.faint(values.opacity_logits)
+        huge = self.huge(refinement.step, values.log_scales)
         # Only Gaussians from before the round have a score. They come first, without the removed
         # split parents.
         split_parents = refinement.event.split_gradient // (self.split_children - 1)
@@ -211,10 +207,8 @@ class Taming(ADC):
         if refinement.step // self.interval - self.start // self.interval > self.prune_rounds:
             return
         values, score = refinement.gaussians.values, self.statistics["score"]
-        faint, huge = (
-            self.faint(values.opacity_logits),
-            self.huge(refinement.step, values.log_scales),
-        )
+        faint = self.faint(values.opacity_logits)
+        huge = self.huge(refinement.step, values.log_scales)
         budget = int((faint | huge).sum()) // 2
         drawn = draw(score > 0, 1 / score, budget, refinement.rng)
         self.remove(refinement, faint & drawn, huge & drawn)

@@ -163,10 +163,8 @@ class Volumetric(ADC):
         if self.volume_order == "before_adc":
             before = refinement.gaussians.values.log_scales
             large = self.selected_by_volume(before)
-            number, log_scales = (
-                torch.where(large, 1, number),
-                torch.where(large.unsqueeze(-1), before, log_scales),
-            )
+            number = torch.where(large, 1, number)
+            log_scales = torch.where(large.unsqueeze(-1), before, log_scales)
         else:
             large = self.selected_by_volume(log_scales)
         number = torch.where(large, (1 + self.volume_gain) * number, number)

@@ -187,10 +187,8 @@ def check_picture_sizes(pairs: Sequence[PicturePair]) -> None:
     """Raise `InputError` for a picture whose size differs from its photograph's: pictures are never
     resized."""
     for pair in pairs:
-        (width, height), (wanted_width, wanted_height) = (
-            image_size(pair.picture),
-            image_size(pair.photograph),
-        )
+        (width, height) = image_size(pair.picture)
+        (wanted_width, wanted_height) = image_size(pair.photograph)
         if (width, height) != (wanted_width, wanted_height):
             raise InputError(
                 f"{pair.picture} is {width}x{height} px, but its photograph {pair.photograph} "

@@ -149,10 +149,8 @@ def similarity_rows(memory, begin, end, height, width, image, target, divisor, d
             continue
         similarity = splat(ZERO)
         for i in range(0, numbers, LANES):
-            mean_x, mean_y = (
-                _blur_column(ring, 0, i, center, length),
-                _blur_column(ring, part, i, center, length),
-            )
+            mean_x = _blur_column(ring, 0, i, center, length)
+            mean_y = _blur_column(ring, part, i, center, length)
             square = _blur_column(ring, 2 * part, i, center, length)
             product = _blur_column(ring, 3 * part, i, center, length)
             a1 = fma(mean_x * mean_y, TWO, F_C1)

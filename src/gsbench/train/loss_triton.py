@@ -128,13 +128,11 @@ def measure_similarity(
     number = tl.program_id(0) * STRIP + tl.arange(0, STRIP)  # [STRIP] of a row
     first = tl.program_id(1) * rows
     zero = tl.zeros([STRIP], tl.float32)
-    mean_x, mean_y, square_x, square_y, product = (
-        _zeros(zero),
-        _zeros(zero),
-        _zeros(zero),
-        _zeros(zero),
-        _zeros(zero),
-    )
+    mean_x = _zeros(zero)
+    mean_y = _zeros(zero)
+    square_x = _zeros(zero)
+    square_y = _zeros(zero)
+    product = _zeros(zero)
     total_similarity, total_l1 = zero, zero
     plane = height.to(tl.int64) * numbers
     for row in range(first - RADIUS, tl.minimum(first + rows, height) + RADIUS):
@@ -223,11 +221,9 @@ def differentiate(
                 product += _load(
                     derivatives + 2 * plane, row, neighbour, height, numbers, _weight(k)
                 )
-        d_mean, d_square, d_product = (
-            _push(d_mean, mean),
-            _push(d_square, square),
-            _push(d_product, product),
-        )
+        d_mean = _push(d_mean, mean)
+        d_square = _push(d_square, square)
+        d_product = _push(d_product, product)
 
         center = row - RADIUS
         inside = (center >= first) & (number < numbers)
@@ -291,13 +287,11 @@ class _TritonLossFunction(torch.autograd.Function):
             launch_grid(add_up, 1)(
                 sums, grid[0] * grid[1], float(image.numel()), loss.ssim_weight, values, GROUP=1024
             )
-        ctx.weight, ctx.scale, ctx.derivatives, ctx.rows, ctx.grid = (
-            loss.ssim_weight,
-            scale,
-            derivatives,
-            rows,
-            grid,
-        )
+        ctx.weight = loss.ssim_weight
+        ctx.scale = scale
+        ctx.derivatives = derivatives
+        ctx.rows = rows
+        ctx.grid = grid
         ctx.save_for_backward(image, target)
         ctx.set_materialize_grads(False)
         total, l1, similarity = values.unbind()

@@ -98,12 +98,10 @@ def _window_energies(
     half_height, half_width = (
         (side * fractions / 2 + 1e-9).astype(int) for side in (height, width)
     )  # [F] px
-    top, bottom, left, right = (
-        row - half_height,
-        row + half_height,
-        column - half_width,
-        column + half_width,
-    )
+    top = row - half_height
+    bottom = row + half_height
+    left = column - half_width
+    right = column + half_width
     energies = sums[bottom, right] - sums[top, right] - sums[bottom, left] + sums[top, left]
     energies[-1] = sums[-1, -1]
     return energies

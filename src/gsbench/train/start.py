@@ -238,11 +238,9 @@ def _views_of(
         x, y, z = local[ahead].T
         column, row = np.floor([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy])
         inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-        seen, column, row = (
-            ahead[inside],
-            column[inside].astype(np.int64),
-            row[inside].astype(np.int64),
-        )
+        seen = ahead[inside]
+        column = column[inside].astype(np.int64)
+        row = row[inside].astype(np.int64)
         seen_by[seen] += 1
         distance = np.linalg.norm(local[seen], axis=1)
         is_nearer = distance < nearest[seen]

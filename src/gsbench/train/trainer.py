@@ -119,12 +119,10 @@ class Trainer:
         seed: int,
         snapshot_at: Collection[int] = (),
     ) -> None:
-        self.scene, self.densifier, self.rasterizer, self.options = (
-            scene,
-            densifier,
-            rasterizer,
-            options,
-        )
+        self.scene = scene
+        self.densifier = densifier
+        self.rasterizer = rasterizer
+        self.options = options
         self.snapshot_at = frozenset(snapshot_at)
         self.device = initial.means.device
         initial = densifier.prepare(initial)
@@ -341,11 +339,9 @@ class Trainer:
     def _resume(self, folder: Path) -> None:
         state = load_checkpoint(folder)
         if state is not None:
-            self.step, self.seconds, self.losses.smoothed = (
-                state["step"],
-                state["seconds"],
-                state["smoothed_loss"],
-            )
+            self.step = state["step"]
+            self.seconds = state["seconds"]
+            self.losses.smoothed = state["smoothed_loss"]
             self.gaussians = TrainableGaussians.load(
                 state["gaussians"], self.gaussians.rates, self.gaussians.spatial_scale, self.device
             )

@@ -91,10 +91,8 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
     ) -> tuple[Tensor, Tensor, Tensor, ForwardPass]:
         """Project, sort, bin, composite; see `StagedRasterizer`."""
         count, view = len(gaussians), CameraNumbers.of(request.camera)
-        image, alpha = (
-            self._tensors.empty((view.height, view.width, 3)),
-            self._tensors.empty((view.height, view.width)),
-        )
+        image = self._tensors.empty((view.height, view.width, 3))
+        alpha = self._tensors.empty((view.height, view.width))
         radii = torch.empty(count, dtype=torch.int32)
         arena = self._frames.lease(request.lifetime)
         records = arena.take("records", (count * at.RECORD,), np.float32)

@@ -477,7 +477,7 @@ def _scatter_splitting(g_splitting, indices, d00, d01, d11, shear, rows):
     r1 = rows[1]
     r0 = plus(rows[0], shear, r1)
     s0, s1 = mixed(d00, r0, d01, r1), mixed(d01, r0, d11, r1)
-    # The sum over both rows of r^T s is symmetric: its entries above the diagonal are written twice.
+    # The matrix is symmetric: entries above the diagonal are written twice.
     xy = r0[0] * s0[1] + r1[0] * s1[1]
     xz = r0[0] * s0[2] + r1[0] * s1[2]
     yz = r0[1] * s0[2] + r1[1] * s1[2]

@@ -212,12 +212,10 @@ class TritonRasterizer(StagedRasterizer[TritonFrame]):
         lifetime = Lifetime()
         with torch.cuda.device_of(gaussians.means):
             scratch = self._scratch.lease(lifetime, gaussians.means.device)
-            units, lists, count, device = (
-                frame.units,
-                frame.lists,
-                len(gaussians),
-                gaussians.means.device,
-            )
+            units = frame.units
+            lists = frame.lists
+            count = len(gaussians)
+            device = gaussians.means.device
             covered = torch.zeros(count, dtype=torch.int32, device=device)
             sums, distances = torch.zeros(2, count, device=device)
             given = sums if values is None else values.detach().float().contiguous()

@@ -213,20 +213,16 @@ def colors(direction, dc, sh_rest, index, mask, DEGREE: tl.constexpr):
         c = _coefficients(sh_rest, index, 6, mask)
         rgb, by_x, by_z = _add(rgb, c, values[6]), _add(by_x, c, D3 * z), _add(by_z, c, D3 * x)
         c = _coefficients(sh_rest, index, 7, mask)
-        rgb, by_x, by_y = (
-            _add(rgb, c, values[7]),
-            _add(by_x, c, 2 * D4 * x),
-            _add(by_y, c, -2 * D4 * y),
-        )
+        rgb = _add(rgb, c, values[7])
+        by_x = _add(by_x, c, 2 * D4 * x)
+        by_y = _add(by_y, c, -2 * D4 * y)
     if DEGREE >= 3:
         xx, yy, zz = x * x, y * y, z * z
         xy, yz, xz = x * y, y * z, x * z
         c = _coefficients(sh_rest, index, 8, mask)
-        rgb, by_x, by_y = (
-            _add(rgb, c, values[8]),
-            _add(by_x, c, 6 * T0 * xy),
-            _add(by_y, c, 3 * T0 * (xx - yy)),
-        )
+        rgb = _add(rgb, c, values[8])
+        by_x = _add(by_x, c, 6 * T0 * xy)
+        by_y = _add(by_y, c, 3 * T0 * (xx - yy))
         c = _coefficients(sh_rest, index, 9, mask)
         rgb, by_x = _add(rgb, c, values[9]), _add(by_x, c, T1 * yz)
         by_y, by_z = _add(by_y, c, T1 * xz), _add(by_z, c, T1 * xy)
@@ -243,11 +239,9 @@ def colors(direction, dc, sh_rest, index, mask, DEGREE: tl.constexpr):
         rgb, by_x = _add(rgb, c, values[13]), _add(by_x, c, 2 * T5 * xz)
         by_y, by_z = _add(by_y, c, -2 * T5 * yz), _add(by_z, c, T5 * (xx - yy))
         c = _coefficients(sh_rest, index, 14, mask)
-        rgb, by_x, by_y = (
-            _add(rgb, c, values[14]),
-            _add(by_x, c, 3 * T6 * (xx - yy)),
-            _add(by_y, c, -6 * T6 * xy),
-        )
+        rgb = _add(rgb, c, values[14])
+        by_x = _add(by_x, c, 3 * T6 * (xx - yy))
+        by_y = _add(by_y, c, -6 * T6 * xy)
     return rgb, by_x, by_y, by_z
 
 

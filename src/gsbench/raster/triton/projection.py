@@ -162,10 +162,8 @@ def project(
     reach = tl.maximum((log2_opacity - LOG2_ALPHA_MIN) * (2 / LOG2_E), 0.0)
     half_x = tl.sqrt(reach * xx) * (1 + CONTOUR_MARGIN) + CONTOUR_MARGIN
     half_y = tl.sqrt(reach * yy) * (1 + CONTOUR_MARGIN) + CONTOUR_MARGIN
-    blocks_x, blocks_y = (
-        tl.ceil(v.width * (1.0 / BLOCK_WIDTH)),
-        tl.ceil(v.height * (1.0 / BLOCK_HEIGHT)),
-    )
+    blocks_x = tl.ceil(v.width * (1.0 / BLOCK_WIDTH))
+    blocks_y = tl.ceil(v.height * (1.0 / BLOCK_HEIGHT))
     inner_x, outer_x = _tile_range(
         tl.ceil(column - half_x), tl.floor(column + half_x) + 1, blocks_x, BLOCK_WIDTH
     )
@@ -173,10 +171,8 @@ def project(
         tl.ceil(row - half_y), tl.floor(row + half_y) + 1, blocks_y, BLOCK_HEIGHT
     )
     first_x, past_x = tl.maximum(first_x, inner_x), tl.minimum(past_x, outer_x)
-    first_y, past_y = (
-        tl.maximum(first_y * BLOCK_ROWS, inner_y),
-        tl.minimum(past_y * BLOCK_ROWS, outer_y),
-    )
+    first_y = tl.maximum(first_y * BLOCK_ROWS, inner_y)
+    past_y = tl.minimum(past_y * BLOCK_ROWS, outer_y)
     seen = visible & (growth * ALPHA_MIN < 1.0) & (first_x < past_x) & (first_y < past_y)
     tl.store(row_counts + index, tl.where(seen, past_y - first_y, 0), mask=inside)
     # The bits of positive float32 numbers sort like the numbers.
@@ -288,11 +284,9 @@ def _store_splitting(place, d00, d01, d11, shear, rows, mask):
     r1 = rows[1]
     s0 = (d00 * r0[0] + d01 * r1[0], d00 * r0[1] + d01 * r1[1], d00 * r0[2] + d01 * r1[2])
     s1 = (d01 * r0[0] + d11 * r1[0], d01 * r0[1] + d11 * r1[1], d01 * r0[2] + d11 * r1[2])
-    xy, xz, yz = (
-        r0[0] * s0[1] + r1[0] * s1[1],
-        r0[0] * s0[2] + r1[0] * s1[2],
-        r0[1] * s0[2] + r1[1] * s1[2],
-    )
+    xy = r0[0] * s0[1] + r1[0] * s1[1]
+    xz = r0[0] * s0[2] + r1[0] * s1[2]
+    yz = r0[1] * s0[2] + r1[1] * s1[2]
     tl.store(place, r0[0] * s0[0] + r1[0] * s1[0], mask=mask)
     tl.store(place + 1, xy, mask=mask)
     tl.store(place + 2, xz, mask=mask)
@@ -429,14 +423,10 @@ def backproject(
     s1 = (s1[0] + shear * s0[0], s1[1] + shear * s0[1], s1[2] + shear * s0[2])
     a0 = (dot(s0, matrix[0]), dot(s0, matrix[1]), dot(s0, matrix[2]))
     a1 = (dot(s1, matrix[0]), dot(s1, matrix[1]), dot(s1, matrix[2]))
-    j00, j02 = (
-        a0[0] * v.r00 + a0[1] * v.r01 + a0[2] * v.r02,
-        a0[0] * v.r20 + a0[1] * v.r21 + a0[2] * v.r22,
-    )
-    j11, j12 = (
-        a1[0] * v.r10 + a1[1] * v.r11 + a1[2] * v.r12,
-        a1[0] * v.r20 + a1[1] * v.r21 + a1[2] * v.r22,
-    )
+    j00 = a0[0] * v.r00 + a0[1] * v.r01 + a0[2] * v.r02
+    j02 = a0[0] * v.r20 + a0[1] * v.r21 + a0[2] * v.r22
+    j11 = a1[0] * v.r10 + a1[1] * v.r11 + a1[2] * v.r12
+    j12 = a1[0] * v.r20 + a1[1] * v.r21 + a1[2] * v.r22
     fx_z, fy_z = inverse_z * v.fx, inverse_z * v.fy
     free_x, free_y = x * inverse_z, y * inverse_z
     # The clamp of a slope passes the gradient only within the limits.
