@@ -126,8 +126,8 @@ def clamped_slopes(slope_x, slope_y, v):
 def image_rows(slope_x, slope_y, inverse_z, v):
     """A = J W, the derivative of the pixel by the world position, as two rows.
 
-    J is the derivative of x fx / z and y fy / z by the position in view space, at the slopes x/z and
-    y/z (EWA splatting, Zwicker et al. 2001; computeCov2D in 3DGS).
+    J is the derivative of x fx / z and y fy / z by the position in view space, at the slopes x/z
+    and y/z (EWA splatting, Zwicker et al. 2001; computeCov2D in 3DGS).
     """
     right, down, ahead = view_axes(v)
     first = stretched(plus(right, -slope_x, ahead), inverse_z * v.fx)

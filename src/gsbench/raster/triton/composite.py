@@ -48,8 +48,6 @@ UNROLL = tl.constexpr(4)  # entries between two checks whether all pixels have s
 UNROLL_BACK = tl.constexpr(2)  # entries per iteration of the backward pass's loop
 # -curve to entry of the inverse covariance, up to sign
 TO_PRECISION = tl.constexpr(2 * math.log(2.0))
-# entries of a footprint's row
-COVERED, VALUES, DISTANCES = tl.constexpr(0), tl.constexpr(1), tl.constexpr(2)
 
 
 @triton.jit
@@ -437,9 +435,33 @@ def cover(
         dx = columns - record[0]
         distance = tl.sqrt(tl.fma(dx, dx, (dy * dy)[None, :]))
         row = rows_out + tl.load(slots + position) * ROW
-        tl.store(row + COVERED, tl.sum(tl.sum(tl.where(blended, 1.0, 0.0), 0), 0))
-        tl.store(row + VALUES, tl.sum(tl.sum(tl.where(blended, given, 0.0), 0), 0))
-        tl.store(row + DISTANCES, tl.sum(tl.sum(tl.where(blended, distance, 0.0), 0), 0))
+        tl.store(row, tl.sum(tl.sum(tl.where(blended, 1.0, 0.0), 0), 0))
+        tl.store(row + 1, tl.sum(tl.sum(tl.where(blended, given, 0.0), 0), 0))
+        tl.store(row + 2, tl.sum(tl.sum(tl.where(blended, distance, 0.0), 0), 0))
+
+
+@triton.jit
+def sum_rows(index, own_rows, first_units, pair_ends, unit_widths, rows, NUMBERS: tl.constexpr):
+    """The first ``NUMBERS`` of the rows of each Gaussian, summed over its ``own_rows`` units.
+
+    ``sum_units`` has summed the pairs of a unit, into the row of its first pair.
+    """
+    unit = tl.load(first_units + index, mask=own_rows > 0, other=0)
+    zero = tl.zeros_like(own_rows).to(tl.float32)
+    # Triton's tuples grow by ``+``; it knows neither ``*`` nor comprehensions.
+    sums = ()
+    for _ in tl.static_range(NUMBERS):
+        sums = sums + (zero,)  # type: ignore[assignment]  # noqa: RUF005
+    for k in range(0, tl.max(own_rows, 0)):
+        active = k < own_rows
+        width = tl.load(unit_widths + unit + k, mask=active, other=0)
+        slot = tl.load(pair_ends + unit + k, mask=active, other=0) - width
+        grown = ()
+        for n in tl.static_range(NUMBERS):
+            own = tl.load(rows + slot * ROW + n, mask=width > 0, other=0.0)
+            grown = grown + (sums[n] + own,)  # type: ignore[assignment]  # noqa: RUF005
+        sums = grown
+    return sums
 
 
 @triton.jit(do_not_specialize=["count"])
@@ -455,21 +477,11 @@ def sum_cover(
     distances,
     GROUP: tl.constexpr,
 ):
-    """Write ``covered`` [N] int32, ``sums`` and ``distances`` [N] from the rows that ``sum_units``
-    has summed."""
+    """Write ``covered`` [N] int32, ``sums`` and ``distances`` [N] from the rows of units."""
     index = tl.program_id(0).to(tl.int64) * GROUP + tl.arange(0, GROUP)  # [GROUP]
-    own_rows = tl.load(row_counts + index, mask=index < count, other=0)
-    unit = tl.load(first_units + index, mask=own_rows > 0, other=0)
-    total = tl.zeros([GROUP], tl.float32)
-    value, distance = total, total
-    for k in range(0, tl.max(own_rows, 0)):
-        active = k < own_rows
-        width = tl.load(unit_widths + unit + k, mask=active, other=0)
-        place = rows + (tl.load(pair_ends + unit + k, mask=active, other=0) - width) * ROW
-        active = width > 0
-        total += tl.load(place + COVERED, mask=active, other=0.0)
-        value += tl.load(place + VALUES, mask=active, other=0.0)
-        distance += tl.load(place + DISTANCES, mask=active, other=0.0)
-    tl.store(covered + index, total.to(tl.int32), mask=index < count)
-    tl.store(sums + index, value, mask=index < count)
-    tl.store(distances + index, distance, mask=index < count)
+    inside = index < count
+    own_rows = tl.load(row_counts + index, mask=inside, other=0)
+    total, value, distance = sum_rows(index, own_rows, first_units, pair_ends, unit_widths, rows, 3)
+    tl.store(covered + index, total.to(tl.int32), mask=inside)
+    tl.store(sums + index, value, mask=inside)
+    tl.store(distances + index, distance, mask=inside)

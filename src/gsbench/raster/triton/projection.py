@@ -10,6 +10,7 @@ import triton.language as tl
 
 from gsbench.raster.base import CONSTANTS
 from gsbench.raster.staged import MIN_QUATERNION_NORM
+from gsbench.raster.triton.composite import sum_rows
 from gsbench.raster.triton.geometry import (
     F0,
     clamped_slopes,
@@ -40,7 +41,6 @@ from gsbench.raster.triton.layout import (
     BLOCK_WIDTH,
     BLUE,
     CLAMPED,
-    COLOR_SLOPES,
     COLUMNS,
     CURVE_T,
     CURVE_Y,
@@ -56,17 +56,6 @@ from gsbench.raster.triton.layout import (
     RIGHTMOST_Y,
     ROW,
     SHEAR,
-    SUM_ABS_T,
-    SUM_ABS_Y,
-    SUM_BLUE,
-    SUM_GREEN,
-    SUM_H,
-    SUM_H_T,
-    SUM_H_TT,
-    SUM_H_TY,
-    SUM_H_Y,
-    SUM_H_YY,
-    SUM_RED,
     TILE,
 )
 
@@ -86,10 +75,7 @@ INVISIBLE = tl.constexpr(-1e9)  # log2(opacity) of the invisible record
 
 @triton.jit
 def _tile_range(low, high, tiles, SIZE: tl.constexpr):
-    """First and past-the-last tile of ``SIZE`` px, of ``tiles``, for pixels ``low`` to ``high`` - 1.
-
-    Both are int32.
-    """
+    """First and past-the-last tile of ``SIZE`` px for the pixels ``low`` to ``high`` - 1; int32."""
     first = tl.floor(tl.minimum(tl.maximum(low * (1.0 / SIZE), 0.0), tiles))
     past = tl.floor(tl.minimum(tl.maximum((high + (SIZE - 1)) * (1.0 / SIZE), 0.0), tiles))
     return first.to(tl.int32), past.to(tl.int32)
@@ -242,36 +228,6 @@ def sum_units(pair_ends, unit_widths, unit_blocks, last_slots, units, rows, GROU
 
 
 @triton.jit
-def _sum_rows(
-    index, rows_of_blocks, first_units, pair_ends, unit_widths, rows, ABSOLUTE: tl.constexpr
-):
-    """The gradient sums of each Gaussian over its units: nine, and two more if ``ABSOLUTE``."""
-    unit = tl.load(first_units + index, mask=rows_of_blocks > 0, other=0)
-    zero = tl.zeros_like(rows_of_blocks).to(tl.float32)
-    sums = (zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero)
-    for k in range(0, tl.max(rows_of_blocks, 0)):
-        active = k < rows_of_blocks
-        width = tl.load(unit_widths + unit + k, mask=active, other=0)
-        slot = tl.load(pair_ends + unit + k, mask=active, other=0) - width
-        active = width > 0
-        place = rows + slot * ROW
-        sums = (
-            sums[0] + tl.load(place + SUM_H, mask=active, other=0.0),
-            sums[1] + tl.load(place + SUM_H_T, mask=active, other=0.0),
-            sums[2] + tl.load(place + SUM_H_Y, mask=active, other=0.0),
-            sums[3] + tl.load(place + SUM_H_TT, mask=active, other=0.0),
-            sums[4] + tl.load(place + SUM_H_TY, mask=active, other=0.0),
-            sums[5] + tl.load(place + SUM_H_YY, mask=active, other=0.0),
-            sums[6] + tl.load(place + SUM_RED, mask=active, other=0.0),
-            sums[7] + tl.load(place + SUM_GREEN, mask=active, other=0.0),
-            sums[8] + tl.load(place + SUM_BLUE, mask=active, other=0.0),
-            sums[9] + tl.load(place + SUM_ABS_T, mask=active & ABSOLUTE, other=0.0),
-            sums[10] + tl.load(place + SUM_ABS_Y, mask=active & ABSOLUTE, other=0.0),
-        )
-    return sums
-
-
-@triton.jit
 def _store_splitting(place, d00, d01, d11, shear, rows, mask):
     """Write the splitting matrices F^T U^T (D G D - h D) U F (SteepGS, arXiv 2505.05587).
 
@@ -331,9 +287,8 @@ def backproject(
     index = tl.program_id(0).to(tl.int64) * GROUP + tl.arange(0, GROUP)  # [GROUP]
     row_count = tl.load(row_counts + index, mask=index < count, other=0)
     seen = row_count > 0
-    h, h_t, h_y, h_tt, h_ty, h_yy, red, green, blue, abs_t, abs_y = _sum_rows(
-        index, row_count, first_units, pair_ends, unit_widths, rows, ABSOLUTE
-    )
+    sums = sum_rows(index, row_count, first_units, pair_ends, unit_widths, rows, 9 + 2 * ABSOLUTE)
+    h, h_t, h_y, h_tt, h_ty, h_yy, red, green, blue = sums[:9]
     mean, log_scale = load_vector(means, index, seen), load_vector(log_scales, index, seen)
     offset = from_camera(mean, v)
 
@@ -374,8 +329,8 @@ def backproject(
     tl.store(g_screen + 2 * index, g_column * half_width, mask=seen)
     tl.store(g_screen + 2 * index + 1, g_row * half_height, mask=seen)
     if ABSOLUTE:
-        tl.store(g_absolute + 2 * index, a * abs_t * half_width, mask=seen)
-        tl.store(g_absolute + 2 * index + 1, abs_y * half_height, mask=seen)
+        tl.store(g_absolute + 2 * index, a * sums[9] * half_width, mask=seen)
+        tl.store(g_absolute + 2 * index + 1, sums[10] * half_height, mask=seen)
 
     # Covariance: M = N S and N = A R. d loss / d M = U^T Q U M with Q = D G D, D = diag(a, e), U =
     # [[1, shear], [0, 1]] and G the second moments of h over (t, dy). For a needle the first row of
