@@ -1,5 +1,7 @@
-"""Every word on the command line is understood, or refused before any work: exit code 2 and one
-line that says why."""
+"""Every word on the command line is understood, or refused before any work.
+
+Exit code 2 and one line that says why.
+"""
 
 from __future__ import annotations
 

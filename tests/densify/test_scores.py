@@ -1,5 +1,4 @@
-"""Edge maps, sums over pixels, draws, and the two densifiers that use them, against restatements in
-numpy."""
+"""Edge maps, sums over pixels, draws, and two densifiers, against restatements in numpy."""
 
 from __future__ import annotations
 
@@ -133,8 +132,10 @@ def test_by_median_leaves_out_what_is_not_positive() -> None:
 
 
 def test_draws_are_in_proportion_and_without_replacement() -> None:
-    """Of four, two are drawn: the chance of each pair is known (first one, then one of the rest, by
-    score)."""
+    """Of four, two are drawn.
+
+    The chance of each pair is known (first one, then one of the rest, by score).
+    """
     scores = torch.tensor([9.0, 1.0, 2.0, 0.0, 3.0])
     candidates = torch.tensor([False, True, True, True, True])
     rng, counts = torch.Generator().manual_seed(0), np.zeros(5)

@@ -27,8 +27,10 @@ def test_isotropic_keeps_its_size() -> None:
 
 
 def test_elongated_by_two() -> None:
-    """Axes 2, 1, 1: kappa = 4; eigenvalues 4, 1, 1 become 1, 1/4, 1/4; axes 1, 1/2, 1/2; volume
-    divided by 8 = 4^1.5."""
+    """Axes 2, 1, 1: kappa = 4.
+
+    Eigenvalues 4, 1, 1 become 1, 1/4, 1/4; axes 1, 1/2, 1/2; volume divided by 8 = 4^1.5.
+    """
     parent = scales((2.0, 1.0, 1.0))
     assert math.exp(log_condition(parent)) == pytest.approx(4)
     child = Volumetric().child_log_scales(parent)

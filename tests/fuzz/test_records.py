@@ -1,5 +1,7 @@
-"""Damaged files of a runs folder cost themselves, never the rest: no crash, no hang, one line that
-names the file."""
+"""Damaged files of a runs folder cost themselves, never the rest.
+
+No crash, no hang, one line that names the file.
+"""
 
 from __future__ import annotations
 

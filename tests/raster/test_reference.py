@@ -1,5 +1,4 @@
-"""The reference rasterizer against finite differences, a pixel-by-pixel restatement, and gsplat's
-own torch code."""
+"""The reference rasterizer against finite differences, a restatement and gsplat's torch code."""
 
 from __future__ import annotations
 
@@ -166,8 +165,10 @@ def test_gradients_match_finite_differences(degree: int) -> None:
 
 
 def test_screen_gradient_is_the_gradient_of_the_projected_mean_in_ndc() -> None:
-    """Moving the principal point moves every projected mean alike: the sum of the screen gradients
-    says by how much."""
+    """Moving the principal point moves every projected mean alike.
+
+    The sum of the screen gradients says by how much.
+    """
     gaussians = random_gaussians(30, seed=5)
     background = torch.zeros(3, dtype=torch.float64)
 

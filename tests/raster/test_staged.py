@@ -1,5 +1,7 @@
-"""What executors share: checks of their inputs, reads from a device that do not wait, and the node
-of autograd."""
+"""What executors share.
+
+Checks of their inputs, reads from a device that do not wait, and the node of autograd.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,7 @@
-"""The schedule of sizes against a restatement of the rule; small pictures, the count that follows,
-and resuming."""
+"""The schedule of sizes against a restatement of the rule.
+
+Small pictures, the count that follows, and resuming.
+"""
 
 from __future__ import annotations
 
@@ -163,8 +165,10 @@ def test_a_small_picture_is_the_filtered_one_from_the_same_place(
 
 @pytest.mark.parametrize(("height", "width"), [(7, 5), (8, 5), (6, 4)])
 def test_the_energy_within_a_window(height: int, width: int) -> None:
-    """A window has as many pixels on either side of frequency zero; the last is the whole
-    spectrum."""
+    """A window has as many pixels on either side of frequency zero.
+
+    The last is the whole spectrum.
+    """
     (picture,) = soft_pictures(1, height, width, 3)
     spectrum = sum(np.abs(np.fft.fftshift(np.fft.fft2(picture[..., c] / 255.0))) for c in range(3))
     fractions = np.array([0.0, 0.4, 0.8, 1.0])
@@ -318,8 +322,10 @@ def test_interrupted_in_the_middle_it_ends_in_the_same_bits(
 def test_masks_are_as_small_as_their_pictures(
     tiny_scene: Scene, truth: Gaussians, rasterizer: Rasterizer, tmp_path: Path
 ) -> None:
-    """What a mask ignores has no part in a small picture either: whatever stands there, the
-    training is the same."""
+    """What a mask ignores has no part in a small picture either.
+
+    Whatever stands there, the training is the same.
+    """
     trained = []
     for value in (0, 255):
         views = []

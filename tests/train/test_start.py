@@ -1,5 +1,4 @@
-"""What is said of initial points before a training, for a scene whose points and colours are
-known."""
+"""What is said of initial points of a scene whose points and colours are known."""
 
 from __future__ import annotations
 

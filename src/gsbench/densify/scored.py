@@ -28,8 +28,7 @@ MIN_DIVISOR = 1e-6
 
 @dataclass
 class FastGS(AbsGS):
-    """AbsGS whose candidates grow only if they cover badly rendered pixels (Ren et al., arXiv
-    2511.04283).
+    """AbsGS that grows only on badly rendered pixels (Ren et al., arXiv 2511.04283).
 
     Each round draws ``score_views`` training views. A pixel is bad if its L1 error, shifted and
     scaled to [0, 1] in its view, is above ``error_threshold``. A Gaussian's count is the number of
@@ -58,8 +57,10 @@ class FastGS(AbsGS):
     final_score: Fraction = 0.9
 
     def rules(self, refinement: Refinement) -> list[Rule]:
-        """The rules of ADC, with scores before growth and the ceiling after pruning; then the final
-        prunings."""
+        """The rules of ADC, with scores before growth and the ceiling after pruning.
+
+        Then the final prunings.
+        """
         step = refinement.step
         rules = [rule for rule in super().rules(refinement) if rule != self.lower_opacity]
         if self.grow_by_gradient in rules:

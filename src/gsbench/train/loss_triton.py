@@ -69,8 +69,10 @@ def _zeros(like):
 
 @triton.jit
 def _push(sums, value):
-    """Advance the running sums by one row, whose blurred ``value`` is added. The first sum is then
-    complete."""
+    """Advance the running sums by one row, whose blurred ``value`` is added.
+
+    The first sum is then complete.
+    """
     return (
         tl.fma(value, W5, sums[1]),
         tl.fma(value, W4, sums[2]),
@@ -119,11 +121,11 @@ def measure_similarity(
     DIFFERENTIATE: tl.constexpr,
     STRIP: tl.constexpr,
 ):
-    """Write the sums of SSIM and of |image - target scale| over the ``rows`` of this program to
-    ``sums`` [programs, 2].
+    """Write the sums of SSIM and of |image - target scale| to ``sums`` [programs, 2].
 
-    If ``DIFFERENTIATE``, ``derivatives`` [3, H, 3 W] gets the derivatives of the sum of SSIM by the
-    blurred image, its blurred square and its blurred product with the target.
+    This program has ``rows`` rows. If ``DIFFERENTIATE``, ``derivatives`` [3, H, 3 W] gets the
+    derivatives of the sum of SSIM by the blurred image, its blurred square and its blurred product
+    with the target.
     """
     number = tl.program_id(0) * STRIP + tl.arange(0, STRIP)  # [STRIP] of a row
     first = tl.program_id(1) * rows
@@ -174,8 +176,10 @@ def measure_similarity(
 
 @triton.jit(do_not_specialize=["programs"])
 def add_up(sums, programs, size, ssim_weight, values, GROUP: tl.constexpr):
-    """Write loss, mean L1 and mean SSIM to ``values`` [3], from ``sums`` [programs, 2] over
-    ``size`` numbers."""
+    """Write loss, mean L1 and mean SSIM to ``values`` [3].
+
+    ``sums`` [programs, 2] are over ``size`` numbers.
+    """
     similarity, l1 = tl.zeros([GROUP], tl.float32), tl.zeros([GROUP], tl.float32)
     for start in range(0, programs, GROUP):
         program = start + tl.arange(0, GROUP)
@@ -235,8 +239,10 @@ def differentiate(
 
 
 class TritonLoss:
-    """Calls the kernels with pooled memory; see ``loss.PhotometricLoss``. Same bits on every run on
-    one GPU."""
+    """Calls the kernels with pooled memory; see ``loss.PhotometricLoss``.
+
+    Same bits on every run on one GPU.
+    """
 
     def __init__(self, ssim_weight: float) -> None:
         self.ssim_weight = ssim_weight

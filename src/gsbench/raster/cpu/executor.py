@@ -1,5 +1,7 @@
-"""The compiled CPU rasterizer: the stages of the forward and the backward pass, run on several
-threads."""
+"""The compiled CPU rasterizer.
+
+The stages of the forward and the backward pass, run on several threads.
+"""
 
 from dataclasses import dataclass
 from typing import Any
@@ -55,11 +57,11 @@ class ForwardPass:
 
 
 class CpuRasterizer(StagedRasterizer[ForwardPass]):
-    """float32 on the CPU, compiled by numba at first use. Same bits on every run and for any number
-    of ``threads``.
+    """float32 on the CPU, compiled by numba at first use.
 
-    Each render keeps its intermediate results until its graph is freed; then their memory is
-    reused. Several threads may call it at once.
+    Same bits on every run and for any number of ``threads``. Each render keeps its intermediate
+    results until its graph is freed; then their memory is reused. Several threads may call it at
+    once.
     """
 
     name = "cpu"
@@ -152,8 +154,7 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
         order: NDArray[np.uint64],
         records: NDArray[np.float32],
     ) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
-        """Starts of the lists of tiles, [tiles + 1], and the records of all lists, front to
-        back."""
+        """Starts of the lists of tiles, [tiles + 1], and the records of all, front to back."""
         tiles = view.tiles_x * view.tiles_y
         counts = arena.take("counts", (GAUSSIAN_SHARDS, tiles), np.int64)
         starts = arena.take("starts", (tiles + 1,), np.int64)
@@ -217,8 +218,10 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
         rows: NDArray[np.float32],
         want_splitting: bool,
     ) -> Gradients:
-        """Compute all gradients from the gradient sums in ``rows``; fill ``request.absolute``, if
-        given."""
+        """Compute all gradients from the gradient sums in ``rows``.
+
+        Fill ``request.absolute``, if given.
+        """
         count, take = len(gaussians), self._tensors.empty
         gradients = gaussians.map(lambda tensor: take(tuple(tensor.shape)))
         g_screen = take((count, 2))

@@ -267,8 +267,7 @@ def _first_shard(record_ints, base, v, tile_shard):
 
 @inlined
 def _take_rows(record, count, past, v, record_ints, tile_shard, rows, indices, sums):
-    """Sum the gradient rows of ``count`` records over the shards of their tiles, and clear the
-    rows.
+    """Sum the gradient rows of ``count`` records over their shards, and clear the rows.
 
     ``sums`` [16 * 16] gets one row per entry of a gradient row; ``indices`` [16] gets the
     Gaussians. If there are fewer than 16 records, the last one is repeated.
@@ -500,8 +499,10 @@ def _difference(a, b):
 
 @inlined
 def _unclamped(record, count, record_ints, sums, colors):
-    """The gradients by red, green and blue, 0 if the channel was clamped; also written to
-    ``colors`` [3 * 16]."""
+    """The gradients by red, green and blue, 0 if the channel was clamped.
+
+    Also written to ``colors`` [3 * 16].
+    """
     for lane in range(LANES):
         clamped = record_ints[(record + min(lane, count - 1)) * at.RECORD + at.CLAMPED]
         colors[lane] = ZERO if clamped & 1 else sums[at.SUM_RED * LANES + lane]
