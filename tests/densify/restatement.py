@@ -1,9 +1,8 @@
-"""One refinement round, stated again from the formulas: numpy, one Gaussian at a time, no code
-shared with gsbench.
+"""One refinement round, stated again from the formulas.
 
-A Gaussian is a dict of raw parameters with its two Adam moments. The normal draws come in as an
-iterator of rows, in the order in which the rules use them: all first children, then all second
-ones.
+Numpy, one Gaussian at a time, no code shared with gsbench. A Gaussian is a dict of raw parameters
+with its two Adam moments. The normal draws come in as an iterator of rows, in the order in which
+the rules use them: all first children, then all second ones.
 """
 
 from __future__ import annotations
@@ -42,8 +41,10 @@ def newborn(parent: Row, mean: np.ndarray, log_scales: np.ndarray) -> Row:
 def split_all(
     rows: list[Row], chosen: list[int], scales: dict[int, np.ndarray], noise: Iterator[np.ndarray]
 ) -> list[Row]:
-    """Two children for each chosen row, appended: every first child, then every second; the parents
-    go."""
+    """Two children for each chosen row, appended: every first child, then every second.
+
+    The parents go.
+    """
     children = []
     for _ in range(2):
         for i in chosen:

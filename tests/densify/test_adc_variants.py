@@ -30,8 +30,10 @@ from tests.gaussians.helpers import random_gaussians
 def absgs_growth(
     rows: list[restatement.Row], signed: np.ndarray, absolute: np.ndarray, noise: object
 ) -> tuple[list[restatement.Row], int, int]:
-    """Small (largest scale at most .001 of the extent): a copy where signed >= .0002; large: split
-    where absolute >= .0004, into two of 1 / 1.6."""
+    """Small (largest scale at most .001 of the extent): a copy where signed >= .0002.
+
+    Large: split where absolute >= .0004, into two of 1 / 1.6.
+    """
     largest = [np.exp(row["log_scales"]).max() for row in rows]
     clones = [i for i, size in enumerate(largest) if size <= 0.001 * EXTENT and signed[i] >= 0.0002]
     chosen = [
@@ -212,8 +214,10 @@ def test_views_of_equal_footprints_count_as_in_adc() -> None:
 
 
 def test_large_gaussians_at_the_edge_of_views_are_not_held_back() -> None:
-    """The paper's motive: one view in which much of it is seen, three that see an edge and have no
-    gradient."""
+    """The paper's motive.
+
+    One view in which much of it is seen, three that see an edge and have no gradient.
+    """
     views, densifier, baseline = Views(0), PixelGS(near_fraction=None), ADC()
     views.gradients[:] = 0
     views.gradients[0] = 3e-4
@@ -251,8 +255,10 @@ def test_a_render_that_does_not_say_is_refused() -> None:
 @pytest.mark.parametrize("step", [600, 3100])
 @pytest.mark.parametrize("rate", [0.1, 0.5, 3.0])
 def test_quantile_round(rate: float, step: int) -> None:
-    """The share with the largest gradients grows as in ADC, nobody that was never seen; then the
-    faintest go."""
+    """The share with the largest gradients grows as in ADC, nobody that was never seen.
+
+    Then the faintest go.
+    """
     densifier = QuantileADC(growth_rate=rate, prune_share=0.05)
     trainable, _ = prepared(densifier, 4)
     draws = np.random.default_rng(4)
@@ -311,11 +317,10 @@ def steep_gs_growth(
     threshold: float = -1e-6,
     opacity: float = 0.5,
 ) -> tuple[list[restatement.Row], int]:
-    """Two halves on either side along the least eigenvector for each that reaches .0002 and has an
-    eigenvalue below.
+    """Two halves along the least eigenvector for who reaches .0002 with a value below.
 
-    Large: scales / 1.6, at the length of a draw each; small: as large as before, a step of the
-    means away.
+    They lie on either side of the parent. Large: scales / 1.6, at the length of a draw each; small:
+    as large as before, a step of the means away.
     """
     chosen = [
         i
@@ -339,8 +344,10 @@ def steep_gs_growth(
 
 
 def given(densifier: SteepGS, seed: int, count: int = 60) -> tuple[np.ndarray, np.ndarray]:
-    """Statistics of three visible iterations: mean gradients [N] and symmetric matrices [N, 3, 3],
-    per iteration."""
+    """Statistics of three visible iterations.
+
+    Mean gradients [N] and symmetric matrices [N, 3, 3], per iteration.
+    """
     draw = np.random.default_rng(seed)
     gradient = draw.uniform(0, 4e-4, count)
     matrices = draw.normal(0, 1e-5, (count, 3, 3)) + 1e-5 * np.eye(3)
@@ -470,8 +477,10 @@ def with_opacity(row: restatement.Row, value: float, moments: bool = True) -> re
 def residual_split(
     rows: list[restatement.Row], gradient: np.ndarray, levels: np.ndarray, stage: int, noise: object
 ) -> tuple[list[restatement.Row], int]:
-    """Who reaches .00067 times 2^((level - stage) / 3), or .00067 at the stage and above, keeps .3
-    of its opacity and gets a child: drawn from it, 1.6 times smaller, as opaque as it was."""
+    """Who reaches .00067 times 2^((level - stage) / 3), at most .00067, gets a child.
+
+    It keeps .3 of its opacity. The child is drawn from it, 1.6 times smaller, as opaque as it was.
+    """
     parents, children = [], []
     for i, row in enumerate(rows):
         threshold = 0.00067 * (2 ** ((levels[i] - stage) / 3) if levels[i] < stage else 1)
@@ -521,8 +530,10 @@ def test_res_gs_round(seed: int, step: int, stage: int) -> None:
 
 
 def test_the_stages_are_those_of_the_authors_loop() -> None:
-    """Their counters, one iteration after another: three parts of each phase, changes at 2,500 and
-    6,000, a pause of 500 iterations after each."""
+    """Their counters, one iteration after another.
+
+    Three parts of each phase, changes at 2,500 and 6,000, a pause of 500 iterations after each.
+    """
     changes, level, warm, last, ahead = [2500, 6000], 1, 0, 700, 2500
     count = (ahead - last) // 3
     stages, paused, reached = {}, {}, 0

@@ -1,5 +1,7 @@
-"""Caps: freeze leaves a round out, the governor steers to a count; against counting one Gaussian at
-a time."""
+"""Caps: freeze leaves a round out, the governor steers to a count.
+
+Against counting one Gaussian at a time.
+"""
 
 from __future__ import annotations
 

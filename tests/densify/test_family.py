@@ -20,8 +20,10 @@ from tests.gaussians.helpers import random_gaussians
 @pytest.mark.parametrize("copies", [1, 2, 3, 8])
 @pytest.mark.parametrize("opacity", [0.1, 0.6, 0.95])
 def test_shared_opacity_preserves_centre_and_integral(copies: int, opacity: float) -> None:
-    """n coincident copies: the same opacity at the centre, and the same integral along a line
-    (numerically)."""
+    """n coincident copies.
+
+    The same opacity at the centre, and the same integral along a line (numerically).
+    """
     o = torch.tensor([opacity], dtype=torch.float64)
     new, factor = shared_opacity(o, torch.tensor([copies]))
     assert 1 - (1 - float(new)) ** copies == pytest.approx(opacity)

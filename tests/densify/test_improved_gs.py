@@ -19,8 +19,10 @@ from tests.gaussians.helpers import random_gaussians
 
 
 def halves(rows: list[restatement.Row], mean_gradient: np.ndarray) -> list[restatement.Row]:
-    """d = 0.45: centres at 3 d s along the longest axis; that axis times 0.55, the others times
-    sqrt(1 - 0.2025)."""
+    """d = 0.45: centres at 3 d s along the longest axis.
+
+    That axis times 0.55, the others times sqrt(1 - 0.2025).
+    """
     chosen = [i for i in range(len(rows)) if mean_gradient[i] >= 0.0008]
     children = []
     for side in (1, -1):
@@ -82,8 +84,10 @@ def expected_scores(gaussians: object, views: list[int]) -> np.ndarray:
 
 @pytest.mark.parametrize(("step", "views"), [(700, 2), (3400, 3), (6400, 3), (9400, 2)])
 def test_the_edge_aware_score_of_each_gaussian(step: int, views: int) -> None:
-    """The mean over the views drawn, each over its own mean; 400 iterations after the first two
-    resets, over all."""
+    """The mean over the views drawn, each over its own mean.
+
+    400 iterations after the first two resets, over all.
+    """
     densifier = EdgeAware(score_views=2)
     trainable, _ = started(densifier, step)
     with torch.no_grad():
@@ -112,8 +116,10 @@ def test_in_the_last_500_iterations_the_score_is_the_gradient_and_more_are_candi
 @pytest.mark.parametrize("step", [600, 3100, 14_900])
 @pytest.mark.parametrize("seed", range(2))
 def test_edge_aware_round(seed: int, step: int) -> None:
-    """Who is drawn becomes two halves along the longest axis; the faint go but in the last round,
-    the huge stay."""
+    """Who is drawn becomes two halves along the longest axis.
+
+    The faint go but in the last round, the huge stay.
+    """
     densifier = EdgeAware(gradient_threshold=3e-4, max_gaussians=COUNT + 9, cap="hard")
     trainable, gradient = started(densifier, seed)
     trainable.values.opacity_logits.data[3] = -9.0
@@ -184,8 +190,10 @@ def test_the_growth_control_is_a_root() -> None:
 
 
 def test_the_prunings_of_the_schedule() -> None:
-    """At iteration 300 below .02; at 3,300 and 6,300, after the round, the faintest fifth; resets
-    go to .05."""
+    """At iteration 300 below .02.
+
+    At 3,300 and 6,300, after the round, the faintest fifth; resets go to .05.
+    """
     densifier, events = EdgeAware(max_gaussians=60), {}
     for step in (299, 300, 3000, 3200, 3300, 6300, 9300, 12_300, 15_300):
         trainable, _ = prepared(densifier, 2)
@@ -260,8 +268,7 @@ def test_the_pressure_and_its_gradient(step: int, soft: bool) -> None:
 
 @pytest.mark.parametrize("sinks", [0.0, 2.0])
 def test_the_weight_follows_an_aim_that_falls_to_nothing(sinks: float) -> None:
-    """The authors' schedule, iteration by iteration, for opacities that stay once the first has set
-    the aim.
+    """The authors' schedule by iterations, for opacities that stay once the aim is set.
 
     Where they sank, the weight falls first, rests while the aim passes, and rises.
     """

@@ -88,8 +88,7 @@ def test_mcmc_round(seed: int, growth: float) -> None:
 
 
 def test_mcmc_noise() -> None:
-    """R S S R^T times a normal draw, times sigmoid(-100 (o - .005)), times 5e5 and the rate of the
-    means."""
+    """R S S R^T times a normal draw, sigmoid(-100 (o - .005)), 5e5 and the means' rate."""
     densifier, trainable = prepared(40, 1)
     trainable.values.opacity_logits.data.copy_(torch.linspace(-9, 2, 40))
     trainable.set_step(1)
@@ -108,8 +107,10 @@ def test_mcmc_noise() -> None:
 
 
 def scored(values: Gaussians) -> tuple[np.ndarray, np.ndarray]:
-    """Over the three views: the largest refine weight, and 1 + .25 times the mean edge score over
-    its median."""
+    """Over the three views.
+
+    The largest refine weight, and 1 + .25 times the mean edge score over its median.
+    """
     room, weight, edge = Room(), np.zeros(COUNT), np.zeros(COUNT)
     for view, camera in enumerate(room.cameras):
         image = ReferenceRasterizer().render(values, camera, 0, BLACK).image.detach()
@@ -121,8 +122,10 @@ def scored(values: Gaussians) -> tuple[np.ndarray, np.ndarray]:
 
 
 def half(row: restatement.Row, side: int) -> restatement.Row:
-    """Half a standard deviation to a side along the longest axis, which is halved; the others times
-    .85."""
+    """Half a standard deviation to a side along the longest axis, which is halved.
+
+    The others times .85.
+    """
     scales = np.exp(row["log_scales"])
     longest = int(np.argmax(scales))
     axis = restatement.rotation(row["quaternions"])[:, longest]

@@ -1,5 +1,7 @@
-"""Whole refinement rounds against the slow restatement: the same Gaussians, optimiser moments and
-events."""
+"""Whole refinement rounds against the slow restatement.
+
+The same Gaussians, optimiser moments and events.
+"""
 
 from __future__ import annotations
 
@@ -22,8 +24,10 @@ EXTENT = 4.0
 def prepared(
     densifier: Densifier, seed: int, count: int = 60
 ) -> tuple[TrainableGaussians, np.ndarray]:
-    """Gaussians with uneven Adam moments, and three observed iterations; also the mean gradient of
-    each."""
+    """Gaussians with uneven Adam moments, and three observed iterations.
+
+    Also the mean gradient of each.
+    """
     rng = np.random.default_rng(seed)
     gaussians = random_gaussians(count, seed, log_scale=(-6.0, 0.3))
     gaussians.opacity_logits.copy_(torch.from_numpy(rng.uniform(-8, 3, count)))
@@ -46,8 +50,10 @@ def prepared(
 def observe(
     densifier: Densifier, trainable: TrainableGaussians, rng: np.random.Generator, step: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Show the densifier a made-up render; returns the gradients [N, 2] and radii [N] of the points
-    in it."""
+    """Show the densifier a made-up render.
+
+    Returns the gradients [N, 2] and radii [N] of the points in it.
+    """
     count = len(trainable)
     points = torch.zeros(count, 2, dtype=torch.float64, requires_grad=True)
     points.grad = torch.from_numpy(rng.exponential(2e-4, (count, 2)))
@@ -251,8 +257,10 @@ SWITCHES: dict[str, list[object]] = {
 
 @pytest.mark.parametrize("seed", range(80))
 def test_any_combination_of_switches_goes_through_several_rounds(seed: int) -> None:
-    """A pairwise-covering draw of the switches; every round balances, stays finite and keeps to an
-    exact cap."""
+    """A pairwise-covering draw of the switches.
+
+    Every round balances, stays finite and keeps to an exact cap.
+    """
     rng = np.random.default_rng(seed)
     options = {name: values[rng.integers(len(values))] for name, values in SWITCHES.items()}
     if options["cap"] == "curve":
@@ -314,8 +322,10 @@ def test_opacity_reset_zeroes_the_opacity_moments_only() -> None:
 
 
 def test_refinements_of_the_paper_schedule() -> None:
-    """144 refinements at 600, 700 ... 14,900 and resets at 3000, 6000, 9000, 12,000 (the baseline's
-    own count)."""
+    """144 refinements at 600, 700 ...
+
+    14,900 and resets at 3000, 6000, 9000, 12,000 (the baseline's own count).
+    """
     densifier = ADC()
     gaussians = random_gaussians(4)
     gaussians = Gaussians(**gaussians.tensors())

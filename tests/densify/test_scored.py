@@ -19,8 +19,10 @@ from tests.densify.test_scores import BLACK, COUNT, Room, alphas, at, started
 
 
 def counted(values: Gaussians, threshold: float) -> tuple[np.ndarray, np.ndarray]:
-    """Over the three views: the mean number of bad pixels, rounded down, and loss times number,
-    scaled to [0, 1]."""
+    """Over the three views.
+
+    The mean number of bad pixels, rounded down, and loss times number, scaled to [0, 1].
+    """
     room, total, weighted = Room(), np.zeros(COUNT), np.zeros(COUNT)
     for view, camera in enumerate(room.cameras):
         image = ReferenceRasterizer().render(values, camera, 0, BLACK).image.detach()

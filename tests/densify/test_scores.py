@@ -1,5 +1,4 @@
-"""Edge maps, sums over pixels, draws, and the two densifiers that use them, against restatements in
-numpy."""
+"""Edge maps, sums over pixels, draws, and two densifiers, against restatements in numpy."""
 
 from __future__ import annotations
 
@@ -133,8 +132,10 @@ def test_by_median_leaves_out_what_is_not_positive() -> None:
 
 
 def test_draws_are_in_proportion_and_without_replacement() -> None:
-    """Of four, two are drawn: the chance of each pair is known (first one, then one of the rest, by
-    score)."""
+    """Of four, two are drawn.
+
+    The chance of each pair is known (first one, then one of the rest, by score).
+    """
     scores = torch.tensor([9.0, 1.0, 2.0, 0.0, 3.0])
     candidates = torch.tensor([False, True, True, True, True])
     rng, counts = torch.Generator().manual_seed(0), np.zeros(5)
@@ -180,10 +181,8 @@ def at(step: int, trainable: TrainableGaussians, rng: torch.Generator) -> Refine
 def taming_scores(trainable: TrainableGaussians, gradient: np.ndarray) -> np.ndarray:
     """The score over all three views, term by term."""
     room, values = Room(), trainable.values.detach()
-    scales, opacities = (
-        np.exp(values.log_scales.numpy()),
-        1 / (1 + np.exp(-values.opacity_logits.numpy())),
-    )
+    scales = np.exp(values.log_scales.numpy())
+    opacities = 1 / (1 + np.exp(-values.opacity_logits.numpy()))
     total = np.zeros(COUNT)
     for view, camera in enumerate(room.cameras):
         weights = alphas(values, camera)
@@ -233,10 +232,8 @@ def test_taming_round(seed: int) -> None:
     large = np.array([np.exp(row["log_scales"]).max() > 0.01 * EXTENT for row in rows])
     over = gradient >= 2e-4
     event = densifier.refine(600, trainable, torch.Generator().manual_seed(seed))
-    small_share, large_share = (
-        12 * (over & ~large).sum() // over.sum(),
-        12 * (over & large).sum() // over.sum(),
-    )
+    small_share = 12 * (over & ~large).sum() // over.sum()
+    large_share = 12 * (over & large).sum() // over.sum()
     assert (event.cloned, event.split_gradient) == (small_share, large_share)
     assert event.blocked_by_cap == over.sum() - small_share - large_share
 

@@ -1,5 +1,7 @@
-"""What the base keeps for every densifier: statistics that follow edits, lineage, saving, and the
-table of causes."""
+"""What the base keeps for every densifier.
+
+Statistics that follow edits, lineage, saving, and the table of causes.
+"""
 
 from __future__ import annotations
 
@@ -188,8 +190,10 @@ def test_a_keyword_that_no_base_takes_is_refused() -> None:
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 def test_state_goes_through_a_checkpoint_on_a_gpu() -> None:
-    """As the trainer does: everything in the checkpoint is moved to the GPU; the lineage belongs on
-    the CPU."""
+    """As the trainer does: everything in the checkpoint is moved to the GPU.
+
+    The lineage belongs on the CPU.
+    """
     cuda = torch.device("cuda")
     densifier = Gathering()
     gaussians = TrainableGaussians(

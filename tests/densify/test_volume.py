@@ -27,8 +27,10 @@ def test_isotropic_keeps_its_size() -> None:
 
 
 def test_elongated_by_two() -> None:
-    """Axes 2, 1, 1: kappa = 4; eigenvalues 4, 1, 1 become 1, 1/4, 1/4; axes 1, 1/2, 1/2; volume
-    divided by 8 = 4^1.5."""
+    """Axes 2, 1, 1: kappa = 4.
+
+    Eigenvalues 4, 1, 1 become 1, 1/4, 1/4; axes 1, 1/2, 1/2; volume divided by 8 = 4^1.5.
+    """
     parent = scales((2.0, 1.0, 1.0))
     assert math.exp(log_condition(parent)) == pytest.approx(4)
     child = Volumetric().child_log_scales(parent)
@@ -128,10 +130,8 @@ def test_threshold_modes() -> None:
     outlier = torch.cat(
         [log_scales, torch.full((3, 3), 2.0, dtype=torch.float64) + torch.tensor([0.0, 0.1, 0.2])]
     )
-    third, first = (
-        torch.quantile(log_volume(outlier), 0.75),
-        torch.quantile(log_volume(outlier), 0.25),
-    )
+    third = torch.quantile(log_volume(outlier), 0.75)
+    first = torch.quantile(log_volume(outlier), 0.25)
     expected = int((log_volume(outlier) > third + 1.5 * (third - first)).sum())
     assert run_volume_rule(outlier, threshold_mode="auto")[1][0].split_volume == expected >= 3
 

@@ -1,5 +1,7 @@
-"""The adapter on gsplat, without a GPU: on a stand-in with gsplat's signatures, against the float64
-reference."""
+"""The adapter on gsplat, without a GPU.
+
+On a stand-in with gsplat's signatures, against the float64 reference.
+"""
 
 from __future__ import annotations
 
@@ -95,8 +97,10 @@ def test_screen_points_have_a_gradient_though_nothing_else_wants_one(library: Mo
 
 
 def test_nothing_stays_alive_after_a_step(library: ModuleType) -> None:
-    """Without the garbage collector: a cycle through the graph would keep 60 MB a step at a million
-    Gaussians."""
+    """Without the garbage collector.
+
+    A cycle through the graph would keep 60 MB a step at a million Gaussians.
+    """
     rasterizer = GsplatRasterizer(library=library)
     camera, black = FAINT.camera(), torch.zeros(3)
     leaves = FAINT.gaussians().map(lambda tensor: tensor.float().requires_grad_())

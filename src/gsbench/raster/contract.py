@@ -1,7 +1,7 @@
-"""A test of the contract of ``raster.base``: it compares a rasterizer with the float64 reference on
-seeded scenes.
+"""A test of the contract of ``raster.base``.
 
-gsbench tests its own executors with the same scenes. To test yours:
+It compares a rasterizer with the float64 reference on seeded scenes. gsbench tests its own
+executors with the same scenes. To test yours:
 
     assert departures(MyRasterizer()) == []
 """
@@ -30,11 +30,10 @@ FOOTPRINT_TOLERANCE = 1e-3
 
 @dataclass(frozen=True)
 class Case:
-    """A seeded scene with its camera. ``principal`` is the offset of the principal point from the
-    image centre, px.
+    """A seeded scene with its camera.
 
-    ``spread`` scales the distances of the Gaussians from the axis through their middle, which is
-    ``depth`` away.
+    ``principal`` is the offset of the principal point from the image centre, px. ``spread`` scales
+    the distances of the Gaussians from the axis through their middle, which is ``depth`` away.
     """
 
     width: int
@@ -68,8 +67,10 @@ class Case:
         )
 
     def gaussians(self) -> Gaussians:
-        """float64 values that are exact in float32; some Gaussians are behind the camera or outside
-        the image."""
+        """float64 values that are exact in float32.
+
+        Some Gaussians are behind the camera or outside the image.
+        """
         generator = torch.Generator().manual_seed(self.width * 1000 + self.count)
 
         def normal(*shape: int) -> Tensor:
@@ -104,9 +105,9 @@ CASES = (
 def render_with_gradients(
     rasterizer: Rasterizer, case: Case, dtype: torch.dtype, device: str = "cpu"
 ) -> tuple[RenderOutput, dict[str, Tensor]]:
-    """Render ``case``; also return gradients, as float64 on the CPU, of a fixed random weighting of
-    image and alpha.
+    """Render ``case``.
 
+    Also return gradients, as float64 on the CPU, of a fixed random weighting of image and alpha.
     Includes the splitting matrices if the rasterizer offers them.
     """
     gaussians = case.gaussians().map(lambda tensor: tensor.to(device, dtype).requires_grad_())
@@ -138,8 +139,7 @@ def render_with_gradients(
 
 
 class Error(NamedTuple):
-    """The largest error of a quantity in a case, what the contract allows, and the place of the
-    error in words."""
+    """The largest error of a quantity in a case, its limit, and its place in words."""
 
     case: str
     quantity: str
@@ -164,11 +164,11 @@ class Error(NamedTuple):
 def departures(
     rasterizer: Rasterizer, device: str = "cpu", cases: tuple[Case, ...] = CASES
 ) -> list[str]:
-    """List where ``rasterizer``, in float32 on ``device``, departs from the contract, one line
-    each; [] if nowhere.
+    """List where ``rasterizer``, in float32 on ``device``, departs from the contract.
 
-    For all ``cases``, it compares image, alpha, radii, all gradients and, if offered, footprint and
-    splitting matrices with the reference. It also tests a scene without Gaussians. Takes seconds.
+    One line each; [] if nowhere. For all ``cases``, it compares image, alpha, radii, all gradients
+    and, if offered, footprint and splitting matrices with the reference. It also tests a scene
+    without Gaussians. Takes seconds.
     """
     lines = []
     for case in cases:
@@ -182,10 +182,10 @@ def departures(
 
 
 def measure(rasterizer: Rasterizer, case: Case, device: str) -> list[Error]:
-    """The largest error of each quantity of ``rasterizer``, in float32 on ``device``, against the
-    float64 reference.
+    """The largest error of each quantity of ``rasterizer`` against the float64 reference.
 
-    A shape or dtype that is not the contract's is an infinite error.
+    It runs in float32 on ``device``. A shape or dtype that is not the contract's is an infinite
+    error.
     """
     expected, references = render_with_gradients(ReferenceRasterizer(), case, torch.float64)
     output, gradients = render_with_gradients(rasterizer, case, torch.float32, device)
@@ -274,8 +274,7 @@ Place = Callable[[int], str]  # words for the place of a tensor's flat index
 
 
 def footprint_errors(output: RenderOutput, expected: RenderOutput) -> dict[str, float]:
-    """The error of each field of ``output``'s footprint against ``expected``, relative to the
-    field's sum."""
+    """The error of each field of ``output``'s footprint, relative to the field's sum."""
     height, width = expected.alpha.shape
     values = torch.rand(
         height, width, generator=torch.Generator().manual_seed(8), dtype=torch.float64

@@ -1,9 +1,8 @@
-"""The readable definition of the rasterizer in torch, tile by tile, for any device, float32 or
-float64.
+"""The readable definition of the rasterizer in torch, tile by tile.
 
-Tests compare the faster executors with this one in float64. The formulas are those of EWA splatting
-(Zwicker et al. 2001) as in 3DGS (Kerbl et al. 2023); the constants are in
-``raster.base.RasterConstants``.
+It runs on any device, in float32 or float64. Tests compare the faster executors with this one in
+float64. The formulas are those of EWA splatting (Zwicker et al. 2001) as in 3DGS (Kerbl et al.
+2023); the constants are in ``raster.base.RasterConstants``.
 """
 
 from collections.abc import Iterator
@@ -139,8 +138,10 @@ class ReferenceRasterizer:
 
 
 def pixel_centres(x0: int, y0: int, x1: int, y1: int, like: Tensor) -> Tensor:
-    """The pixel centres of a rectangle, row by row, [P, 2] (x, y), with the dtype and on the device
-    of ``like``."""
+    """The pixel centres of a rectangle, row by row, [P, 2] (x, y).
+
+    They have the dtype and the device of ``like``.
+    """
     return torch.cartesian_prod(
         torch.arange(y0, y1, dtype=like.dtype, device=like.device),
         torch.arange(x0, x1, dtype=like.dtype, device=like.device),
@@ -148,11 +149,10 @@ def pixel_centres(x0: int, y0: int, x1: int, y1: int, like: Tensor) -> Tensor:
 
 
 def project(gaussians: Gaussians, camera: Camera) -> Projection:
-    """Project the Gaussians to the image plane; leave out those behind ``near`` or with an unusable
-    covariance.
+    """Project the Gaussians to the image plane.
 
-    A first pass without a graph selects the usable ones, so that an overflow in another Gaussian
-    cannot reach their gradients.
+    Leave out those behind ``near`` or with an unusable covariance. A first pass without a graph
+    selects the usable ones, so that an overflow in another Gaussian cannot reach their gradients.
     """
     with torch.no_grad():
         depths = view_depths(gaussians, camera)  # [N]
@@ -174,8 +174,10 @@ def project(gaussians: Gaussians, camera: Camera) -> Projection:
 def _to_image(
     gaussians: Gaussians, camera: Camera
 ) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor], Tensor]:
-    """Means [M, 2] px; entries xx, xy, yy of the blurred 2D covariances, each [M], px^2; view
-    depths [M]."""
+    """Means [M, 2] px.
+
+    Entries xx, xy, yy of the blurred 2D covariances, each [M], px^2; view depths [M].
+    """
     rotation = gaussians.means.new_tensor(camera.rotation)  # [3, 3]
     translation = gaussians.means.new_tensor(camera.translation)  # [3]
     x, y, z = (gaussians.means @ rotation.T + translation).unbind(-1)  # each [M]
@@ -204,8 +206,10 @@ def _to_image(
 
 
 def mean_jacobians(means: Tensor, camera: Camera) -> Tensor:
-    """The Jacobians [M, 2, 3] of the projected means, px, by ``means`` [M, 3], without the limits
-    on the slopes."""
+    """The Jacobians [M, 2, 3] of the projected means, px, by ``means`` [M, 3].
+
+    They have no limits on the slopes.
+    """
     rotation = means.new_tensor(camera.rotation)  # [3, 3]
     # each [M, 1]
     x, y, z = (means @ rotation.T + means.new_tensor(camera.translation)).unsqueeze(-1).unbind(1)
@@ -215,8 +219,10 @@ def mean_jacobians(means: Tensor, camera: Camera) -> Tensor:
 
 
 def tile_rectangles(projected: Projection, camera: Camera, tile: int) -> tuple[Tensor, Tensor]:
-    """The tiles that each Gaussian's square of side 2 radius touches: first and past-the-last,
-    int64 [M, 2] (x, y)."""
+    """The tiles that each Gaussian's square of side 2 radius touches.
+
+    First and past-the-last, int64 [M, 2] (x, y).
+    """
     means, radii = projected.means.detach(), projected.radii.unsqueeze(-1)
     grid = torch.tensor(
         [-(-camera.width // tile), -(-camera.height // tile)], device=means.device
@@ -234,8 +240,10 @@ def tile_rectangles(projected: Projection, camera: Camera, tile: int) -> tuple[T
 def bin_gaussians(
     depths: Tensor, tile_min: Tensor, tile_max: Tensor, tiles_x: int
 ) -> list[tuple[int, Tensor]]:
-    """List all tiles with Gaussians: the row-major number, and the Gaussians [K], front to back
-    (ties by index)."""
+    """List all tiles with Gaussians.
+
+    The row-major number, and the Gaussians [K], front to back (ties by index).
+    """
     order = torch.sort(depths, stable=True).indices  # [M]
     low, size = tile_min[order], (tile_max - tile_min)[order].clamp_min(0)  # [M, 2]
     counts = size.prod(-1)  # [M]
@@ -254,8 +262,10 @@ def bin_gaussians(
 def members_of_tiles(
     depths: Tensor, tile_min: Tensor, tile_max: Tensor, camera: Camera
 ) -> Iterator[tuple[Tensor, tuple[int, int, int, int]]]:
-    """Yield, for each tile with Gaussians, those [K], front to back, and its pixels: first x, y;
-    past-the-last x, y."""
+    """Yield, for each tile with Gaussians, those [K], front to back, and its pixels: first x, y.
+
+    Past-the-last x, y.
+    """
     tile, tiles_x = CONSTANTS.tile, -(-camera.width // CONSTANTS.tile)
     for number, members in bin_gaussians(depths, tile_min, tile_max, tiles_x):
         x, y = number % tiles_x * tile, number // tiles_x * tile
@@ -289,12 +299,11 @@ def blending_weights(
     opacities: Tensor,
     image_probe: Tensor | None = None,
 ) -> Tensor:
-    """Alpha times transmittance, [P, K], for the arguments of ``composite``; 0 where a Gaussian is
-    not blended.
+    """Alpha times transmittance, [P, K], for the arguments of ``composite``.
 
-    ``image_probe`` [K, 2, 2] is zero. Its gradient is the sum over pixels of (d loss / d s) times
-    the second derivative of s by the projected mean, where s is the opacity times the density at
-    the pixel.
+    0 where a Gaussian is not blended. ``image_probe`` [K, 2, 2] is zero. Its gradient is the sum
+    over pixels of (d loss / d s) times the second derivative of s by the projected mean, where s is
+    the opacity times the density at the pixel.
     """
     dx, dy = (means - pixels.unsqueeze(1)).unbind(-1)  # [P, K]
     power = -0.5 * (conics[:, 0] * dx * dx + conics[:, 2] * dy * dy) - conics[:, 1] * dx * dy

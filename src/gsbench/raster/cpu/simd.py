@@ -100,8 +100,10 @@ def _register_operator(
     emit: Callable[..., Any],
     gives: types.Type = VECTOR,
 ) -> None:
-    """Make numba compile ``functions`` of one of the combinations ``operands`` to ``emit(builder,
-    *operands)``."""
+    """Make numba compile ``functions`` to ``emit(builder, *operands)``.
+
+    They take any of the combinations ``operands``.
+    """
 
     class _Template(AbstractTemplate):
         def generic(self, args: Sequence[Any], kws: Any) -> Any:
@@ -213,8 +215,10 @@ def store(typing_context, array, index, value):
 
 
 def _places(context: Any, builder: Any, sig: Any, args: Any) -> Iterator[Any]:
-    """The addresses of ``array.flat[indices[k] * stride + offset]`` for each lane k; ``args[:4]``
-    are these four."""
+    """The addresses of ``array.flat[indices[k] * stride + offset]`` for each lane k.
+
+    ``args[:4]`` are these four.
+    """
     data = context.make_array(sig.args[0])(context, builder, args[0]).data
     indices = context.make_array(sig.args[1])(context, builder, args[1]).data
     stride, offset = (context.cast(builder, args[k], sig.args[k], types.intp) for k in (2, 3))
@@ -225,8 +229,10 @@ def _places(context: Any, builder: Any, sig: Any, args: Any) -> Iterator[Any]:
 
 @intrinsic
 def gather(typing_context, array, indices, stride, offset):
-    """``array.flat[indices[k] * stride + offset]`` in lane k; ``indices`` is an int64 array
-    [16]."""
+    """``array.flat[indices[k] * stride + offset]`` in lane k.
+
+    ``indices`` is an int64 array [16].
+    """
     _check_array(array)
 
     def codegen(context, builder, sig, args):
@@ -242,8 +248,10 @@ def gather(typing_context, array, indices, stride, offset):
 
 @intrinsic
 def scatter(typing_context, array, indices, stride, offset, value):
-    """Write lane k of ``value`` to ``array.flat[indices[k] * stride + offset]``; of equal indices
-    the last wins."""
+    """Write lane k of ``value`` to ``array.flat[indices[k] * stride + offset]``.
+
+    Of equal indices the last wins.
+    """
     _check_array(array)
 
     def codegen(context, builder, sig, args):
@@ -283,8 +291,7 @@ def _call(builder: Any, name: str, *operands: Any) -> Any:
 
 
 def _function(emit: Callable[..., Any], *kinds: Any) -> Any:
-    """An intrinsic of vectors, or vectors and numbers, that compiles to ``emit(builder,
-    *operands)``."""
+    """An intrinsic of vectors and numbers that compiles to ``emit(builder, *operands)``."""
     if not _fits(kinds):
         return None
 
@@ -382,8 +389,10 @@ def mask_from_bits(typing_context, bits):
 
 @intrinsic
 def lanes_with_bit(typing_context, masks, index, bit):
-    """A 64-bit word whose bit k is 1 if ``masks.flat[index + k] & bit`` is not 0; ``masks`` is a
-    uint16 array."""
+    """A 64-bit word whose bit k is 1 if ``masks.flat[index + k] & bit`` is not 0.
+
+    ``masks`` is a uint16 array.
+    """
     lanes = 64
     kind = ir.VectorType(ir.IntType(16), lanes)
 
@@ -450,8 +459,10 @@ def exp2(typing_context, a):
 
 @intrinsic
 def log2(typing_context, a):
-    """``log2(a)`` of positive normal numbers, with an error of at most 2e-7 max(1, |log2(a)|);
-    undefined elsewhere."""
+    """``log2(a)`` of positive normal numbers, with an error of at most 2e-7 max(1, |log2(a)|).
+
+    Undefined elsewhere.
+    """
 
     def emit(builder, x):
         # x = 2^n m with m from sqrt(1/2) to sqrt(2): n is the difference of the bits and those of
@@ -479,11 +490,11 @@ SUM_LANES = tuple(int(f"{k:04b}"[::-1], 2) for k in range(LANES))
 
 @intrinsic
 def lane_sums(typing_context, vectors):
-    """Sum the 16 lanes of each of up to 16 vectors; the k-th sum is in lane ``SUM_LANES[k]``, other
-    lanes are 0.
+    """Sum the 16 lanes of each of up to 16 vectors.
 
-    It is a tree of shuffles and additions in which each level merges pairs of vectors. So the sums
-    of eleven vectors take about as long as three single sums.
+    The k-th sum is in lane ``SUM_LANES[k]``, other lanes are 0. It is a tree of shuffles and
+    additions in which each level merges pairs of vectors. So the sums of eleven vectors take about
+    as long as three single sums.
     """
     if not (isinstance(vectors, types.UniTuple) and vectors.dtype is VECTOR):
         return None
