@@ -103,7 +103,7 @@ class TrialFolder:
         return f"{self.path.parent.parent.name}/{self.path.parent.name} seed {seed} ({hash8})"
 
     def require_no_links(self) -> None:
-        """Raise InputError if the folder, one above it, or its content is a link, pipe or device."""
+        """Raise InputError if the folder, one above it, or its content is a link or a device."""
         require_no_links(self.runs, self.path, below=True)
 
     # ---- state
