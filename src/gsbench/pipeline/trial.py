@@ -287,7 +287,7 @@ def _publish(
 
 # on whose versions a result depends
 PACKAGES = ("torch", "numpy", "numba", "pycolmap", "kornia", "gsplat")
-# what results.json takes from the training and from the evaluation as it is
+# fields that results.json takes from the training and from the evaluation as they are
 OF_TRAINING = (
     "iterations",
     "num_init_points",

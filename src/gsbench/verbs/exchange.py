@@ -49,9 +49,8 @@ def _evaluate_parser() -> ArgumentParser:
     parser.add_argument(
         "--truth",
         metavar="PLACE",
-        help="the photographs: a folder, a trial (folder or EXPERIMENT:SCENE:"
-        "DENSIFY), or a scene's name, whose test views are taken as a trial sees them; not needed "
-        "for predictions",
+        help="the photographs: a folder, a trial (folder or EXPERIMENT:SCENE:DENSIFY), or a "
+        "scene's name, whose test views are taken as a trial sees them; not needed for predictions",
     )
     parser.add_argument(
         "--protocol", choices=list(PROTOCOLS), help="default: that of the trial, or paper"
@@ -82,12 +81,10 @@ def export(argv: Sequence[str], runs: Path) -> int:
     parser = ArgumentParser(
         "export",
         "A .html file is a page with the model and the test cameras, made by npx "
-        "(docs/other_models.md). `gsbench "
-        "export init TRIAL --out DIR` copies the COLMAP model that the trial started from. "
-        "`gsbench export --results "
-        "EXPERIMENT` writes results, configurations and hashes as one small archive, without "
-        "pixels unless --pictures "
-        "is given.",
+        "(docs/other_models.md). `gsbench export init TRIAL --out DIR` copies the COLMAP model "
+        "that the trial started from. `gsbench export --results EXPERIMENT` writes results, "
+        "configurations and hashes as one small archive, without pixels unless --pictures is "
+        "given.",
     )
     parser.add_argument(
         "--results",

@@ -172,8 +172,7 @@ def _tables_parser() -> ArgumentParser:
         "--layout",
         choices=[*PAPER_TABLES, "plain", FAIRNESS],
         help=f"the paper's layout for any experiment; {FAIRNESS}: for each pair of arms in what "
-        "they differ, what was "
-        "tuned, and whose defaults those are",
+        "they differ, what was tuned, and whose defaults those are",
     )
     return parser
 

@@ -244,10 +244,9 @@ def _check_trackers(trials: Sequence[Trial], changes: Sequence[str]) -> None:
     for trial in trials:
         if address := untyped_address(trial.values["tracking"], typed_uri):
             raise InputError(
-                f"{trial.files.label} would send its results to {address}, an address from a "
-                "file: to allow it, type "
-                f"{TRACKER}={address} (for a trial in no plan: set {VARIABLE}={address}); "
-                "tracking=none sends nothing"
+                f"{trial.files.label} would send its results to {address}, an address from a file: "
+                f"to allow it, type {TRACKER}={address} (for a trial in no plan: set "
+                f"{VARIABLE}={address}); tracking=none sends nothing"
             )
 
 
