@@ -186,7 +186,7 @@ def make_cell(
 
 
 def short_reason(reason: str) -> str:
-    """The reason why a metric is missing, in one line; for weights results.json has the full text."""
+    """The reason why a metric is missing, in a line; of weights results.json has the full text."""
     if reason.startswith("weights not found: "):
         return f"{reason.partition(' (')[0]}; gsbench doctor says where they come from"
     return reason

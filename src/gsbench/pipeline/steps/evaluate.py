@@ -81,7 +81,7 @@ def evaluate_step(views: Views, trained: Step, parts: Parts) -> Step:
             inputs["raster"] = rasterizer_inputs(parts.rasterizer, user)
             inputs["background"] = list(parts.train.background)
         build = _build_from_model(views, trained, parts)
-    # Metrics that are off are left out, so that a new one changes no key of those who do not use it.
+    # Metrics that are off are left out, so that a new one changes no key of others.
     inputs |= {name: value for name, value in further.items() if value}
     return step_of(EVALUATE, inputs, build, user)
 
