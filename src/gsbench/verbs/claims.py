@@ -71,7 +71,8 @@ def check(argv: Sequence[str], runs: Path) -> int:
             raise InputError(
                 "check --from runs nothing, so no other option than --out goes with it"
             )
-        return _recheck(file, options.archive, options.out)
+        _recheck(file, options.archive, options.out)
+        return 0
     if options.out is not None:
         raise InputError(
             f"--out goes with --from; what is run here writes {HTML} beside its trials"
@@ -84,8 +85,8 @@ def check(argv: Sequence[str], runs: Path) -> int:
     return 0
 
 
-def _recheck(file: ClaimsFile, archive: Path, out: Path | None) -> int:
-    """Print the verdicts by the archive's trials; write their page to ``out`` if given. Returns 0.
+def _recheck(file: ClaimsFile, archive: Path, out: Path | None) -> None:
+    """Print the verdicts by the archive's trials, and write their page to ``out`` if given.
 
     Raises InputError for an ``out`` of another format.
     """
