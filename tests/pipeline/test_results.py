@@ -93,7 +93,7 @@ def made(tmp_path: Path, tiny_scene: Scene) -> Any:
     return make
 
 
-def test_results_are_put_together_from_the_steps(made: Any) -> None:
+def test_results_are_put_together_from_the_steps(made):
     found = made()
     expected = {
         "experiment": "x",
@@ -148,14 +148,7 @@ def test_results_are_put_together_from_the_steps(made: Any) -> None:
         ),
     ],
 )
-def test_what_nobody_knows_is_unavailable(
-    made: Any,
-    changes: dict[str, Any],
-    evaluated_from: str,
-    raster: str,
-    unknown: set[str],
-    timed: bool,
-) -> None:
+def test_what_nobody_knows_is_unavailable(made, changes, evaluated_from, raster, unknown, timed):
     found = made(**changes)
     assert (found.evaluated_from, found.raster) == (evaluated_from, raster)
     assert found.unavailable.keys() == {"flip"} | unknown
@@ -163,7 +156,7 @@ def test_what_nobody_knows_is_unavailable(
     assert (found.trained_by is None) == ("trained_by" not in changes)
 
 
-def test_the_newest_declaration_of_the_metric_is_repeated(made: Any) -> None:
+def test_the_newest_declaration_of_the_metric_is_repeated(made):
     home = TrialFolder.of(made.values).home
     home.mkdir(parents=True)
     times = [f"2026-01-01T0{hour}:00:00Z" for hour in range(4)]
@@ -176,7 +169,7 @@ def test_the_newest_declaration_of_the_metric_is_repeated(made: Any) -> None:
     assert made().declared == declared[1].summary()
 
 
-def test_the_hash_of_a_cloud_is_of_its_model_and_its_gaussians(tmp_path: Path) -> None:
+def test_the_hash_of_a_cloud_is_of_its_model_and_its_gaussians(tmp_path):
     store = Store(tmp_path)
 
     def hash_of(number: int, **changes: str) -> str:
@@ -199,14 +192,14 @@ def test_the_hash_of_a_cloud_is_of_its_model_and_its_gaussians(tmp_path: Path) -
     )
 
 
-def test_versions_are_those_of_installed_packages() -> None:
+def test_versions_are_those_of_installed_packages():
     found = versions()
     assert found["python"].startswith("3.")
     assert {"gsbench", "torch", "numpy", "pycolmap"} <= found.keys()
     assert None not in found.values()
 
 
-def test_the_users_files_are_what_a_capture_was_read_from(tmp_path: Path) -> None:
+def test_the_users_files_are_what_a_capture_was_read_from(tmp_path):
     store = Store(tmp_path / "store")
     (tmp_path / "model").mkdir()
     for name in ("cameras.bin", "images.bin", "points3D.bin"):
