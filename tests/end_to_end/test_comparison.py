@@ -3,7 +3,6 @@ outside."""
 
 from __future__ import annotations
 
-
 import pytest
 
 from gsbench.cli import run

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 
-
 pytestmark = pytest.mark.slow
 SECONDS = 900  # a trial of three iterations on a machine that has much else to do
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-
 from gsbench.config.compose import compose_one
 from gsbench.pipeline import trial as pipeline_trial
 from gsbench.pipeline.parts import Parts
