@@ -44,7 +44,7 @@ def rewrite(file: Path, change: Callable[[dict[str, bytes]], None]) -> None:
             archive.writestr(name, data)
 
 
-def test_results_settings_and_views_come_back(tmp_path: Path) -> None:
+def test_results_settings_and_views_come_back(tmp_path):
     file = export(tmp_path)
     there = load_experiment(tmp_path / "runs", "exp")
     back = unpack_archive(file, tmp_path / "other")
@@ -58,7 +58,7 @@ def test_results_settings_and_views_come_back(tmp_path: Path) -> None:
     ).read_text()
 
 
-def test_an_archive_is_small_and_the_same_results_make_the_same(tmp_path: Path) -> None:
+def test_an_archive_is_small_and_the_same_results_make_the_same(tmp_path):
     file = export(tmp_path, MANY)
     assert file.stat().st_size < 300_000
     before = file.read_bytes()
@@ -66,7 +66,7 @@ def test_an_archive_is_small_and_the_same_results_make_the_same(tmp_path: Path) 
     assert file.read_bytes() == before
 
 
-def test_no_pixels_and_no_paths_of_the_machine(tmp_path: Path) -> None:
+def test_no_pixels_and_no_paths_of_the_machine(tmp_path):
     runs = tmp_path / "runs"
     (path, *_) = write_runs(runs, Plan(pictures=True, views=2))
     config = yaml.safe_load((path / "config.yaml").read_text())
@@ -98,7 +98,7 @@ def test_no_pixels_and_no_paths_of_the_machine(tmp_path: Path) -> None:
     )
 
 
-def test_it_is_an_ro_crate(tmp_path: Path) -> None:
+def test_it_is_an_ro_crate(tmp_path):
     """The rules of RO-Crate 1.2, sections 3 (root data entity), 4 (data entities) and 2
     (packaging)."""
     file = export(tmp_path)
@@ -207,9 +207,7 @@ def flip_a_bit(file: Path) -> None:
         ),
     ],
 )
-def test_damage_of_every_kind_is_one_line_and_leaves_nothing(
-    tmp_path: Path, damage: Callable[[Path], None], message: str
-) -> None:
+def test_damage_of_every_kind_is_one_line_and_leaves_nothing(tmp_path, damage, message):
     file = export(tmp_path)
     damage(file)
     with pytest.raises(InputError) as raised:
@@ -220,7 +218,7 @@ def test_damage_of_every_kind_is_one_line_and_leaves_nothing(
     assert {path.name for path in tmp_path.iterdir()} <= {"runs", "exp.zip", "other"}
 
 
-def test_a_file_too_large_is_not_unpacked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_too_large_is_not_unpacked(tmp_path, monkeypatch):
     file = export(tmp_path)
     monkeypatch.setattr("gsbench.claims.archive.MAX_BYTES", 1000)
     with pytest.raises(InputError, match="no archive of gsbench's has so many"):
@@ -228,11 +226,8 @@ def test_a_file_too_large_is_not_unpacked(tmp_path: Path, monkeypatch: pytest.Mo
 
 
 def test_a_damaged_trial_is_left_out_by_name_and_the_rest_is_exported(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+    tmp_path, monkeypatch, capsys, caplog
+):
     runs = tmp_path / "runs"
     monkeypatch.setenv("GSBENCH_RUNS", str(runs))
     first, second, *_ = write_runs(runs, Plan())

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import json
 import shutil
-from pathlib import Path
 from typing import Any
 
 import pytest
 
 from gsbench.runs.keys import PACKAGE
 from gsbench.system.install import conf_dir
-from tests.end_to_end.conftest import SMALL, Run
+from tests.end_to_end.conftest import SMALL
 
 pytestmark = pytest.mark.slow
 
@@ -26,7 +25,7 @@ QUICK = [
 ]
 
 
-def test_an_edited_loss_is_trained_with(gsbench: Run, tmp_path: Path) -> None:
+def test_an_edited_loss_is_trained_with(gsbench, tmp_path):
     copy = tmp_path / "copy" / "src" / "gsbench"
     shutil.copytree(PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__"))
     shutil.copytree(conf_dir(), tmp_path / "copy" / "conf")

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from gsbench.cli import run
-from tests.end_to_end.conftest import SMALL, Run
+from tests.end_to_end.conftest import SMALL
 
 pytestmark = pytest.mark.slow
 
@@ -37,11 +37,8 @@ OWN = [
 
 
 def test_an_edited_densifier_is_never_averaged_with_what_it_was(
-    gsbench: Run,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+    gsbench, tmp_path, monkeypatch, capsys
+):
     runs = str(tmp_path / "runs")
     monkeypatch.setenv("GSBENCH_RUNS", runs)
 

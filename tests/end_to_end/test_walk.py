@@ -82,7 +82,7 @@ def crossings(files: list[str]) -> int:
     return sum(one != other for one, other in itertools.pairwise(folders))
 
 
-def test_a_way_is_counted_by_its_folders() -> None:
+def test_a_way_is_counted_by_its_folders():
     outer, inner = (
         [(1, "app/a.py"), (2, "config/b.py")],
         [(1, "app/a.py"), (3, "app/c.py"), (4, "launch/d.py")],
@@ -91,7 +91,7 @@ def test_a_way_is_counted_by_its_folders() -> None:
     assert crossings(way([outer, inner])) == 3  # conf, config, app, launch
 
 
-def test_from_the_yaml_to_the_split(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_from_the_yaml_to_the_split(tmp_path, monkeypatch):
     stacks: list[list[Frame]] = []
     calls: Counter[str] = Counter()
 

@@ -37,9 +37,7 @@ def composed(runs: Path, *words: str) -> Trial:
     return compose_one(["name=exp", f"runs={runs}", *words])
 
 
-def test_a_declaration_is_kept_with_its_time_and_changes_are_added(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_declaration_is_kept_with_its_time_and_changes_are_added(tmp_path, caplog):
     undeclared, psnr, ssim = (
         composed(tmp_path, *words) for words in ([], ["eval.primary=psnr"], ["eval.primary=ssim"])
     )
@@ -55,8 +53,8 @@ def test_a_declaration_is_kept_with_its_time_and_changes_are_added(
 
 
 def test_trials_are_declared_with_the_metric_and_those_of_later_commands_are_added(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+    tmp_path, caplog
+):
     def say(*commands: tuple[str, ...]) -> list[dict[str, list[int]]]:
         trials = [composed(tmp_path, *words) for words in commands]
         declare(trials)
@@ -82,7 +80,7 @@ def test_trials_are_declared_with_the_metric_and_those_of_later_commands_are_add
     assert len(say((psnr, "densify=volumetric", "densify.volume_threshold=0.1"))[-1]) == 3
 
 
-def test_one_command_cannot_declare_two(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_one_command_cannot_declare_two(tmp_path, capsys):
     trials = [composed(tmp_path, f"eval.primary={metric}") for metric in ("psnr", "ssim")]
     with pytest.raises(
         InputError, match=r"trials of exp declare eval\.primary=psnr and eval\.primary=ssim"
@@ -92,9 +90,7 @@ def test_one_command_cannot_declare_two(tmp_path: Path, capsys: pytest.CaptureFi
     assert "eval.primary does not make a different trial" in capsys.readouterr().err
 
 
-def test_claims_are_kept_beside_declared_metrics(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_claims_are_kept_beside_declared_metrics(tmp_path, caplog):
     home = tmp_path / "exp"
 
     def claims(metric: str, moment: str) -> Declaration:
@@ -115,7 +111,7 @@ def test_claims_are_kept_beside_declared_metrics(
 
 
 @pytest.mark.slow
-def test_results_keep_what_was_declared_and_a_change_computes_nothing(tmp_path: Path) -> None:
+def test_results_keep_what_was_declared_and_a_change_computes_nothing(tmp_path):
     words = [*TINY, f"runs={tmp_path}", "name=exp"]
     assert run([*words, "eval.primary=psnr"]) == 0
     (file,) = tmp_path.glob("exp/*/*/*/results.json")

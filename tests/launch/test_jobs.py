@@ -33,20 +33,20 @@ def collected(folder: Path, failure: str | None = None) -> Outcome:
     return collect(job, trial.folder, [trial])
 
 
-def test_a_failed_job_is_told_by_the_trials_folder(folder: Path) -> None:
+def test_a_failed_job_is_told_by_the_trials_folder(folder):
     outcome = collected(folder, json.dumps({"message": "no scene\nat all", "bad_input": True}))
     assert outcome.message == f"no scene; log: {folder / 'log'}"
     assert (outcome.status, outcome.bad_input) == ("failed", True)
 
 
-def test_a_job_that_left_nothing_is_told_by_its_log(folder: Path) -> None:
+def test_a_job_that_left_nothing_is_told_by_its_log(folder):
     outcome = collected(folder)
     assert outcome.status == "failed"
     assert "ended without a result" in outcome.message
     assert "its last lines: RuntimeError: no luck" in outcome.message
 
 
-def test_one_trial_of_each_cloud_begins_first() -> None:
+def test_one_trial_of_each_cloud_begins_first():
     def trial(scene: str, seed: int) -> Any:
         return SimpleNamespace(values={"scene": scene, "init": "sfm", "seed": seed})
 
@@ -57,9 +57,7 @@ def test_one_trial_of_each_cloud_begins_first() -> None:
     ]
 
 
-def test_a_link_of_submitits_does_not_refuse_the_next_submission_and_any_other_does(
-    tmp_path: Path,
-) -> None:
+def test_a_link_of_submitits_does_not_refuse_the_next_submission_and_any_other_does(tmp_path):
     values = compose_one(["name=cluster", f"runs={tmp_path}"]).values
     folder = job_folder(values)
     script = folder / "2_submission.sh"

@@ -6,7 +6,6 @@ import csv
 import json
 from contextlib import nullcontext
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -58,9 +57,7 @@ def inputs(fps: list[int] | None = None, **options: Any) -> dict[str, Any]:
     return dict(step.inputs)
 
 
-def test_an_evaluation_that_asks_for_nothing_new_has_the_key_that_it_had(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_an_evaluation_that_asks_for_nothing_new_has_the_key_that_it_had(monkeypatch):
     monkeypatch.setattr(keys, "edited", lambda files: {})  # as in a release
     old = {"train": TRAINED.key, "protocol": "paper-1", "unavailable": FOUR_LPIPS, "maps": False}
     assert inputs() == old
@@ -72,7 +69,7 @@ def test_an_evaluation_that_asks_for_nothing_new_has_the_key_that_it_had(
     )
 
 
-def test_speed_is_measured_at_the_size_that_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_speed_is_measured_at_the_size_that_is_asked_for(monkeypatch):
     case, sizes = CASES[-1], []
 
     class Watched(ReferenceRasterizer):
@@ -102,9 +99,7 @@ def told(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
     return told
 
 
-def test_an_evaluation_measures_what_its_pictures_hold(
-    tmp_path: Path, truth: Gaussians, tiny_scene: Scene, told: list[tuple[Any, ...]]
-) -> None:
+def test_an_evaluation_measures_what_its_pictures_hold(tmp_path, truth, tiny_scene, told):
     """Metrics by the formula from the PNG files; the nearest training view by trying all; an
     earlier model's means."""
     store, init = Store(tmp_path), Step(INIT, {}, lambda folder: None)
@@ -180,9 +175,7 @@ def test_an_evaluation_measures_what_its_pictures_hold(
     assert told == [("views", 1, 2), ("views", 2, 2), ("iteration 7", 1, 2), ("iteration 7", 2, 2)]
 
 
-def test_another_programs_renders_are_measured_as_they_are(
-    tmp_path: Path, tiny_scene: Scene, told: list[tuple[Any, ...]]
-) -> None:
+def test_another_programs_renders_are_measured_as_they_are(tmp_path, tiny_scene, told):
     store = Store(tmp_path)
     renders = store.path(TRAINED) / "renders"
     renders.mkdir(parents=True)

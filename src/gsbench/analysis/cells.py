@@ -118,9 +118,8 @@ def check_averageable(trials: Sequence[TrialResult], where: str) -> None:
         )
         raise InputError(
             f"the table cell {where} would average trials made by different versions of {listed}: "
-            "`gsbench status "
-            f"{experiment}` names the superseded ones, `gsbench status {experiment} "
-            "--forget-superseded` removes them"
+            f"`gsbench status {experiment}` names the superseded ones, `gsbench status "
+            f"{experiment} --forget-superseded` removes them"
         )
     by_scene = group_by(trials, lambda trial: trial.scene)
     for scene, group in by_scene.items():
@@ -187,7 +186,7 @@ def make_cell(
 
 
 def short_reason(reason: str) -> str:
-    """Why a metric is missing, in one line; for weights results.json has the full text."""
+    """The reason why a metric is missing, in a line; of weights results.json has the full text."""
     if reason.startswith("weights not found: "):
         return f"{reason.partition(' (')[0]}; gsbench doctor says where they come from"
     return reason

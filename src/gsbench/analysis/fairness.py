@@ -250,10 +250,8 @@ def _search_line(own: Sequence[TrialResult], experiment: str, search: TuningReco
     more = len(search.points) - MAX_VALUES
     line = (
         f"{search.arm}: {chosen} is the best of {counted(len(search.points), 'point')} by "
-        f"{search.metric} of {VIEWS} "
-        f"({listed(search.scenes)}; seed {', '.join(map(str, search.seeds))}; the search "
-        f"{experiment}), "
-        f"{_when(own, experiment)}. "
+        f"{search.metric} of {VIEWS} ({listed(search.scenes)}; seed "
+        f"{', '.join(map(str, search.seeds))}; the search {experiment}), {_when(own, experiment)}. "
         f"Tried: {', '.join(tried)}{f' and {more} more' if more > 0 else ''}."
     )
     return line if _has_settings(own[0], best) else f"{line} These trials have other values."
@@ -288,8 +286,7 @@ def _varied_settings(trials: Sequence[TrialResult], own: TrialResult) -> list[st
         return []
     return [
         f"{own.arm}: {counted(len(choices), 'choice')} of its settings were run here. They differ "
-        f"in {listed(keys)}, "
-        "and all were measured on the test views that the verdict uses."
+        f"in {listed(keys)}, and all were measured on the test views that the verdict uses."
     ]
 
 

@@ -278,12 +278,9 @@ def _differences(
     setup_notes = [f"The paper on {topic}: it {words}." for topic, words in setup.items()]
     legend = (
         f"Δ is measured minus printed. Of {marks.total()} cells {marks[ROUNDING]} are within "
-        f"rounding ({ROUNDING}), "
-        f"{marks[INTERVAL]} within our {CONFIDENCE:.0%} t interval of the mean ({INTERVAL}), "
-        f"{marks[DIFFERS]} differ "
-        f"({DIFFERS}). The paper prints no deviation, so the spread of its own trials is not "
-        "taken into account; a "
-        "single trial has no interval."
+        f"rounding ({ROUNDING}), {marks[INTERVAL]} within our {CONFIDENCE:.0%} t interval of the "
+        f"mean ({INTERVAL}), {marks[DIFFERS]} differ ({DIFFERS}). The paper prints no deviation, "
+        "so the spread of its own trials is not taken into account; a single trial has no interval."
     )
     headings = ("scene", "init", "densify")
     return Table(title, headings, tuple(columns), tuple(rows), (legend, *notes, *setup_notes))

@@ -154,7 +154,7 @@ def quantity(name: str, trials: Iterable[TrialResult]) -> Quantity:
 
 
 def asked_quantity(key: str, trials: Iterable[TrialResult] = ()) -> Quantity:
-    """What a question about ``key`` compares: a metric at the end of training, or a cost.
+    """The number that a question about ``key`` compares: a metric at the end, or a cost.
 
     If ``key`` is a user's metric that no trial has, the quantity has default facts.
     """

@@ -251,7 +251,7 @@ class TrialResult:
 
     @cached_property
     def question(self) -> str:
-        """What the held-out views ask, interpolation or extrapolation; "" for a list."""
+        """The question of the held-out views, interpolation or extrapolation; "" for a list."""
         kind = re.split("[ ,]", self.split, maxsplit=1)[0]
         return QUESTIONS.get(kind, "")
 

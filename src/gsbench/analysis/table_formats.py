@@ -156,10 +156,8 @@ def to_latex(table: Table) -> str:
     ).replace("\\begin{table}\n", "\\begin{table}\n\\centering\n")
     if table.notes:
         notes = "\\\\\n".join(escape_latex(note) for note in table.notes)
-        below = (
-            "\\par\\smallskip\\begin{minipage}{\\linewidth}\\footnotesize\n"
-            f"{notes}\n\\end{{minipage}}\n"
-        )
+        start = "\\par\\smallskip\\begin{minipage}{\\linewidth}\\footnotesize"
+        below = f"{start}\n{notes}\n\\end{{minipage}}\n"
         text = text.replace("\\end{table}", f"{below}\\end{{table}}")
     return f"% needs \\usepackage{{booktabs{',array' if table.wrapped else ''}}}\n{text}"
 

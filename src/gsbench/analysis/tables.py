@@ -308,8 +308,7 @@ def doubt_notes(trials: Sequence[TrialResult]) -> list[str]:
     if len(folders) > 1 and len(downscales) > 1:
         notes.append(
             "Pictures of scene.images and of scene.downscale were made by different filters: "
-            "results on them differ "
-            "by about 0.3 to 0.45 dB."
+            "results on them differ by about 0.3 to 0.45 dB."
         )
     for trial in trials:
         twins = trial.record.twins or TwinViews()
@@ -440,8 +439,7 @@ def machine_notes(trials: Sequence[TrialResult]) -> list[str]:
     rest = f"; not recorded: {unknown}" if unknown else ""
     return [
         f"The trials ran on {len(kinds)} kinds of machine: {listed}{rest}. There equal settings "
-        "give other last digits "
-        "and, after thousands of iterations, other results."
+        "give other last digits and, after thousands of iterations, other results."
     ]
 
 

@@ -65,8 +65,7 @@ def describe_round(verdict: RoundVerdict) -> list[str]:
     if verdict.counted:
         lines.append(
             f"{100 * verdict.consistent:.0f} % of the pairs shown again, swapped, had the same "
-            "answer; "
-            f"{100 * verdict.left:.0f} % of the votes were for the left side."
+            f"answer; {100 * verdict.left:.0f} % of the votes were for the left side."
         )
     return lines + [f"Left out: {person} {reason}." for person, reason in verdict.left_out.items()]
 
@@ -79,8 +78,7 @@ def _describe_pair(pair: PairVotes, final: bool) -> list[str]:
         parts += f", {50 + 50 * sum(means) / len(means):.0f} % of the {how} views" if means else ""
     return [
         f"{pair.arm} against {pair.baseline}: {_share(pair)} ({pair.wins} for it, {pair.losses} "
-        "against it, "
-        f"{pair.ties} without a difference{parts}).",
+        f"against it, {pair.ties} without a difference{parts}).",
         f"People like these, on these views: {_statement(pair.people, 'people', final)}.",
         f"Scenes like these, for these people: {_statement(pair.scenes, 'scenes', final)}.",
     ]

@@ -227,8 +227,7 @@ def prepare_other_sweeper(
     task.objective = Objective(sign, tuple(seeds))
     log.info(
         "hydra/sweeper=%s gets %s%s of test views, %s; gsbench's own sweeper would tune on "
-        "validation views and "
-        "can stop by looks",
+        "validation views and can stop by looks",
         name,
         "-" if sign != direction else "",
         metric,

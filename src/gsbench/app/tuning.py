@@ -267,9 +267,8 @@ def _describe(searches: Sequence[ArmSearch]) -> str:
     untuned = [search.record.arm for search in searches if not search.ranges]
     return (
         f"a search tunes first: {counted(first.wanted, 'point')} each for {listed(list(trials))}, "
-        f"by {first.metric} "
-        f"of validation views on {listed(first.scenes)} with {counted(len(first.seeds), 'seed')}, "
-        f"{sum(trials.values()) * first.wanted} trainings"
+        f"by {first.metric} of validation views on {listed(first.scenes)} with "
+        f"{counted(len(first.seeds), 'seed')}, {sum(trials.values()) * first.wanted} trainings"
         + (f"; not tuned: {listed(untuned)}" if untuned else "")
     )
 

@@ -62,8 +62,7 @@ def choose_switches(
         if name not in declared:
             raise InputError(
                 f"{name!r} is not a switch of densify={densify}{did_you_mean(name, declared)} "
-                "(there are "
-                f"{', '.join(declared) or 'none'})"
+                f"(there are {', '.join(declared) or 'none'})"
             )
     if not declared:
         raise InputError(

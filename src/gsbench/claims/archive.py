@@ -434,8 +434,7 @@ def crate_metadata(
         "@type": "Dataset",
         "name": f"{name}: results of gsbench",
         "description": f"{len(trials)} trainings of 3D Gaussian Splatting: {', '.join(arms)} on "
-        f"{', '.join(scenes)}, "
-        f"measured by {', '.join(protocols)}. No models.",
+        f"{', '.join(scenes)}, measured by {', '.join(protocols)}. No models.",
         "datePublished": day,
         "hasPart": [{"@id": file} for file in sizes],
     }

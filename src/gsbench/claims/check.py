@@ -264,9 +264,8 @@ def _check_same_claims(file: ClaimsFile, declaration: Declaration) -> None:
             if getattr(in_file, what) != getattr(before, what):
                 raise InputError(
                     f"claim {claim.id}: its {what} was {getattr(before, what)} when it was "
-                    "declared "
-                    f"({declaration.when}), and is {getattr(in_file, what)} in the file: use the "
-                    "file as it was then"
+                    f"declared ({declaration.when}), and is {getattr(in_file, what)} in the file: "
+                    "use the file as it was then"
                 )
         arms = [arm.densify for arm in (before.baseline, before.arm) if arm is not None]
         if arms != [claim.baseline, claim.arm]:
@@ -332,10 +331,9 @@ def make_page(
         which = "the verdict" if tested == 1 else f"any of the {tested} verdicts"
         lines.append(
             f"The chance that {which} is false is at most {100 * file.error_rate:g} %, over all "
-            "looks, if trainings "
-            "differ about normally (docs/verdict.md). A verdict is about these scenes at this "
-            "size. From six scenes on "
-            "there is also a statement about scenes like these, with its own error rate."
+            "looks, if trainings differ about normally (docs/verdict.md). A verdict is about these "
+            "scenes at this size. From six scenes on there is also a statement about scenes like "
+            "these, with its own error rate."
         )
     lines.append(_declared_line(declared, declarations))
     judged = list(
@@ -368,8 +366,7 @@ def _section(one: ClaimVerdict) -> ClaimSection:
     if answer is not None and answer.interval is not None:
         headline = (
             f"{verdict.quantity.name} of {claim.arm} against {claim.baseline}: "
-            f"{verdict.shown(answer.mean)} "
-            f"({100 * (1 - answer.level):.3g} % interval "
+            f"{verdict.shown(answer.mean)} ({100 * (1 - answer.level):.3g} % interval "
             f"{verdict.shown_interval(answer.interval)}); {one.reason}"
         )
         evidence += [
@@ -416,8 +413,7 @@ def _late_words(one: ClaimVerdict) -> str:
         return ""
     return (
         f"{counted(one.verdict.late, 'trial')} had been measured before this was declared. So the "
-        "metric shares the "
-        "error rate with all metrics that could have been chosen"
+        "metric shares the error rate with all metrics that could have been chosen"
     )
 
 

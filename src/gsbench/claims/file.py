@@ -292,9 +292,8 @@ def _check_metric(claim: Claim, file: ClaimsFile) -> None:
         key.lstrip("+").startswith(own) for key in file.settings
     ):
         raise InputError(
-            f"{where}: {claim.metric!r} is not a metric{did_you_mean(claim.metric, names)} "
-            f"(choose {', '.join(names)}; "
-            f"one of your own by settings: {{{own}_target_: mine.MyMetric}})"
+            f"{where}: {claim.metric!r} is not a metric{did_you_mean(claim.metric, names)} (choose "
+            f"{', '.join(names)}; one of your own by settings: {{{own}_target_: mine.MyMetric}})"
         )
     effect = claim.effect
     if asked_quantity(claim.metric).cost and not effect.relative:

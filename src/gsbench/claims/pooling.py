@@ -106,8 +106,7 @@ def describe(pooled: Pooled) -> list[str]:
     interval, further = test.interval(), pooled.prediction
     lines = [
         f"mean {test.mean:+.4g} (95 % interval {interval.low:+.4g} to {interval.high:+.4g}, p "
-        f"{test.p:.3g}) "
-        f"of {len(pooled.studies)} studies, each with the same weight",
+        f"{test.p:.3g}) of {len(pooled.studies)} studies, each with the same weight",
         f"studies differ by a deviation of {pooled.deviation:.3g}; a further one would lie between "
         f"{further.low:+.4g} and {further.high:+.4g}",
     ]
@@ -117,8 +116,7 @@ def describe(pooled: Pooled) -> list[str]:
         )
         lines.append(
             f"caution: the budgets differ ({budgets}): a difference at equal counts and one at "
-            "free counts answer two "
-            "questions, and this mean answers neither"
+            "free counts answer two questions, and this mean answers neither"
         )
     return lines
 
@@ -256,16 +254,14 @@ def _arm_pairs(
             several = baselines if len(baselines) > 1 else others
             raise InputError(
                 f"{path}: the name fits {' and '.join(map(str, several))}: choose trials with "
-                "--where "
-                "KEY=VALUE, or give the whole name of one"
+                "--where KEY=VALUE, or give the whole name of one"
             )
         if baselines and others:
             pairs.append((baselines[0], others[0]))
     if not pairs:
         raise InputError(
             f"{path} has no pair of {' or '.join(question.arm)} and "
-            f"{' or '.join(question.baseline)} (there are "
-            f"{', '.join(map(str, arms))})"
+            f"{' or '.join(question.baseline)} (there are {', '.join(map(str, arms))})"
         )
     return pairs
 

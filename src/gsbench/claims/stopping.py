@@ -112,10 +112,8 @@ class SweepInLooks:
         )
         return (
             f"stops when decided, by {questions[0].metric} and a least difference of "
-            f"{questions[0].least:g}: "
-            f"{counted(len(questions), 'pair')} of arms, looks at {', '.join(map(str, looks))} "
-            "seeds, "
-            f"{first} trials until the first, {most} at most"
+            f"{questions[0].least:g}: {counted(len(questions), 'pair')} of arms, looks at "
+            f"{', '.join(map(str, looks))} seeds, {first} trials until the first, {most} at most"
         )
 
 

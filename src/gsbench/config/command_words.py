@@ -72,8 +72,7 @@ def parse(argv: Sequence[str]) -> tuple[list[str], bool, bool]:
             name = "NAME" if "-cp" in word or "path" in word else name
             raise InputError(
                 f"{word}: gsbench's main configuration is its own: write yours to "
-                f"FOLDER/experiment/{name}.yaml, and "
-                f"give --config-dir FOLDER +experiment={name}"
+                f"FOLDER/experiment/{name}.yaml, and give --config-dir FOLDER +experiment={name}"
             )
         elif word.startswith("-"):
             group = word.lstrip("-").partition("=")[0]

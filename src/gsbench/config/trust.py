@@ -323,9 +323,8 @@ def _check_hydra(hydra: Mapping[str, Any], allowed: Sequence[str]) -> None:
             for text in (key, value):
                 if isinstance(text, str) and NOT_SWEPT.match(text):
                     raise InputError(
-                        f"{'.'.join(place)}: {text} cannot differ from job to job, and no file "
-                        "can allow it: "
-                        "type it on the command line"
+                        f"{'.'.join(place)}: {text} cannot differ from job to job, and no file can "
+                        "allow it: type it on the command line"
                     )
         elif isinstance(value, str) and "${" in value:
             # may become a class

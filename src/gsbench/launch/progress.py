@@ -170,6 +170,5 @@ def _in_words(means: dict[str, float], metric: Quantity, shared: int) -> str:
         return f"no arm leads in {metric.name}; {shared} trials of each are compared"
     return (
         f"{best} leads so far: {metric.name} {metric.format(means[best])}, mean of the {shared} "
-        "scenes and seeds that "
-        "all arms have. This is not a verdict."
+        "scenes and seeds that all arms have. This is not a verdict."
     )

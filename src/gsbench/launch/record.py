@@ -139,9 +139,8 @@ def declared_metrics(trials: Sequence[Trial]) -> dict[Path, str | None]:
         metric, before = trial.values["eval"].get("primary"), metrics.get(home)
         if metric and before and metric != before:
             raise InputError(
-                f"trials of {home.name} declare eval.primary={before} and eval.primary={metric}: "
-                "a verdict is about "
-                "one metric, so give one of them, or run two experiments (name=…)"
+                f"trials of {home.name} declare eval.primary={before} and eval.primary={metric}: a "
+                "verdict is about one metric, so give one of them, or run two experiments (name=…)"
             )
         metrics[home] = before or metric
     return metrics
@@ -183,8 +182,7 @@ def declare(trials: Sequence[Trial]) -> None:
         if same_metric:
             log.warning(
                 "%s: trials are added to those declared with %s; if there are results already, it "
-                "no longer decides "
-                "the verdict alone",
+                "no longer decides the verdict alone",
                 home.name,
                 metric,
             )

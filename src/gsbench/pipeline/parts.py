@@ -141,11 +141,9 @@ class Parts:
     def threads(self) -> int:
         """The CPU threads that the trial may use on this machine."""
         wanted = self.values["threads"]
-        return (
-            available_threads(self.values["launch"]["parallel"])
-            if wanted == "auto"
-            else int(wanted)
-        )
+        if wanted == "auto":
+            return available_threads(self.values["launch"]["parallel"])
+        return int(wanted)
 
     @cached_property
     def raster(self) -> Proven:
@@ -230,8 +228,7 @@ def build(group: str, values: dict[str, Any], allow_targets: list[str]) -> Any:
     elif options and not own:
         raise InputError(
             f"{group}._target_={target} has options but is not a dataclass: make it one, so that "
-            "results are stored "
-            "under their values"
+            "results are stored under their values"
         )
     try:
         return cls(**options)
@@ -256,8 +253,7 @@ def build_own_rasterizer(values: dict[str, Any], allow_targets: list[str]) -> Ra
     if not isinstance(name, str) or any(name == executor.name for executor in EXECUTORS):
         raise InputError(
             f"raster._target_={target} needs an attribute name, a text that results and tables "
-            "show and that no other "
-            f"rasterizer has; it has {name!r}"
+            f"show and that no other rasterizer has; it has {name!r}"
         )
     return rasterizer
 
@@ -274,8 +270,7 @@ def build_metrics(values: dict[str, Any], allow_targets: list[str]) -> dict[str,
         if facts_of(name, metrics[name]).direction == 0 and metric_and_question(primary)[0] == name:
             raise InputError(
                 f"eval.primary={primary}: {options['_target_']} does not say whether more or less "
-                "is better "
-                "(direction), so no verdict can be about it"
+                "is better (direction), so no verdict can be about it"
             )
     return metrics
 
@@ -297,8 +292,8 @@ def _check_names(cls: Any, target: str, options: dict[str, Any], group: str) -> 
         raise InputError(unknown_setting(key, unknown, parameters))
     raise InputError(
         f"{key} is not a setting{did_you_mean(unknown, parameters)} ({target} has: "
-        f"{', '.join(parameters) or 'none'}); "
-        f"remove it by ~{key}, or start from another choice, {group}=NAME"
+        f"{', '.join(parameters) or 'none'}); remove it by ~{key}, or start from another choice, "
+        f"{group}=NAME"
     )
 
 
@@ -324,12 +319,11 @@ def locate(target: str, group: str, allow_targets: list[str]) -> type:
     if module_digest(module) is None:
         log.warning("no file of %s was found: results do not record its version", target)
     if unnamed := unnamed_modules(loaded_before, {module, *permitted}):
-        words = ", ".join(unnamed)
         log.warning(
             "%s imports %s, and results do not record their versions: name them in allow_targets "
             "too",
             target,
-            words,
+            ", ".join(unnamed),
         )
     return cls
 

@@ -161,7 +161,7 @@ class Arm:
 
 @dataclass(frozen=True, kw_only=True)
 class Question(Record):
-    """Does ``arm`` differ from ``baseline`` in ``metric``, in the direction ``sign``, by ``least``?
+    """A question: is ``arm`` better than ``baseline`` in ``metric`` (``sign``) by ``least``?
 
     - ``sign``: of the claimed difference, arm minus baseline; 0 if no difference is claimed.
     - ``least``: the smallest difference that matters, in the metric's unit or (``relative``) as a

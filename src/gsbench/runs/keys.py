@@ -216,9 +216,8 @@ def step_of(
         ]
         if changed:
             raise InputError(
-                f"{', '.join(changed)} changed while {stage.name} ran, so it may have used the "
-                "old and the new "
-                "code: start again"
+                f"{', '.join(changed)} changed while {stage.name} ran, so it may have used the old "
+                "and the new code: start again"
             )
 
     if edited_rooms := edited(states):

@@ -103,7 +103,7 @@ class TrialFolder:
         return f"{self.path.parent.parent.name}/{self.path.parent.name} seed {seed} ({hash8})"
 
     def require_no_links(self) -> None:
-        """Raise InputError if the folder, one above it, or its content is a link or a pipe."""
+        """Raise InputError if the folder, one above it, or its content is a link or a device."""
         require_no_links(self.runs, self.path, below=True)
 
     # ---- state
@@ -273,7 +273,7 @@ class TrialFolder:
         values: dict[str, Any],
         unavailable_now: Callable[[dict[str, Any]], Collection[str]] | None = None,
     ) -> str:
-        """Why to run or check the trial with the resolved configuration ``values``; "" if done.
+        """The cause to run or check the trial with the configuration ``values``; "" if done.
 
         It is done if none of its inputs has changed. If it lacks a metric whose weights or packages
         were missing, it is done only if ``unavailable_now``, called with the ``eval`` settings,

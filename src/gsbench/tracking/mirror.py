@@ -250,8 +250,7 @@ def sync(folders: Iterable[TrialFolder], uri: str | None) -> Iterator[str]:
         if address := untyped_address(options, uri):
             yield (
                 f"left out: {folder.label}: its configuration names the tracker {address}, and "
-                f"--uri {address} was "
-                "not typed"
+                f"--uri {address} was not typed"
             )
             continue
         try:

@@ -130,8 +130,7 @@ def require_own_artifacts(client: MlflowClient, address: str, runs: Path) -> Non
     if not place.is_relative_to(runs / ARTIFACTS) or ".." in place.parts:
         raise InputError(
             f"{runs / DATABASE} would send artifacts to {address}; if this runs folder was moved, "
-            f"remove {DATABASE} "
-            f"and {ARTIFACTS} there: `gsbench sync` makes them again"
+            f"remove {DATABASE} and {ARTIFACTS} there: `gsbench sync` makes them again"
         )
     require_no_links(runs, place, below=True)
 

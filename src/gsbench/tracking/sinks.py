@@ -85,7 +85,7 @@ class Scalar:
 
 @dataclass(frozen=True)
 class Summary:
-    """What a tracker shows at a trial's end, in Markdown (``note``) and in numbers."""
+    """The end of a trial in a tracker, in Markdown (``note``) and in numbers."""
 
     note: str
     scalars: Sequence[Scalar]

@@ -37,13 +37,8 @@ def ask_hydra(argv: list[str]) -> int:
     Raises InputError for bad input.
     """
     options = _parser().parse_args(argv)
-    asked = [
-        options.cfg is not None,
-        options.info is not None,
-        options.shell_completion,
-        options.hydra_help,
-    ]
-    if sum(asked) != 1 or ((options.resolve or options.package) and options.cfg is None):
+    asked = [options.cfg, options.info, options.shell_completion, options.hydra_help]
+    if sum(map(bool, asked)) != 1 or ((options.resolve or options.package) and not options.cfg):
         raise InputError(
             "ask one thing: --cfg job (with --resolve or --package KEY), --info, or --hydra-help"
         )
@@ -82,11 +77,11 @@ def _parser() -> ArgumentParser:
     parser = ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("overrides", nargs="*", metavar="KEY=VALUE")
     parser.add_argument("--cfg", "-c", choices=["job", "hydra", "all"])
-    parser.add_argument("--resolve", action="store_true")
+    parser.flag("--resolve", "with --cfg: show values instead of ${…}")
     parser.add_argument("--package", "-p")
     info = ["all", "config", "defaults", "defaults-tree", "plugins", "searchpath"]
     parser.add_argument("--info", "-i", nargs="?", const="all", choices=info)
-    parser.add_argument("--hydra-help", action="store_true")
+    parser.flag("--hydra-help", "Hydra's own options")
     parser.add_argument("--shell-completion", "-sc", action="store_true")
     parser.add_argument("--config-dir", "-cd", type=Path)
     return parser
