@@ -15,8 +15,8 @@ def describe_ledger(ledger: Ledger) -> list[str]:
     least = f"{100 * opened.least:g} %" if opened.relative else f"{opened.least:g}"
     better = "more" if opened.sign > 0 else "less"
     return [
-        f"{opened.metric}, {better} is better, decides; {least} is the least that matters. "
-        f"Of the kept ideas at most {100 * opened.rate:g} % are expected to be no better.",
+        f"{opened.metric} decides: {better} is better, and {least} is the least that matters. "
+        f"At most {100 * opened.rate:g} % of the kept ideas are expected to be no better.",
         f"{ledger.tried} of {opened.ideas} planned ideas were tried, and {len(ledger.kept)} kept, "
         f"on {', '.join(opened.keys)}, with at most {len(opened.seeds)} seeds.",
     ]
