@@ -238,13 +238,10 @@ def test_it_is_declared_and_leaves_other_declarations_alone(runs, tmp_path):
         (["look", "exp"], "invalid choice"),
     ],
 )
-def test_bad_input_is_one_line(runs, words, message, capsys, tmp_path, monkeypatch):
+def test_bad_input_is_one_line(runs, words, message, tmp_path, monkeypatch, refused):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "file").touch()
-    assert run(["vote", *words]) == 2
-    err = capsys.readouterr().err
-    assert message in err
-    assert err.count("\n") == 1
+    assert message in refused("vote", *words)
 
 
 def test_without_pictures_there_is_no_page(tmp_path):
@@ -259,7 +256,7 @@ def test_without_pictures_there_is_no_page(tmp_path):
 # ---- files of votes
 
 
-def test_files_that_do_not_fit_are_refused(runs, tmp_path, capsys):
+def test_files_that_do_not_fit_are_refused(runs, tmp_path, refused):
     key = made(runs, tmp_path / "page", "--pairs", "12", "--people", "2")
     sound = ballot(key, 1, prefers(ADC))
     part = replace(sound, person=f"{2:016x}", votes=sound.votes[:-1])
@@ -270,30 +267,29 @@ def test_files_that_do_not_fit_are_refused(runs, tmp_path, capsys):
         (twice, "answers 17 of the 17 showings"),
         (foreign, "no round 000000000000"),
     ):
-        assert run(["vote", "judge", "exp", saved(tmp_path, bad)]) == 2
-        assert message in capsys.readouterr().err
+        assert message in refused("vote", "judge", "exp", saved(tmp_path, bad))
     for change in ({"person": "../../../x"}, {"round": ".."}, {"finished": "soon"}, {"votes": 1}):
         file = tmp_path / "changed.json"
         file.write_text(json.dumps(sound.to_json() | change))
-        assert run(["vote", "judge", "exp", str(file)]) == 2
-        assert "is damaged" in capsys.readouterr().err
+        assert "is damaged" in refused("vote", "judge", "exp", file)
     first = saved(tmp_path, sound)
-    assert run(["vote", "judge", "exp", first, first]) == 2
-    assert "same person" in capsys.readouterr().err
+    assert "same person" in refused("vote", "judge", "exp", first, first)
     assert run(["vote", "judge", "exp", first]) == 0
-    assert run(["vote", "judge", "exp", saved(tmp_path, ballot(key, 1, prefers(VOLUMETRIC)))]) == 2
-    assert "other votes before" in capsys.readouterr().err
+    assert "other votes before" in refused(
+        "vote", "judge", "exp", saved(tmp_path, ballot(key, 1, prefers(VOLUMETRIC)))
+    )
 
 
-def test_a_changed_key_judges_nothing(runs, tmp_path, capsys):
+def test_a_changed_key_judges_nothing(runs, tmp_path, refused):
     key = made(runs, tmp_path / "page", "--pairs", "12")
     file = runs / "exp" / "votes" / key.round / "key.json"
     text = file.read_text()
     first = key.showings[0]
     swapped = [replace(first, left=first.right, right=first.left), *key.showings[1:]]
     file.write_text(json.dumps(replace(key, showings=tuple(swapped)).to_json()))
-    assert run(["vote", "judge", "exp", saved(tmp_path, ballot(key, 1, prefers(ADC)))]) == 2
-    assert "was changed after the page was made" in capsys.readouterr().err
+    assert "was changed after the page was made" in refused(
+        "vote", "judge", "exp", saved(tmp_path, ballot(key, 1, prefers(ADC)))
+    )
     file.write_text(text)
 
 
@@ -455,7 +451,7 @@ class Voter:
 
 @pytest.mark.slow
 @pytest.mark.browser
-def test_two_people_vote_by_keyboard_and_are_judged(runs, tmp_path, capsys):
+def test_two_people_vote_by_keyboard_and_are_judged(runs, tmp_path, capsys, said):
     key = made(runs, tmp_path / "page", "--pairs", "12", "--people", "2")
     address, files, last = (tmp_path / "page" / "index.html").as_uri(), [], len(key.showings)
     for width, chooser in ((1200, prefers(VOLUMETRIC)), (400, prefers(ADC))):
@@ -501,8 +497,7 @@ def test_two_people_vote_by_keyboard_and_are_judged(runs, tmp_path, capsys):
             browser.wait_for(lambda place=saved_in: list(place.glob("*.json")) or None, "the file")  # type: ignore[misc]
             files += [str(file) for file in saved_in.glob("*.json")]
     capsys.readouterr()
-    assert run(["vote", "judge", "exp", *files]) == 0
-    out = capsys.readouterr().out
+    out = said("vote", "judge", "exp", *files)
     assert "24 votes of 2 people; 24 were declared" in out
     assert "50 % of 24 votes (12 for it, 12 against it, 0 without a difference" in out
     assert "100 % of the pairs shown again" in out

@@ -101,9 +101,8 @@ def test_the_table_stays_once_all_have_ended(sweep, tmp_path, monkeypatch, capsy
 
 
 @pytest.mark.parametrize("words", [["status", "--watch"], ["status", "nothing", "--watch"]])
-def test_what_cannot_be_watched_is_one_line(words, tmp_path, monkeypatch, capsys):
+def test_what_cannot_be_watched_is_one_line(words, tmp_path, monkeypatch, refused):
     monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path))
-    assert run(words) == 2
-    assert len(capsys.readouterr().err.splitlines()) == 1
+    refused(*words)
     with pytest.raises(InputError):
         progress_frame(tmp_path, "nothing")

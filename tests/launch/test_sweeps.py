@@ -16,7 +16,6 @@ from typing import Any
 
 import pytest
 
-from gsbench import cli
 from gsbench.app.command import compose_trials, launch, run_trials
 from gsbench.config.command_words import GROUPS, options, parse
 from gsbench.config.compose import Trial, compose_one
@@ -601,27 +600,25 @@ def test_storage_errors_are_recognised(tmp_path):
 
 
 @pytest.mark.parametrize("number", [errno.EFBIG, errno.ENOLCK, errno.EROFS])
-def test_verbs_that_write_say_storage_errors_in_one_line(number, runs, monkeypatch, capsys):
+def test_verbs_that_write_say_storage_errors_in_one_line(number, runs, monkeypatch, refused):
     def refuse(*arguments: object) -> None:
         raise OSError(number, os.strerror(number), str(runs / "x" / "plan.json"))
 
     add_to_plan(compose_trials(["name=x", "densify=adc", "seed=0"]))
     monkeypatch.setattr("gsbench.launch.record.write_json", refuse)
-    assert cli.run(["status", "x", "--forget"]) == 2
-    said = capsys.readouterr().err
+    said = refused("status", "x", "--forget")
     assert len(said.splitlines()) == 1
     assert "plan.json" in said
 
 
 @pytest.mark.skipif(not hasattr(fcntl, "flock"), reason="needs flock")
-def test_a_file_system_without_locks_is_named(runs, monkeypatch, capsys):
+def test_a_file_system_without_locks_is_named(runs, monkeypatch, refused):
     def refuse(descriptor: int, operation: int) -> None:
         raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
 
     add_to_plan(compose_trials(["name=x", "densify=adc", "seed=0"]))
     monkeypatch.setattr(fcntl, "flock", refuse)
-    assert cli.run(["status", "x", "--forget"]) == 2
-    assert "has no locks" in capsys.readouterr().err
+    assert "has no locks" in refused("status", "x", "--forget")
 
 
 def test_what_is_done_is_found_in_a_folder_that_may_not_be_written_to(runs, monkeypatch):
