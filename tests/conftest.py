@@ -79,7 +79,15 @@ def caplog(caplog: pytest.LogCaptureFixture) -> Iterator[pytest.LogCaptureFixtur
 
 
 @pytest.fixture
-def said(capsys):  # type: ignore[no-untyped-def]
+def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The runs folder of a test that works in its own folder; it is not made yet."""
+    monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs"))
+    monkeypatch.chdir(tmp_path)
+    return tmp_path / "runs"
+
+
+@pytest.fixture
+def said(capsys):
     """A function that runs a command line, which must succeed, and returns what it prints."""
     from gsbench.cli import run
 
@@ -92,7 +100,7 @@ def said(capsys):  # type: ignore[no-untyped-def]
 
 
 @pytest.fixture
-def refused(capsys):  # type: ignore[no-untyped-def]
+def refused(capsys):
     """A function that runs a command line, which must be refused, and returns the line of why."""
     from gsbench.cli import run
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 
 from gsbench import cli
@@ -11,12 +9,7 @@ from gsbench.app.command import compose_trials
 from gsbench.config.command_words import check_search_path
 from gsbench.errors import InputError
 
-
-@pytest.fixture(autouse=True)
-def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs"))
-    monkeypatch.chdir(tmp_path)
-    return tmp_path / "runs"
+pytestmark = pytest.mark.usefixtures("runs")
 
 
 SWEEP = ["densify=adc,none", "seed=0,1", "init=random", "tracking=none"]

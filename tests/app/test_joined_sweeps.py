@@ -26,11 +26,7 @@ KNOWN = {
 }
 
 
-@pytest.fixture(autouse=True)
-def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs"))
-    monkeypatch.chdir(tmp_path)
-    return tmp_path / "runs"
+pytestmark = pytest.mark.usefixtures("runs")
 
 
 def arms(*words: str) -> list[tuple[str, int]]:
@@ -130,8 +126,8 @@ def test_plan_dry_run_and_retry_see_one_experiment(runs, monkeypatch, capsys, sa
     write_results(first, trials[0].values)
     ran: list[Path] = []
 
-    def run_trials(again: list[object]) -> int:
-        ran.extend(TrialFolder.of(trial.values).path for trial in again)  # type: ignore[attr-defined]
+    def run_trials(again):
+        ran.extend(TrialFolder.of(trial.values).path for trial in again)
         return 0
 
     monkeypatch.setattr("gsbench.app.command.run_trials", run_trials)

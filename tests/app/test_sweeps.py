@@ -72,15 +72,8 @@ class Fake:
 
 
 @pytest.fixture
-def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs"))
-    monkeypatch.chdir(tmp_path)
-    return tmp_path / "runs"
-
-
-@pytest.fixture
-def sweep(runs: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., int]:
-    def run(fake: Fake, *words: str) -> int:
+def sweep(runs, monkeypatch) -> Callable[..., int]:
+    def run(fake, *words):
         monkeypatch.setattr("gsbench.app.command.run_batch", fake)
         return cli.run([*SWEEP, *words])
 

@@ -117,7 +117,7 @@ def test_it_is_an_ro_crate(tmp_path):
     assert all(by_id[part]["@type"] == "File" for part in parts)
     assert all(int(by_id[part]["contentSize"]) == len(content[part]) for part in parts)
 
-    def references(value: object) -> set[str]:
+    def references(value):
         if isinstance(value, dict):
             own = {value["@id"]} if value.keys() == {"@id"} else set()
             return own.union(*map(references, value.values()))
@@ -225,10 +225,8 @@ def test_a_file_too_large_is_not_unpacked(tmp_path, monkeypatch):
 
 
 def test_a_damaged_trial_is_left_out_by_name_and_the_rest_is_exported(
-    tmp_path, monkeypatch, caplog, said, refused
+    runs, tmp_path, caplog, said, refused
 ):
-    runs = tmp_path / "runs"
-    monkeypatch.setenv("GSBENCH_RUNS", str(runs))
     first, second, *_ = write_runs(runs, Plan())
     (first / "per_view.csv").write_text("view,psnr\nview000,1.0\n")
     (second / "results.json").write_text("{")

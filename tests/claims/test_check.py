@@ -253,9 +253,8 @@ def test_numbers_and_late_trials_on_the_page():
 
 
 def test_the_verb_on_made_up_trials_and_on_their_archive(
-    tmp_path, monkeypatch, capsys, said, refused
+    runs, tmp_path, monkeypatch, capsys, said, refused
 ):
-    monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs"))
     runner = FakeRunner(noise=0.001)
     monkeypatch.setattr("gsbench.verbs.claims.run_batch", runner)
     path, archive, page = tmp_path / "claims.yaml", tmp_path / "a.zip", tmp_path / "page.html"
@@ -267,7 +266,7 @@ def test_the_verb_on_made_up_trials_and_on_their_archive(
     )
     assert run(["check", str(path)]) == 0
     assert runner.batches == [4]
-    home = tmp_path / "runs" / "check_it"
+    home = runs / "check_it"
     assert (
         capsys.readouterr().out
         == f"supported            lpips: it is higher\n{home / 'claims.html'}\n"
@@ -302,9 +301,8 @@ def test_the_verb_on_made_up_trials_and_on_their_archive(
 
 @pytest.mark.slow
 def test_the_verb_runs_real_trials_declares_first_and_ends_with_the_same_page(
-    tmp_path, monkeypatch, capsys, said
+    runs, tmp_path, monkeypatch, capsys, said
 ):
-    monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs"))
     words = dict(word.split("=", 1) for word in TINY)
     settings = {key: yaml.safe_load(value) for key, value in words.items()}
     arms = {"few": {"init.count": 200}, "many": {"init.count": 300, "train.opacity": 0.03}}
@@ -321,11 +319,11 @@ def test_the_verb_runs_real_trials_declares_first_and_ends_with_the_same_page(
         json.dumps(content() | {"settings": settings, "arms": arms, "claims": claims, "seeds": 2})
     )
     assert "4 trials until the first look" in said("check", path, "--dry-run")
-    assert not (tmp_path / "runs" / "check_it").exists()
+    assert not (runs / "check_it").exists()
     out = said("check", path)
     assert "  points: " in out
     assert "not testable here    size: too large" in out
-    home = tmp_path / "runs" / "check_it"
+    home = runs / "check_it"
     (declared,) = read_declarations(home)
     measured = [
         json.loads(file.read_text())["measured"] for file in home.glob("*/*/*/results.json")

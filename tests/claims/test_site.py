@@ -141,7 +141,7 @@ def test_an_archive_of_too_many_bytes_is_neither_written_nor_read(tmp_path, monk
 
 
 def test_words_of_a_stranger_stay_words(tmp_path):
-    def spoil(content: dict[str, bytes]) -> None:
+    def spoil(content):
         for name in ("results.jsonl", "configurations.jsonl", "declared.jsonl"):
             lines = [json.loads(line) for line in content[name].splitlines()]
             for line in lines:
@@ -154,7 +154,7 @@ def test_words_of_a_stranger_stay_words(tmp_path):
             content[name] = "".join(json.dumps(line) + "\n" for line in lines).encode()
         repack(content)
 
-    def repack(content: dict[str, bytes]) -> None:
+    def repack(content):
         import hashlib
 
         manifest = json.loads(content["archive.json"])
@@ -212,7 +212,7 @@ def test_damaged_archives_are_left_out_and_nothing_at_all_is_refused(tmp_path, c
 def test_a_picture_that_leads_elsewhere_is_refused(tmp_path, name):
     import hashlib
 
-    def add(content: dict[str, bytes]) -> None:
+    def add(content):
         manifest = json.loads(content["archive.json"])
         content[name] = b"x"
         manifest["sha256"][name] = hashlib.sha256(b"x").hexdigest()
@@ -237,7 +237,7 @@ def test_a_click_on_a_heading_sorts(tmp_path):
     ]
     site(tmp_path, *archives)
 
-    def evaluated(browser: Browser, script: str) -> str:
+    def evaluated(browser, script):
         return str(browser.call("Runtime.evaluate", expression=script)["result"]["value"])
 
     names = (

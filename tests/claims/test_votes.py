@@ -37,7 +37,7 @@ SHARP = {"left": "right", "right": "left"}
 
 
 @pytest.fixture(scope="module")
-def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def pictures(tmp_path_factory) -> Path:
     """A runs folder with pictures: two scenes with seven views each, two seeds."""
     folder = tmp_path_factory.mktemp("votes")
     write_runs(
@@ -48,7 +48,7 @@ def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def runs(pictures: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def runs(pictures, monkeypatch) -> Path:
     monkeypatch.setenv("GSBENCH_RUNS", str(pictures))
     return pictures
 
@@ -69,7 +69,7 @@ def prefers(arm: str) -> Chooser:
 
 
 def ballot(key: RoundKey, person: int, choose: Chooser, minute: int = 0, name: str = "") -> Ballot:
-    votes = tuple(Vote(showing=one.id, answer=choose(one), seconds=1.0) for one in key.showings)  # type: ignore[arg-type]
+    votes = tuple(Vote(showing=one.id, answer=choose(one), seconds=1.0) for one in key.showings)
     finished = f"2026-11-27T00:{minute:02}:00Z"
     return Ballot(
         round=key.round, person=f"{person:016x}", finished=finished, votes=votes, name=name
@@ -167,7 +167,7 @@ def test_each_showing_has_the_pictures_that_its_key_says(runs, tmp_path):
 def test_views_sides_repeats_and_traps_follow_the_rules(runs, tmp_path):
     key = made(runs, tmp_path / "page", "--pairs", "12")
     kinds = [one.kind for one in key.showings]
-    assert [kinds.count(kind) for kind in ("pair", "again", "trap")] == [12, 1, 4]  # type: ignore[arg-type]
+    assert [kinds.count(kind) for kind in ("pair", "again", "trap")] == [12, 1, 4]
     assert [one.left for one in key.pairs].count(ADC) == 6
     assert sorted(one.left for one in key.showings if one.kind == "trap") == 2 * ["blurred"] + 2 * [
         "photograph"
@@ -338,7 +338,7 @@ def test_people_are_the_units_of_an_exact_test(agree):
 def test_scenes_are_the_units_of_the_other_statement():
     key = made_up(["sfm-a", "sfm-b"], scenes=7, views=3)
 
-    def choose(showing: Showing) -> str:
+    def choose(showing):
         return prefers("sfm-b" if showing.scene < "6" else "sfm-a")(showing)
 
     (pair,) = judge_round(key, [ballot(key, 1, choose)]).pairs
@@ -376,7 +376,7 @@ def test_more_arms_share_the_error_rate():
     key = made_up(["sfm-a", "sfm-b", "sfm-c"], scenes=2, views=2)
     order = ["sfm-a", "sfm-c", "sfm-b", "photograph"]
 
-    def choose(showing: Showing) -> str:
+    def choose(showing):
         return max(
             SHARP,
             key=lambda side: (
@@ -400,7 +400,7 @@ def test_the_ranking_is_the_maximum_of_its_likelihood():
     for counts, chances in zip(wins, bradley_terry(wins), strict=True):
         games = (counts + 0.5) * (1 - np.eye(5))
 
-        def loss(theta: np.ndarray, games: np.ndarray = games) -> float:
+        def loss(theta, games=games):
             return float((games * np.logaddexp(0, theta[None] - theta[:, None])).sum())
 
         theta = minimize(loss, np.zeros(5), tol=1e-12).x
@@ -494,7 +494,7 @@ def test_two_people_vote_by_keyboard_and_are_judged(runs, tmp_path, capsys, said
             voter.press("Enter")
             voter.wait("document.getElementById('saved').textContent !== ''")
             saved_in = tmp_path / str(width)
-            browser.wait_for(lambda place=saved_in: list(place.glob("*.json")) or None, "the file")  # type: ignore[misc]
+            browser.wait_for(lambda place=saved_in: list(place.glob("*.json")) or None, "the file")
             files += [str(file) for file in saved_in.glob("*.json")]
     capsys.readouterr()
     out = said("vote", "judge", "exp", *files)

@@ -55,7 +55,7 @@ def test_a_declaration_is_kept_with_its_time_and_changes_are_added(tmp_path, cap
 def test_trials_are_declared_with_the_metric_and_those_of_later_commands_are_added(
     tmp_path, caplog
 ):
-    def say(*commands: tuple[str, ...]) -> list[dict[str, list[int]]]:
+    def say(*commands):
         trials = [composed(tmp_path, *words) for words in commands]
         declare(trials)
         lines = (tmp_path / "exp" / "declared.jsonl").read_text().splitlines()
@@ -94,7 +94,7 @@ def test_one_command_cannot_declare_two(tmp_path, refused):
 def test_claims_are_kept_beside_declared_metrics(tmp_path, caplog):
     home = tmp_path / "exp"
 
-    def claims(metric: str, moment: str) -> Declaration:
+    def claims(metric, moment):
         return Declaration(time=moment, questions=(Question(metric=metric, name="claim"),))
 
     first = declare_questions(home, claims("psnr", "2020-01-01T00:00:00Z"))

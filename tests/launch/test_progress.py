@@ -23,7 +23,7 @@ def begin(runs: Path, arm: str, seed: int) -> Path:
 
 
 @pytest.fixture
-def sweep(tmp_path: Path) -> dict[tuple[str, int], Path]:
+def sweep(tmp_path) -> dict[tuple[str, int], Path]:
     """A sweep: of adc all trials are done, of volumetric one is done, one failed, and one began."""
     folders = {(arm, seed): begin(tmp_path, arm, seed) for arm in ARMS for seed in SEEDS}
     # In the only seed that both have, adc is better; in the mean over all of its own trials it is
