@@ -19,7 +19,7 @@ OWN = {"eval__extra": {"mae": {"_target_": "mine.Mae"}}}
 
 
 @pytest.fixture
-def runs(tmp_path: Path) -> Path:
+def runs(tmp_path) -> Path:
     for seed in (0, 1):
         for densify in ("adc", "volumetric"):
             one_trial(tmp_path, seed, "aaaaaaaa", _densify=densify, psnr=27.0 + seed)

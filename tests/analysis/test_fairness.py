@@ -33,7 +33,7 @@ def sheet(runs: Path, second: str = "longaxis", first: str = "adc") -> Table:
 
 
 def shown(table: Table) -> dict[str, tuple[str, str, str]]:
-    return {row.labels[0]: tuple(entry.text for entry in row.entries) for row in table.rows}  # type: ignore[misc]
+    return {row.labels[0]: tuple(entry.text for entry in row.entries) for row in table.rows}
 
 
 def change(paths: list[Path], arm: str, **values: Any) -> None:
@@ -44,7 +44,7 @@ def change(paths: list[Path], arm: str, **values: Any) -> None:
 
 
 @pytest.fixture
-def paths(tmp_path: Path) -> list[Path]:
+def paths(tmp_path) -> list[Path]:
     return write_arms(tmp_path, {name: densifier(name) for name in ("adc", "longaxis")})
 
 
@@ -197,7 +197,7 @@ def test_a_search_that_proposed_the_settings_is_named(tmp_path):
         (tmp_path / name).mkdir()
         (tmp_path / name / "tuning.json").write_text(content)
 
-    def tuning() -> list[str]:
+    def tuning():
         return [note for note in sheet(tmp_path, "volumetric").notes if note.startswith("Tuning.")]
 
     (line,) = tuning()

@@ -20,7 +20,7 @@ COMPARED = "so this does not compare at equal counts; densify.cap=governor makes
 
 
 def trials_of(tmp_path: Path, **plan: object) -> tuple[TrialResult, ...]:
-    write_runs(tmp_path, Plan(**plan))  # type: ignore[arg-type]
+    write_runs(tmp_path, Plan(**plan))
     return load_experiment(tmp_path, "exp").trials
 
 

@@ -69,7 +69,7 @@ def test_what_the_paper_contradicts_follows_from_its_numbers():
     table1, table2 = (paper.tables[name] for name in ("table1", "table2"))
     text = "\n".join(paper.contradictions)
 
-    def pairs(quantity: str) -> list[tuple[float, float]]:
+    def pairs(quantity):
         keys = [
             [(scene, "dim", arm, quantity) for arm in ("adc", "volumetric")]
             for scene in paper.scenes("table1")

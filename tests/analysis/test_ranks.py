@@ -25,7 +25,7 @@ Make = Callable[..., Experiment]
 
 
 @pytest.fixture
-def seven(make_experiment: Make) -> Experiment:
+def seven(make_experiment) -> Experiment:
     return make_experiment(
         scenes=SCENES, densifiers=ARMS, effect={"psnr": 2.0, "lpips_vgg_raw": -0.1}
     )

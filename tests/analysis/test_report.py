@@ -43,7 +43,7 @@ ADC, VOLUMETRIC = Arm("sfm", "adc"), Arm("sfm", "volumetric")
 
 
 @pytest.fixture(scope="module")
-def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def runs(tmp_path_factory) -> Path:
     """Two scenes with pictures, in which "volumetric" has a clearly better LPIPS and nothing else
     differs."""
     folder = tmp_path_factory.mktemp("runs")
@@ -52,12 +52,12 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def experiment(runs: Path) -> Experiment:
+def experiment(runs) -> Experiment:
     return load_experiment(runs, "exp")
 
 
 @pytest.fixture(scope="module")
-def page(experiment: Experiment) -> str:
+def page(experiment) -> str:
     return build_report(experiment)
 
 
@@ -246,7 +246,7 @@ def test_logged_histograms_are_shares_of_all_trials_together():
         SimpleNamespace(folder=SimpleNamespace(curves=lambda name, kind, own=own: own))
         for own in rows
     ]
-    found = _logged_histograms(trials)  # type: ignore[arg-type]
+    found = _logged_histograms(trials)
     assert list(found) == [4, 8]
     assert np.array(found[4]) == pytest.approx(np.array([[10**-3.5, 0.25], [10**-0.5, 0.75]]))
     assert np.array(found[8]) == pytest.approx(np.array([[10**-2.0, 1.0]]))

@@ -26,11 +26,7 @@ KNOWN = {
 }
 
 
-@pytest.fixture(autouse=True)
-def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs"))
-    monkeypatch.chdir(tmp_path)
-    return tmp_path / "runs"
+pytestmark = pytest.mark.usefixtures("runs")
 
 
 def arms(*words: str) -> list[tuple[str, int]]:
@@ -113,16 +109,14 @@ def test_grids_in_a_users_own_experiment(tmp_path):
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else None,
 )
-def test_what_cannot_be_is_refused_in_a_line(words, text, capsys):
-    assert cli.run(["-m", *words] if len(words) < 2 and "grids" not in words[0] else words) == 2
-    (line,) = capsys.readouterr().err.splitlines()
+def test_what_cannot_be_is_refused_in_a_line(words, text, refused):
+    line = refused(*["-m", *words] if len(words) < 2 and "grids" not in words[0] else words)
     assert text in line
 
 
-def test_plan_dry_run_and_retry_see_one_experiment(runs, monkeypatch, capsys):
+def test_plan_dry_run_and_retry_see_one_experiment(runs, monkeypatch, capsys, said):
     words = ["+experiment=threshold", "densify.volume_threshold=0.5", "seed=0"]
-    assert cli.run([*words, "--dry-run"]) == 0
-    assert "2 trials: 2 missing" in capsys.readouterr().out
+    assert "2 trials: 2 missing" in said(*words, "--dry-run")
     trials = compose_trials(words)
     add_to_plan(trials)
     first, second = (TrialFolder.of(trial.values).path for trial in trials)
@@ -132,8 +126,8 @@ def test_plan_dry_run_and_retry_see_one_experiment(runs, monkeypatch, capsys):
     write_results(first, trials[0].values)
     ran: list[Path] = []
 
-    def run_trials(again: list[object]) -> int:
-        ran.extend(TrialFolder.of(trial.values).path for trial in again)  # type: ignore[attr-defined]
+    def run_trials(again):
+        ran.extend(TrialFolder.of(trial.values).path for trial in again)
         return 0
 
     monkeypatch.setattr("gsbench.app.command.run_trials", run_trials)

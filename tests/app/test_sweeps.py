@@ -72,15 +72,8 @@ class Fake:
 
 
 @pytest.fixture
-def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs"))
-    monkeypatch.chdir(tmp_path)
-    return tmp_path / "runs"
-
-
-@pytest.fixture
-def sweep(runs: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., int]:
-    def run(fake: Fake, *words: str) -> int:
+def sweep(runs, monkeypatch) -> Callable[..., int]:
+    def run(fake, *words):
         monkeypatch.setattr("gsbench.app.command.run_batch", fake)
         return cli.run([*SWEEP, *words])
 
@@ -193,7 +186,7 @@ def test_another_launcher_of_hydras_gets_one_look_at_a_time(sweep):
     assert [seed for ((_, seed),) in fake.batches] == [0, 0, 1, 1, 2, 2, 3, 3]
 
 
-def test_settings_make_arms_and_the_report_opens_with_the_looks(sweep, runs, capsys):
+def test_settings_make_arms_and_the_report_opens_with_the_looks(sweep, runs, capsys, said):
     """Arms that differ in a setting alone are told apart as in the report."""
     fake = Fake(clear)
     assert (
@@ -218,8 +211,7 @@ def test_settings_make_arms_and_the_report_opens_with_the_looks(sweep, runs, cap
     assert f"{pair}, on this scene: better in PSNR (dB)" in text
     assert "launch.stop_when_decided" in text
     capsys.readouterr()
-    assert cli.run(["tables", "stop"]) == 0
-    assert "Seeds come in planned looks" in capsys.readouterr().out
+    assert "Seeds come in planned looks" in said("tables", "stop")
 
 
 @pytest.mark.parametrize(
@@ -245,12 +237,12 @@ def test_what_cannot_be_looked_at_is_refused_before_any_trial(sweep, runs, words
     assert not runs.exists()
 
 
-def test_one_trial_is_no_sweep(runs, capsys):
-    assert cli.run([*TINY, "launch.stop_when_decided=true"]) == 2
-    assert "adds seeds to a sweep" in capsys.readouterr().err
+def test_one_trial_is_no_sweep(runs, refused):
+    assert "adds seeds to a sweep" in refused(*TINY, "launch.stop_when_decided=true")
 
 
-def test_a_dry_run_says_when_it_looks_and_writes_nothing(runs, capsys):
-    assert cli.run([*SWEEP, "--dry-run"]) == 0
-    assert "looks at 2, 3, 4 seeds, 4 trials until the first, 8 at most" in capsys.readouterr().out
+def test_a_dry_run_says_when_it_looks_and_writes_nothing(runs, said):
+    assert "looks at 2, 3, 4 seeds, 4 trials until the first, 8 at most" in said(
+        *SWEEP, "--dry-run"
+    )
     assert not runs.exists()

@@ -104,21 +104,15 @@ class Fake:
         return [trial for trial in self.trained if trial.values["name"] == "fair"]
 
 
-@pytest.fixture
-def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs"))
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "conf" / "experiment").mkdir(parents=True)
-    return tmp_path / "runs"
-
-
 Sweep = Callable[..., int]
 
 
 @pytest.fixture
-def sweep(runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Sweep:
-    def run(fake: Fake, *words: str, file: str = FILE) -> int:
-        (tmp_path / "conf" / "experiment" / "fair.yaml").write_text(file)
+def sweep(runs, tmp_path, monkeypatch) -> Sweep:
+    def run(fake, *words, file=FILE):
+        conf = tmp_path / "conf" / "experiment"
+        conf.mkdir(parents=True, exist_ok=True)
+        (conf / "fair.yaml").write_text(file)
         monkeypatch.setattr("gsbench.app.command.run_batch", fake)
         return cli.run(["--config-dir", str(tmp_path / "conf"), *WORDS, *words])
 

@@ -22,7 +22,6 @@ from gsbench.claims.ablation import (
     off_settings,
     runs_to_train,
 )
-from gsbench.cli import run
 from gsbench.config.command_words import options
 from gsbench.config.compose import compose_one
 from gsbench.densify.volumetric import Volumetric
@@ -197,19 +196,13 @@ def test_a_combination_whose_trials_are_missing_has_no_verdict(tmp_path):
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else None,
 )
-def test_bad_words_are_refused_in_a_line(words, message, tmp_path, monkeypatch, capsys):
-    monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs"))
-    assert run(["ablate", *(word for word in TINY if word != "densify=none"), *words]) == 2
-    (line,) = [
-        line for line in capsys.readouterr().err.splitlines() if line.startswith("gsbench: ")
-    ]
-    assert message in line
-    assert not (tmp_path / "runs").exists()
+def test_bad_words_are_refused_in_a_line(runs, words, message, refused):
+    assert message in refused("ablate", *(word for word in TINY if word != "densify=none"), *words)
+    assert not (runs).exists()
 
 
 @pytest.mark.slow
-def test_the_verb_trains_each_run_once_and_judges_it(tmp_path, monkeypatch, capsys):
-    monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs"))
+def test_the_verb_trains_each_run_once_and_judges_it(runs, said):
     words = [
         *(word for word in TINY if word != "densify=none"),
         "densify=adc",
@@ -217,7 +210,6 @@ def test_the_verb_trains_each_run_once_and_judges_it(tmp_path, monkeypatch, caps
         "name=parts",
     ]
     words += ["+densify.switches.size.off.split_size=0.5", "--switches", "size"]
-    assert run(["ablate", *words]) == 0
-    out = capsys.readouterr().out
+    out = said("ablate", *words)
     assert "adc: 1 part (size), 2 runs, 4 trials" in out
     assert "| without size | " in out

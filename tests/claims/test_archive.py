@@ -13,7 +13,6 @@ import yaml
 
 from gsbench.analysis.results import load_experiment, read_views
 from gsbench.claims.archive import unpack_archive, write_archive
-from gsbench.cli import run
 from gsbench.errors import InputError
 from tests.analysis.synthetic import Plan, write_runs
 
@@ -118,7 +117,7 @@ def test_it_is_an_ro_crate(tmp_path):
     assert all(by_id[part]["@type"] == "File" for part in parts)
     assert all(int(by_id[part]["contentSize"]) == len(content[part]) for part in parts)
 
-    def references(value: object) -> set[str]:
+    def references(value):
         if isinstance(value, dict):
             own = {value["@id"]} if value.keys() == {"@id"} else set()
             return own.union(*map(references, value.values()))
@@ -226,22 +225,22 @@ def test_a_file_too_large_is_not_unpacked(tmp_path, monkeypatch):
 
 
 def test_a_damaged_trial_is_left_out_by_name_and_the_rest_is_exported(
-    tmp_path, monkeypatch, capsys, caplog
+    runs, tmp_path, caplog, said, refused
 ):
-    runs = tmp_path / "runs"
-    monkeypatch.setenv("GSBENCH_RUNS", str(runs))
     first, second, *_ = write_runs(runs, Plan())
     (first / "per_view.csv").write_text("view,psnr\nview000,1.0\n")
     (second / "results.json").write_text("{")
-    assert run(["export", "--results", "exp", "--out", str(tmp_path / "out" / "a.zip")]) == 0
-    assert capsys.readouterr().out.startswith(f"{tmp_path / 'out' / 'a.zip'}: results of exp, ")
+    assert said("export", "--results", "exp", "--out", tmp_path / "out" / "a.zip").startswith(
+        f"{tmp_path / 'out' / 'a.zip'}: results of exp, "
+    )
     assert "does not average" in caplog.text
     assert "not JSON" in caplog.text
     assert len(unpack_archive(tmp_path / "out" / "a.zip", tmp_path / "b").trials) == 10
     for path in runs.glob("exp/*/*/*/per_view.csv"):
         path.write_text("")
-    assert run(["export", "--results", "exp", "--out", str(tmp_path / "b.zip")]) == 2
-    assert "no whole trial to export" in capsys.readouterr().err
+    assert "no whole trial to export" in refused(
+        "export", "--results", "exp", "--out", tmp_path / "b.zip"
+    )
     assert not (tmp_path / "b.zip").exists()
     for words in (
         ["--results", "exp", "exp:courtyard:adc:0"],
@@ -249,5 +248,4 @@ def test_a_damaged_trial_is_left_out_by_name_and_the_rest_is_exported(
         ["exp:courtyard:adc:0"],
         [],
     ):
-        assert run(["export", *words]) == 2
-        assert len(capsys.readouterr().err.splitlines()) == 1
+        refused("export", *words)

@@ -252,21 +252,21 @@ def test_numbers_and_late_trials_on_the_page():
     assert _late_words(judged("undecided", late=2)).startswith("2 trials had been measured before")
 
 
-def test_the_verb_on_made_up_trials_and_on_their_archive(tmp_path, monkeypatch, capsys):
-    monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs"))
+def test_the_verb_on_made_up_trials_and_on_their_archive(
+    runs, tmp_path, monkeypatch, capsys, said, refused
+):
     runner = FakeRunner(noise=0.001)
     monkeypatch.setattr("gsbench.verbs.claims.run_batch", runner)
     path, archive, page = tmp_path / "claims.yaml", tmp_path / "a.zip", tmp_path / "page.html"
     path.write_text(json.dumps(content()))
-    assert run(["check", str(path), "--dry-run"]) == 0
-    out = capsys.readouterr().out
+    out = said("check", path, "--dry-run")
     assert "1 claim to be tested" in out
     assert (
         "4 trials until the first look, 8 at most; each test may err in 5 % of such sweeps" in out
     )
     assert run(["check", str(path)]) == 0
     assert runner.batches == [4]
-    home = tmp_path / "runs" / "check_it"
+    home = runs / "check_it"
     assert (
         capsys.readouterr().out
         == f"supported            lpips: it is higher\n{home / 'claims.html'}\n"
@@ -274,8 +274,7 @@ def test_the_verb_on_made_up_trials_and_on_their_archive(tmp_path, monkeypatch, 
     assert "supported" in (home / "claims.html").read_text()
     assert run(["export", "--results", "check_it", "--out", str(archive)]) == 0
     capsys.readouterr()
-    assert run(["check", str(path), "--from", str(archive)]) == 0
-    out = capsys.readouterr().out
+    out = said("check", path, "--from", archive)
     assert "supported            lpips: PSNR (dB) of volumetric against adc: +1.0" in out
     assert "judged on 4 trials: 1 scene, 2 seeds, two arms; looks planned at 2, 3, 4 seeds" in out
     assert run(["check", str(path), "--from", str(archive), "--out", str(page)]) == 0
@@ -290,23 +289,20 @@ def test_the_verb_on_made_up_trials_and_on_their_archive(tmp_path, monkeypatch, 
         ({"id": "other"}, "the file lacks claims that were declared: lpips"),
     ):
         path.write_text(json.dumps(content(**changes)))
-        assert run(["check", str(path), "--from", str(archive)]) == 2
-        assert message in capsys.readouterr().err
+        assert message in refused("check", path, "--from", archive)
     for words, message in (
         (["--from", str(archive), "--dry-run"], "runs nothing"),
         (["--from", str(archive), "--out", "page.txt"], "a page ends in .html"),
         (["--out", "page.html"], "--out goes with --from"),
         (["train.iterations=5"], "settings of a check are in its file of claims"),
     ):
-        assert run(["check", str(path), *words]) == 2
-        assert message in capsys.readouterr().err
+        assert message in refused("check", path, *words)
 
 
 @pytest.mark.slow
 def test_the_verb_runs_real_trials_declares_first_and_ends_with_the_same_page(
-    tmp_path, monkeypatch, capsys
+    runs, tmp_path, monkeypatch, capsys, said
 ):
-    monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs"))
     words = dict(word.split("=", 1) for word in TINY)
     settings = {key: yaml.safe_load(value) for key, value in words.items()}
     arms = {"few": {"init.count": 200}, "many": {"init.count": 300, "train.opacity": 0.03}}
@@ -322,14 +318,12 @@ def test_the_verb_runs_real_trials_declares_first_and_ends_with_the_same_page(
     path.write_text(
         json.dumps(content() | {"settings": settings, "arms": arms, "claims": claims, "seeds": 2})
     )
-    assert run(["check", str(path), "--dry-run"]) == 0
-    assert "4 trials until the first look" in capsys.readouterr().out
-    assert not (tmp_path / "runs" / "check_it").exists()
-    assert run(["check", str(path)]) == 0
-    out = capsys.readouterr().out
+    assert "4 trials until the first look" in said("check", path, "--dry-run")
+    assert not (runs / "check_it").exists()
+    out = said("check", path)
     assert "  points: " in out
     assert "not testable here    size: too large" in out
-    home = tmp_path / "runs" / "check_it"
+    home = runs / "check_it"
     (declared,) = read_declarations(home)
     measured = [
         json.loads(file.read_text())["measured"] for file in home.glob("*/*/*/results.json")
@@ -349,8 +343,7 @@ def test_the_verb_runs_real_trials_declares_first_and_ends_with_the_same_page(
     monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "elsewhere"))
     capsys.readouterr()
     recheck = ["check", str(path), "--from", str(archive)]
-    assert run(recheck) == 0
-    printed = capsys.readouterr().out
+    printed = said(*recheck)
     assert len(printed.splitlines()) < 15
     assert "?  claim" not in printed
     page = tmp_path / "pages" / "claims.html"

@@ -98,7 +98,7 @@ def test_the_nearer_setting_counts():
 
 
 def test_the_direction_of_a_claim_is_the_sign_of_its_question():
-    def sign(direction: str) -> int:
+    def sign(direction):
         file = parse_claims(changed("claims", 0, "direction", to=direction))
         return file.question(
             file.claims[0], {"courtyard": ("garden/sfm-adc/0a", "garden/sfm-volumetric/0b")}

@@ -59,7 +59,7 @@ def test_from_six_scenes_on_scenes_like_these_are_asked_beside_the_verdict(tmp_p
 def test_the_page_says_where_machines_and_clouds_of_its_trials_differ(tmp_path):
     trials = made(tmp_path, ("room",), seeds=2)
 
-    def lines(cpus: tuple[str, str]) -> tuple[str, ...]:
+    def lines(cpus):
         found = []
         for trial in trials:
             cpu = cpus[trial.seed]

@@ -164,14 +164,13 @@ def test_where_each_scene_has_one_initialiser_they_are_one_study(tmp_path):
     assert [("sfm" in note, "dataset" in note) for note in notes] == [(False, True), (True, False)]
 
 
-def test_trials_of_archives_can_be_chosen(tmp_path, capsys):
+def test_trials_of_archives_can_be_chosen(tmp_path, said):
     """As where one archive holds two initialisers, or two splits, under one name."""
     files = [
         str(archive(tmp_path, name, seed, inits=("sfm", "random")))
         for seed, name in enumerate("ab")
     ]
-    assert run(["pool", *files, "--arm", "volumetric", "--where", "init=sfm"]) == 0
-    out = capsys.readouterr().out
+    out = said("pool", *files, "--arm", "volumetric", "--where", "init=sfm")
     assert "of 2 studies" in out
     assert "| a |" in out
     assert out.startswith("volumetric against adc, difference in PSNR (dB), more is better\n")
@@ -187,33 +186,30 @@ def test_unlike_budgets_are_named(tmp_path, capsys):
     assert sentence in capsys.readouterr().out
 
 
-def test_three_labs_make_a_mean(tmp_path, capsys):
+def test_three_labs_make_a_mean(tmp_path, said):
     files = [str(archive(tmp_path, f"lab{k}", k)) for k in range(3)]
-    assert run(["pool", *files, "--arm", "volumetric"]) == 0
-    out = capsys.readouterr().out
+    out = said("pool", *files, "--arm", "volumetric")
     assert "| lab0 | +" in out
     assert "of 3 studies" in out
     assert "a further one would lie between" in out
 
 
-def test_two_protocols_have_no_mean_and_one_can_be_chosen(tmp_path, capsys):
+def test_two_protocols_have_no_mean_and_one_can_be_chosen(tmp_path, said):
     """Between archives and within one: every study is shown, and none is lost."""
     files = [
         str(archive(tmp_path, "a", 0)),
         str(archive(tmp_path, "b", 1, "both")),
         str(archive(tmp_path, "c", 2)),
     ]
-    assert run(["pool", *files, "--arm", "volumetric"]) == 0
-    out = capsys.readouterr().out
+    out = said("pool", *files, "--arm", "volumetric")
     assert all(name in out for name in ("| a |", "| b (paper-1) |", "| b (standard-1) |", "| c |"))
     assert "no mean: the studies differ in protocol" in out
-    assert run(["pool", *files, "--arm", "volumetric", "--protocol", "paper-1"]) == 0
-    out = capsys.readouterr().out
+    out = said("pool", *files, "--arm", "volumetric", "--protocol", "paper-1")
     assert "of 3 studies" in out
     assert "b (standard-1): not asked for" in out
 
 
-def test_bad_sources_are_a_line_each_and_the_others_are_pooled(tmp_path, capsys):
+def test_bad_sources_are_a_line_each_and_the_others_are_pooled(tmp_path, capsys, refused):
     good = [archive(tmp_path, "good", 0), archive(tmp_path, "fine", 1)]
     cut = archive(tmp_path, "cut", 2)
     cut.write_bytes(cut.read_bytes()[:-500])
@@ -239,26 +235,19 @@ def test_bad_sources_are_a_line_each_and_the_others_are_pooled(tmp_path, capsys)
         (line,) = [line for line in lines if name in line]
         assert reason in line
     assert len(lines) == 6
-    assert run(["pool", str(cut), "--arm", "volumetric"]) == 2
-    assert len(capsys.readouterr().err.splitlines()) == 1
+    refused("pool", cut, "--arm", "volumetric")
 
 
-def test_labs_that_name_their_files_alike_are_told_apart(tmp_path, capsys):
+def test_labs_that_name_their_files_alike_are_told_apart(tmp_path, said):
     for lab, seed in (("one", 0), ("two", 1)):
         (tmp_path / lab).mkdir()
         archive(tmp_path / lab, "results", seed)
     sources = [str(tmp_path / lab / "results.zip") for lab in ("one", "two")]
-    assert run(["pool", *sources, "--arm", "volumetric"]) == 0
-    assert f"| {sources[1]} |" in capsys.readouterr().out
+    assert f"| {sources[1]} |" in said("pool", *sources, "--arm", "volumetric")
 
 
-def test_a_metric_that_a_source_lacks_is_named(tmp_path, capsys):
-    assert (
-        run(
-            ["pool", str(archive(tmp_path, "lab")), "--arm", "volumetric", "--metric", "lpips_alex"]
-        )
-        == 2
+def test_a_metric_that_a_source_lacks_is_named(tmp_path, refused):
+    assert "can be paired in lpips_alex" in refused(
+        "pool", archive(tmp_path, "lab"), "--arm", "volumetric", "--metric", "lpips_alex"
     )
-    assert "can be paired in lpips_alex" in capsys.readouterr().err
-    assert run(["pool", str(tmp_path / "lab.zip")]) == 2
-    assert "--arm" in capsys.readouterr().err
+    assert "--arm" in refused("pool", tmp_path / "lab.zip")

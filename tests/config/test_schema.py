@@ -120,7 +120,7 @@ def sweep_size(experiment: str) -> int:
             "config", overrides=[f"+experiment={experiment}"], return_hydra_config=True
         )
     size = 1
-    for value in OmegaConf.to_container(config.hydra.sweeper.params).values():  # type: ignore[union-attr]
+    for value in OmegaConf.to_container(config.hydra.sweeper.params).values():
         size *= len(str(value).split(","))
     return size
 

@@ -40,12 +40,12 @@ SWEEPS = {  # words, and how often Hydra composes for them
 
 
 @pytest.fixture
-def compositions(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
+def compositions(monkeypatch) -> list[list[str]]:
     """The words of each of Hydra's compositions of a job."""
     asked: list[list[str]] = []
     compose = ConfigLoaderImpl.load_sweep_config
 
-    def counted(self, master_config, sweep_overrides):  # type: ignore[no-untyped-def]
+    def counted(self, master_config, sweep_overrides):
         asked.append(sweep_overrides)
         return compose(self, master_config, sweep_overrides)
 

@@ -131,7 +131,7 @@ def test_what_yaml_and_class_both_state_is_the_same(path):
 
 def test_the_list_names_files_that_are_there():
     assert DELIBERATE.keys() | WHOLE <= set(FILES)
-    assert {class_of(path).__name__ for path in ("eval/paper", "train/paper", "init/sfm")} == {  # type: ignore[union-attr]
+    assert {class_of(path).__name__ for path in ("eval/paper", "train/paper", "init/sfm")} == {
         "EvalConfig",
         "TrainConfig",
         "Sfm",

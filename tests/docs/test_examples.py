@@ -42,7 +42,7 @@ def run_blocks(document: Path, folder: Path) -> dict[str, Any]:
 
 
 @pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+def folder(tmp_path, monkeypatch) -> Iterator[Path]:
     """An empty working folder, from which modules can be imported; what was imported from it is
     forgotten."""
     for key in os.environ:
@@ -143,9 +143,9 @@ def test_densifier_of_the_document_is_repeatable_and_resumes_to_the_bit(folder):
         if b.startswith("# largest.py")
     )
     (folder / "largest.py").write_text(code)
-    import largest  # type: ignore[import-not-found]
+    import largest
 
-    def rounds(state: Any, first: int, last: int) -> Any:
+    def rounds(state, first, last):
         """Refinements ``first`` to ``last`` of a made-up training that goes on from ``state``."""
         densifier = largest.SplitLargest(
             start=0, stop=100, interval=1, share=0.1, prune_opacity=0.3
@@ -200,7 +200,7 @@ def test_governed_class_of_the_document_ends_at_its_limit(folder):
         if b.startswith("# opaque.py")
     )
     (folder / "opaque.py").write_text(code)
-    import opaque  # type: ignore[import-not-found]
+    import opaque
 
     gaussians, rng = random_gaussians(100), torch.Generator().manual_seed(0)
     densifier = opaque.CloneOpaque(start=0, stop=500, max_gaussians=150, cap="governor")

@@ -49,7 +49,7 @@ def test_arms_of_any_origin_are_told_apart_and_those_that_come_late_cost_the_dec
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs"))
 
-    def tables(*words: str) -> str:
+    def tables(*words):
         capsys.readouterr()
         assert run(["tables", "arms", *words]) == 0
         return capsys.readouterr().out

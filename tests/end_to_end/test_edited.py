@@ -31,13 +31,13 @@ def test_an_edited_loss_is_trained_with(gsbench, tmp_path):
     shutil.copytree(conf_dir(), tmp_path / "copy" / "conf")
     changes = {"PYTHONPATH": str(copy.parent), "GSBENCH_RUNS": str(tmp_path / "runs")}
 
-    def train(*words: str) -> str:
+    def train(*words):
         # where kernels have to be compiled first
         done = gsbench(*QUICK, *words, timeout=900, **changes)
         assert done.returncode == 0, done.stderr
         return done.stdout + done.stderr
 
-    def results() -> dict[str, Any]:
+    def results():
         (path,) = (tmp_path / "runs" / "edited").glob("*/*/*/results.json")
         found: dict[str, Any] = json.loads(path.read_text())
         return found

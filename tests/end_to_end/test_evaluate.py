@@ -25,7 +25,7 @@ SCENE = ["scene.views=12", "scene.width=96", "scene.height=72"]
 
 
 @pytest.fixture(scope="module")
-def trained(tmp_path_factory: pytest.TempPathFactory, environment: dict[str, str]) -> Path:
+def trained(tmp_path_factory, environment) -> Path:
     """A runs folder with two trials of one arm."""
     runs = tmp_path_factory.mktemp("trained")
     changed = environment | {"GSBENCH_RUNS": str(runs)}
@@ -47,7 +47,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory, environment: dict[str, str
 
 
 @pytest.fixture
-def runs(trained: Path, tmp_path: Path) -> Path:
+def runs(trained, tmp_path) -> Path:
     """A copy that the test may change."""
     return Path(shutil.copytree(trained, tmp_path / "runs", copy_function=os.link))
 

@@ -17,7 +17,7 @@ pytestmark = pytest.mark.slow
 
 
 @pytest.fixture
-def small_disk(tmp_path: Path) -> Iterator[Path]:
+def small_disk(tmp_path) -> Iterator[Path]:
     """A file system of three MiB; the test is skipped where this user may not mount one."""
     disk = tmp_path / "disk"
     disk.mkdir()

@@ -9,7 +9,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
@@ -21,7 +20,7 @@ pytestmark = pytest.mark.slow
 
 
 @pytest.fixture
-def server(tmp_path: Path) -> Iterator[Server]:
+def server(tmp_path) -> Iterator[Server]:
     folder = tmp_path / "archives"
     folder.mkdir()
     for dataset in read_catalog().values():
@@ -57,7 +56,7 @@ def test_fetch_then_table1_misses_nothing(gsbench, server, tmp_path):
 
 
 def test_killed_and_started_again(server, tmp_path, environment, gsbench):
-    def slowly(_: str, __: int, body: bytes) -> bytes:
+    def slowly(_, __, body):
         time.sleep(0.05)
         return body
 

@@ -63,7 +63,7 @@ def write_class(folder: Path, step: int, worse: bool) -> None:
 def test_a_gate_passes_what_is_equal_and_stops_what_is_worse(gsbench, tmp_path):
     changes = {"GSBENCH_RUNS": str(tmp_path / "runs")}
 
-    def do(*words: str) -> subprocess.CompletedProcess[str]:
+    def do(*words):
         return gsbench(*words, timeout=900, **changes)
 
     write_class(tmp_path, 0, worse=False)
@@ -94,7 +94,7 @@ def test_bisect_finds_the_commit_goes_on_where_it_was_and_leaves_the_checkout_al
     home = tmp_path / "own" / "densifiers"  # a folder within the repository
     home.mkdir(parents=True)
 
-    def git(*words: str) -> str:
+    def git(*words):
         command = [
             "git",
             "-C",
@@ -125,7 +125,7 @@ def test_bisect_finds_the_commit_goes_on_where_it_was_and_leaves_the_checkout_al
         sorted(os.listdir(home.parent / ".git")),
     )
 
-    def bisect() -> subprocess.CompletedProcess[str]:
+    def bisect():
         words = ["HEAD~12", "HEAD", *WORDS, "--least", "0.2", "--seeds", "3"]
         return gsbench(
             "bisect", *words, cwd=home, timeout=1500, GSBENCH_RUNS=str(tmp_path / "runs")

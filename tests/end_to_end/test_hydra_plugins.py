@@ -54,7 +54,7 @@ def test_optunas_sweeper_looks_for_the_best_mean_over_seeds(gsbench, tmp_path, d
     assert f"psnr of test views, {direction}d" in done.stderr
     psnr = defaultdict(list)
     for result in results_below(tmp_path / "runs" / "x"):
-        psnr[result["num_init_points"]].append(result["metrics"]["psnr"])  # type: ignore[index]
+        psnr[result["num_init_points"]].append(result["metrics"]["psnr"])
     assert all(len(values) == 2 for values in psnr.values())
     best = max(psnr, key=lambda count: statistics.fmean(psnr[count]))
     found = yaml.safe_load((tmp_path / "runs" / ".hydra" / "optimization_results.yaml").read_text())

@@ -50,7 +50,7 @@ SAME = ("point_cloud.ply", "events.jsonl", "lineage.npz", "per_view.csv")
 
 
 @pytest.fixture(scope="module")
-def captures(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+def captures(tmp_path_factory) -> tuple[Path, Path]:
     """A COLMAP folder with masks of a disc that wanders and of a margin, and the same with noise
     below them."""
     folder = tmp_path_factory.mktemp("masked")
@@ -166,7 +166,7 @@ def test_bad_masks_end_in_one_line_before_any_work(captures, tmp_path, capfd):
     shutil.copytree(captures[0], capture)
     mask = sorted((capture / "masks").iterdir())[2]
 
-    def said(*words: str) -> str:
+    def said(*words):
         capfd.readouterr()
         assert run([*QUICK, f"scene.path={capture}", f"runs={tmp_path / 'runs'}", *words]) != 0
         lines = [line for line in capfd.readouterr().err.splitlines() if str(capture) in line]

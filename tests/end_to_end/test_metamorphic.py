@@ -56,7 +56,7 @@ Change = Callable[[Path, pycolmap.Reconstruction], None]
 
 
 @pytest.fixture(scope="module")
-def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def good(tmp_path_factory) -> Path:
     """A COLMAP folder of the courtyard with exact cameras, and a cloud in the photographs'
     colours."""
     folder = tmp_path_factory.mktemp("made") / "good"
@@ -91,7 +91,7 @@ def surroundings(cameras: dict[str, Camera], images: Path) -> tuple[np.ndarray, 
 
 
 @pytest.fixture(scope="module")
-def original(good: Path, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+def original(good, tmp_path_factory) -> list[Path]:
     """Trials of the capture as it is, one for each seed."""
     runs = tmp_path_factory.mktemp("runs")
     return [train(runs / str(seed), good, COLMAP, f"seed={seed}") for seed in range(SEEDS)]

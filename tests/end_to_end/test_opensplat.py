@@ -28,7 +28,7 @@ pytestmark = [
 
 
 @pytest.fixture(scope="module")
-def trial(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def trial(tmp_path_factory) -> Path:
     """The folder of a trial of OpenSplat on a small courtyard, with a schedule of growth as short
     as the training."""
     runs = tmp_path_factory.mktemp("runs")

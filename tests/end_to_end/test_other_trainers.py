@@ -63,7 +63,7 @@ COURTYARD = ["scene.views=12", "scene.width=96", "scene.height=72", *QUICK]
 
 
 @pytest.fixture(scope="module")
-def trainers(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def trainers(tmp_path_factory) -> Path:
     """A folder of configurations with the two trainers: a user's own YAML files."""
     folder = tmp_path_factory.mktemp("conf")
     (folder / "densify").mkdir()
@@ -73,9 +73,7 @@ def trainers(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def home(
-    tmp_path_factory: pytest.TempPathFactory, environment: dict[str, str], trainers: Path
-) -> Path:
+def home(tmp_path_factory, environment, trainers) -> Path:
     """A folder with a fetched scene, and a sweep over it of one arm of ours and two of other
     programs."""
     home = tmp_path_factory.mktemp("home")
@@ -319,9 +317,7 @@ def test_one_that_hangs_is_ended(trainers, tmp_path, monkeypatch, capsys):
 
 
 @pytest.fixture
-def hanging(
-    environment: dict[str, str], trainers: Path, tmp_path: Path
-) -> Iterator[tuple[subprocess.Popen[str], list[int]]]:
+def hanging(environment, trainers, tmp_path) -> Iterator[tuple[subprocess.Popen[str], list[int]]]:
     """gsbench with a trainer that hangs, deaf to SIGTERM, and the trainer's and its child's process
     ids."""
     words = [

@@ -39,7 +39,7 @@ TRAINED = ("point_cloud.ply", "events.jsonl", "lineage.npz")
 
 
 @pytest.fixture(scope="module")
-def captures(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+def captures(tmp_path_factory) -> tuple[Path, Path]:
     """A COLMAP folder with points that all views made, and the same with noise in place of every
     eighth photograph."""
     folder = tmp_path_factory.mktemp("captures")

@@ -42,7 +42,7 @@ def test_an_edited_densifier_is_never_averaged_with_what_it_was(
     runs = str(tmp_path / "runs")
     monkeypatch.setenv("GSBENCH_RUNS", runs)
 
-    def train(*seeds: int) -> str:
+    def train(*seeds):
         """Trainings run in processes of their own, which import the file as it is."""
         done = gsbench(
             "-m", *SMALL, *QUICK, *OWN, f"seed={','.join(map(str, seeds))}", GSBENCH_RUNS=runs
@@ -50,7 +50,7 @@ def test_an_edited_densifier_is_never_averaged_with_what_it_was(
         assert done.returncode == 0, done.stderr
         return done.stderr
 
-    def ask(*words: str, code: int = 0) -> str:
+    def ask(*words, code=0):
         """Verbs read files only, and run here."""
         assert run(list(words)) == code
         said = capsys.readouterr()

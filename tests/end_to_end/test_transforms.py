@@ -83,7 +83,7 @@ def as_nerfstudio(model: pycolmap.Reconstruction, folder: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def scene(tmp_path_factory) -> Path:
     """A folder with a COLMAP model with points, and the same as transforms.json."""
     folder = tmp_path_factory.mktemp("transforms") / "yard"
     render_courtyard(folder, views=10, width=192, height=144)

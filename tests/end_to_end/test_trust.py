@@ -20,7 +20,7 @@ BOMB = "with open({mark!r}, 'a') as stream:\n    stream.write(__name__ + '\\n')\
 
 
 @pytest.fixture
-def capture(tmp_path: Path) -> Path:
+def capture(tmp_path) -> Path:
     """A folder with bombs of all names of the standard library and of everything that is
     installed."""
     folder, mark = tmp_path / "capture", tmp_path / "exploded"

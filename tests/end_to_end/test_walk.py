@@ -11,9 +11,7 @@ from __future__ import annotations
 import inspect
 import itertools
 from collections import Counter
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -95,12 +93,12 @@ def test_from_the_yaml_to_the_split(tmp_path, monkeypatch):
     stacks: list[list[Frame]] = []
     calls: Counter[str] = Counter()
 
-    def watch(owner: Any, name: str, counts: Callable[..., bool] = lambda *given: True) -> None:
+    def watch(owner, name, counts=lambda *given: True):
         """Count the calls of ``owner.name`` whose arguments count, and note the stack at the
         first."""
         real = getattr(owner, name)
 
-        def watched(*given: Any, **named: Any) -> Any:
+        def watched(*given, **named):
             if counts(*given):
                 calls[name] += 1
                 if calls[name] == 1:
@@ -122,7 +120,7 @@ def test_from_the_yaml_to_the_split(tmp_path, monkeypatch):
     compositions = 0
     enforce_permissions = compose.enforce_permissions  # for the command line, and for each job
 
-    def counted(*given: Any) -> Any:
+    def counted(*given):
         nonlocal compositions
         compositions += 1
         return enforce_permissions(*given)

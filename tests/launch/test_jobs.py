@@ -15,7 +15,7 @@ from gsbench.launch.jobs import Outcome, clouds_first, collect, job_folder
 
 
 @pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def folder(tmp_path, monkeypatch) -> Path:
     monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs"))
     return tmp_path
 
@@ -47,7 +47,7 @@ def test_a_job_that_left_nothing_is_told_by_its_log(folder):
 
 
 def test_one_trial_of_each_cloud_begins_first():
-    def trial(scene: str, seed: int) -> Any:
+    def trial(scene, seed):
         return SimpleNamespace(values={"scene": scene, "init": "sfm", "seed": seed})
 
     trials = [trial(scene, seed) for scene in "ab" for seed in (0, 1)]

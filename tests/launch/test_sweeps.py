@@ -11,12 +11,10 @@ import shutil
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import pytest
 
-from gsbench import cli
 from gsbench.app.command import compose_trials, launch, run_trials
 from gsbench.config.command_words import GROUPS, options, parse
 from gsbench.config.compose import Trial, compose_one
@@ -38,12 +36,7 @@ from gsbench.system.locks import BusyError, hold, is_held
 from tests.finished import record_of
 from tests.runs.test_trial_folder import edit
 
-
-@pytest.fixture(autouse=True)
-def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs"))
-    monkeypatch.chdir(tmp_path)
-    return tmp_path / "runs"
+pytestmark = pytest.mark.usefixtures("runs")
 
 
 @cache
@@ -75,7 +68,7 @@ def finish(
     if not source.exists():
         source.write_bytes(b"photo")
     entry = Store(folder.runs / "store").get(
-        Step(TRAIN, {"x": 1}, lambda folder: (folder / "model").write_text("m"))  # type: ignore[arg-type,return-value]
+        Step(TRAIN, {"x": 1}, lambda folder: (folder / "model").write_text("m"))
     )
     (folder.path / "table.csv").write_text("a,b")
     (folder.path / "config.yaml").write_text("")
@@ -507,12 +500,12 @@ def test_estimate_is_of_the_same_scene_size_and_rasterizer_or_is_none(runs):
 
 
 @pytest.fixture
-def fake_trial(monkeypatch: pytest.MonkeyPatch):  # type: ignore[no-untyped-def]
+def fake_trial(monkeypatch):
     """Replace the trial by one that does what ``behaviour[seed]`` says, and records the order."""
     behaviour: dict[int, Exception] = {}
     order: list[int] = []
 
-    def run_one(trial: Any, mirror: Any, wait: bool) -> Outcome:
+    def run_one(trial, mirror, wait):
         seed = trial.values["seed"]
         error = behaviour.get(seed)
         if isinstance(error, BusyError) and not wait:
@@ -601,27 +594,25 @@ def test_storage_errors_are_recognised(tmp_path):
 
 
 @pytest.mark.parametrize("number", [errno.EFBIG, errno.ENOLCK, errno.EROFS])
-def test_verbs_that_write_say_storage_errors_in_one_line(number, runs, monkeypatch, capsys):
-    def refuse(*arguments: object) -> None:
+def test_verbs_that_write_say_storage_errors_in_one_line(number, runs, monkeypatch, refused):
+    def refuse(*arguments):
         raise OSError(number, os.strerror(number), str(runs / "x" / "plan.json"))
 
     add_to_plan(compose_trials(["name=x", "densify=adc", "seed=0"]))
     monkeypatch.setattr("gsbench.launch.record.write_json", refuse)
-    assert cli.run(["status", "x", "--forget"]) == 2
-    said = capsys.readouterr().err
+    said = refused("status", "x", "--forget")
     assert len(said.splitlines()) == 1
     assert "plan.json" in said
 
 
 @pytest.mark.skipif(not hasattr(fcntl, "flock"), reason="needs flock")
-def test_a_file_system_without_locks_is_named(runs, monkeypatch, capsys):
-    def refuse(descriptor: int, operation: int) -> None:
+def test_a_file_system_without_locks_is_named(runs, monkeypatch, refused):
+    def refuse(descriptor, operation):
         raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
 
     add_to_plan(compose_trials(["name=x", "densify=adc", "seed=0"]))
     monkeypatch.setattr(fcntl, "flock", refuse)
-    assert cli.run(["status", "x", "--forget"]) == 2
-    assert "has no locks" in capsys.readouterr().err
+    assert "has no locks" in refused("status", "x", "--forget")
 
 
 def test_what_is_done_is_found_in_a_folder_that_may_not_be_written_to(runs, monkeypatch):
@@ -630,7 +621,7 @@ def test_what_is_done_is_found_in_a_folder_that_may_not_be_written_to(runs, monk
     trials = [replace(_composed(), values=values)]
     before = sorted(path for path in runs.rglob("*"))
 
-    def refuse(*arguments: object, **named: object) -> None:
+    def refuse(*arguments, **named):
         raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(runs))
 
     for name in (

@@ -16,7 +16,6 @@ from PIL import Image
 
 from gsbench.eval.evaluator import Evaluator
 from gsbench.eval.protocol import PAPER
-from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.ply import write_ply
 from gsbench.pipeline.steps import evaluate as evaluate_module
 from gsbench.pipeline.steps.evaluate import evaluate_step, measure_speed
@@ -47,9 +46,9 @@ def inputs(fps: list[int] | None = None, **options: Any) -> dict[str, Any]:
         user_code=UserCode(),
         program=None,
     )
-    step = evaluate_step(None, TRAINED, parts)  # type: ignore[arg-type]
+    step = evaluate_step(None, TRAINED, parts)
     parts.program = SimpleNamespace(leaves_model=False)
-    measured = evaluate_step(None, TRAINED, parts)  # type: ignore[arg-type]
+    measured = evaluate_step(None, TRAINED, parts)
     new = {"more", "fps"}
     assert {key: measured.inputs[key] for key in new & measured.inputs.keys()} == {
         key: step.inputs[key] for key in new & step.inputs.keys()
@@ -73,7 +72,7 @@ def test_speed_is_measured_at_the_size_that_is_asked_for(monkeypatch):
     case, sizes = CASES[-1], []
 
     class Watched(ReferenceRasterizer):
-        def render(self, gaussians: Any, camera: Any, *rest: Any) -> Any:
+        def render(self, gaussians, camera, *rest):
             sizes.append((camera.width, camera.height))
             return super().render(gaussians, camera, *rest)
 
@@ -90,7 +89,7 @@ def test_speed_is_measured_at_the_size_that_is_asked_for(monkeypatch):
 
 
 @pytest.fixture
-def told(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
+def told(monkeypatch) -> list[tuple[Any, ...]]:
     """The progress that an evaluation reports."""
     told: list[tuple[Any, ...]] = []
     monkeypatch.setattr(
@@ -130,7 +129,7 @@ def test_an_evaluation_measures_what_its_pictures_hold(tmp_path, truth, tiny_sce
     with (folder / "per_view.csv").open() as stream:
         rows = {row["view"]: row for row in csv.DictReader(stream)}
 
-    def rendered(model: Gaussians, view: View) -> np.ndarray:
+    def rendered(model, view):
         image = (
             ReferenceRasterizer().render(model, view.camera, 3, torch.tensor([0.1, 0.2, 0.3])).image
         )

@@ -37,7 +37,7 @@ WRAPPED = (
 
 
 @pytest.fixture(autouse=True)
-def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+def home(tmp_path, monkeypatch) -> Iterator[Path]:
     """The folder in which somebody types."""
     monkeypatch.chdir(tmp_path)
     yield tmp_path
@@ -53,7 +53,7 @@ def _forget() -> None:
 
 
 @pytest.fixture(autouse=True)
-def bare_capture(monkeypatch: pytest.MonkeyPatch) -> None:
+def bare_capture(monkeypatch) -> None:
     monkeypatch.setattr(pipeline_trial, "CaptureSource", BareSource)
 
 

@@ -18,8 +18,7 @@ from gsbench.runs.experiments import Declaration, Question, open_question, recor
 from gsbench.runs.keys import EVALUATE, INIT, STAGES, TRAIN, Step, sha256_of
 from gsbench.runs.store import Store
 from gsbench.runs.trial_folder import TrialFolder
-from gsbench.runs.trial_record import TrialRecord
-from gsbench.scene.types import Capture, Scene
+from gsbench.scene.types import Capture
 from gsbench.train.proof import Proven
 
 TRAINING = {
@@ -48,7 +47,7 @@ def write(files: dict[str, Any], folder: Path) -> None:
 
 
 @pytest.fixture
-def made(tmp_path: Path, tiny_scene: Scene) -> Any:
+def made(tmp_path, tiny_scene) -> Any:
     """A function that makes the results of a trial whose training is ``TRAINING`` with changes."""
     values = compose_one(
         ["scene=courtyard", "name=x", f"runs={tmp_path}", "eval.primary=psnr", "seed=4"]
@@ -58,7 +57,7 @@ def made(tmp_path: Path, tiny_scene: Scene) -> Any:
     larger = replace(tiny_scene.test[0], camera=tiny_scene.test[0].camera.resized(80, 64))
     scene = replace(tiny_scene, test=(larger, *tiny_scene.test[1:]))
 
-    def make(**changes: Any) -> TrialRecord:
+    def make(**changes):
         training = TRAINING | changes
         evaluation = {
             "metrics": {"psnr": 20.0},
@@ -89,7 +88,7 @@ def made(tmp_path: Path, tiny_scene: Scene) -> Any:
         raster = Proven(ReferenceRasterizer())
         return results_of(values, capture, scene, raster, entries, {"train": "2", "init": "1"})
 
-    make.values = values  # type: ignore[attr-defined]
+    make.values = values
     return make
 
 
@@ -172,7 +171,7 @@ def test_the_newest_declaration_of_the_metric_is_repeated(made):
 def test_the_hash_of_a_cloud_is_of_its_model_and_its_gaussians(tmp_path):
     store = Store(tmp_path)
 
-    def hash_of(number: int, **changes: str) -> str:
+    def hash_of(number, **changes):
         files = {f"{MODEL_FOLDER}/a.bin": "a", GAUSSIANS_FILE: "b", "report.json": "c"} | changes
         return cloud_hash(
             store.get(Step(INIT, {"number": number}, lambda folder: write(files, folder))).path

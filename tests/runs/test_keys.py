@@ -70,7 +70,7 @@ BESIDE: dict[str, tuple[str, ...]] = {
 
 
 @pytest.fixture
-def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+def package(tmp_path, monkeypatch) -> Iterator[Path]:
     """A copy of gsbench that is not the one that runs, without files of a release, read as by a new
     process."""
     copy = shutil.copytree(
@@ -201,7 +201,7 @@ CLASS = "class Mine: ...\n"
 
 
 @pytest.fixture
-def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+def home(tmp_path, monkeypatch) -> Iterator[Path]:
     """A folder in which somebody types, whose modules are allowed."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", list(sys.path))

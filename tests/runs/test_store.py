@@ -34,7 +34,7 @@ def refuse(folder: Path) -> None:
 
 
 @pytest.fixture
-def store(tmp_path: Path) -> Store:
+def store(tmp_path) -> Store:
     return Store(tmp_path / "store")
 
 
@@ -49,7 +49,7 @@ def test_second_request_is_not_built(store):
 
 
 def test_what_other_code_may_have_built_is_not_kept(store):
-    def changed() -> None:
+    def changed():
         raise InputError("the code was edited meanwhile")
 
     with pytest.raises(InputError, match="edited meanwhile"):
@@ -181,7 +181,7 @@ def test_a_copy_of_the_store_is_believed_by_content(store, tmp_path):
 
 
 def test_failed_build_is_not_published_and_starts_afresh(store):
-    def fail(folder: Path) -> None:
+    def fail(folder):
         (folder / "half.txt").write_text("half")
         raise RuntimeError("no")
 
@@ -194,7 +194,7 @@ def test_failed_build_is_not_published_and_starts_afresh(store):
 def test_resumable_build_finds_what_was_left_without_temporaries(store):
     stage = Stage("long", 1, resumable=True, scratch=("*.scratch",))
 
-    def half(folder: Path) -> None:
+    def half(folder):
         (folder / "half.txt").write_text("half")
         (folder / ".torn.tmp-123").write_text("to")
         (folder / "work.scratch").write_text("needed until published")
@@ -203,7 +203,7 @@ def test_resumable_build_finds_what_was_left_without_temporaries(store):
     with pytest.raises(KeyboardInterrupt):
         store.get(Step(stage, {}, half))
 
-    def rest(folder: Path) -> None:
+    def rest(folder):
         assert {path.name for path in folder.iterdir()} == {"half.txt", "work.scratch"}
         (folder / "rest.txt").write_text("rest")
 
@@ -338,7 +338,7 @@ def test_killed_rival_frees_its_lock(store):
 
 
 @pytest.fixture
-def small_disk(tmp_path: Path):  # type: ignore[no-untyped-def]
+def small_disk(tmp_path):
     """A file system of one MiB; the test is skipped where this user may not mount one."""
     disk = tmp_path / "disk"
     disk.mkdir()
@@ -358,7 +358,7 @@ def test_full_disk_is_one_line_and_corrupts_nothing(small_disk):
     store = Store(small_disk / "store")
     sound = store.get(Step(LETTERS, {"x": 1}, write_letters))
 
-    def big(folder: Path) -> None:
+    def big(folder):
         (folder / "big.bin").write_bytes(bytes(2 << 20))
 
     with pytest.raises(DiskFullError, match=r"is full: free some space") as caught:

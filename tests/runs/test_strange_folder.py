@@ -30,7 +30,7 @@ SECRET = "what nobody else may read or change"
 
 
 @pytest.fixture
-def outside(tmp_path: Path) -> Path:
+def outside(tmp_path) -> Path:
     """A private folder beside the runs folder."""
     folder = tmp_path / "outside"
     folder.mkdir()
@@ -39,7 +39,7 @@ def outside(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def trial(tmp_path: Path) -> Path:
+def trial(tmp_path) -> Path:
     """A finished trial in the runs folder, by its results alone."""
     folder = tmp_path / "runs" / "x" / "s" / "a-b" / "01234567-seed0"
     named = {

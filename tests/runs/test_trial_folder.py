@@ -23,7 +23,7 @@ from tests.fuzz.records import EXPERIMENT, write_trial
 
 
 @pytest.fixture
-def trial(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def trial(tmp_path, monkeypatch) -> Path:
     monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path))
     write_trial(tmp_path, "adc", 1)
     return write_trial(tmp_path, "adc", 0)

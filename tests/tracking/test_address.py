@@ -116,8 +116,7 @@ def test_no_link_among_the_artifacts_is_written_through(tmp_path):
 
 
 @pytest.mark.parametrize("address", ["./mlruns", "mlruns", "file:./mlruns", "http:/host"])
-def test_an_address_that_is_a_folder_is_refused_in_one_line(address, capsys):
-    assert run(["scene=courtyard", f"tracking.uri={address}", "--dry-run"]) == 2
-    said = capsys.readouterr().err.splitlines()
+def test_an_address_that_is_a_folder_is_refused_in_one_line(address, refused):
+    said = refused("scene=courtyard", f"tracking.uri={address}", "--dry-run").splitlines()
     assert len(said) == 1
     assert "tracking.uri must be an address such as http://HOST:PORT" in said[0]

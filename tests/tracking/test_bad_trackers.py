@@ -54,7 +54,7 @@ TINY = [
 
 
 @pytest.fixture(scope="module")
-def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def runs(tmp_path_factory) -> Path:
     return tmp_path_factory.mktemp("bad-trackers")
 
 
@@ -183,9 +183,7 @@ def wait_until(condition: Callable[[], bool]) -> None:
 
 
 @pytest.fixture(params=["http", "postgresql"])
-def tracker(
-    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
-) -> Iterator[tuple[Gate, str]]:
+def tracker(request, tmp_path_factory) -> Iterator[tuple[Gate, str]]:
     """A tracker that works, behind a gate, and its address there."""
     with ExitStack() as stack:
         if request.param == "http":

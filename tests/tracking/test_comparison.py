@@ -121,7 +121,7 @@ def test_other_versions_of_mlflow_get_the_plain_page(version):
 def test_a_server_that_refuses_long_parameters_gets_the_rest(limit, runs, monkeypatch):
     send = mlflow.MlflowClient.log_batch
 
-    def strict(self: Any, run_id: str, **sent: Any) -> None:
+    def strict(self, run_id, **sent):
         if any(len(param.value) > limit for param in sent.get("params", ())):
             raise MlflowException(f"Param value exceeded length {limit}")
         send(self, run_id, **sent)
@@ -187,7 +187,7 @@ def test_a_browser_shows_the_arms_as_groups_and_a_chart(tmp_path, monkeypatch):
             time.sleep(0.5)
         with Browser(page, tmp_path / "profile", (1500, 1000)) as browser:
 
-            def evaluated(script: str) -> Any:
+            def evaluated(script):
                 return browser.call("Runtime.evaluate", expression=script, returnByValue=True)[
                     "result"
                 ].get("value")

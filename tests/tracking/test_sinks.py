@@ -173,7 +173,7 @@ def test_tensorboard_shows_the_same_numbers_once(tmp_path):
     there = tmp_path / "tensorboard" / folder.relative_to(tmp_path)
     sink = options() | {"sink": "tensorboard"}
 
-    def shown() -> Any:
+    def shown():
         events = accumulator.EventAccumulator(str(there), size_guidance={"scalars": 0, "images": 0})
         return events.Reload()
 

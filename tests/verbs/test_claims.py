@@ -12,7 +12,7 @@ from tests.analysis.synthetic import Plan, write_runs
 
 
 @pytest.fixture
-def runs(tmp_path: Path) -> Path:
+def runs(tmp_path) -> Path:
     write_runs(tmp_path, Plan(scenes=("a", "b", "c"), trial_noise=0.3, effect_noise=0.2))
     write_runs(tmp_path, Plan(experiment="one", scenes=("a",), trial_noise=0.3))
     write_runs(tmp_path, Plan(experiment="alone", densifiers=("adc",)))

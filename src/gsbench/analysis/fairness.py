@@ -4,6 +4,7 @@ The sheet and the sentences are made from the trials' records, so they leave out
 recorded.
 """
 
+import itertools
 import statistics
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -70,14 +71,12 @@ def fairness_table(trials: Sequence[TrialResult], first: Arm, second: Arm) -> Ta
     """
     pairs = pair_trials(trials, first, second)
     one, other = pairs[0] if pairs else representatives(trials, first, second)
-    compared = [trial for pair in pairs for trial in pair] or trials
+    compared = list(itertools.chain(*pairs)) or trials
     groups = [[trial for trial in compared if trial.arm == arm] for arm in (first, second)]
-    rows = [_row(what, [show(group) for group in groups]) for what, show in MEASURED.items()]
+    rows = [_row(what, list(map(show, groups))) for what, show in MEASURED.items()]
     for index, key in enumerate(differing_keys(one.config, other.config)):
-        values = [
-            _shown(trial.config[key]) if key in trial.config else NONE for trial in (one, other)
-        ]
-        rows.append(_row(key, values, rule_above=index == 0))
+        shown = [_shown(own[key]) if key in own else NONE for own in (one.config, other.config)]
+        rows.append(_row(key, shown, rule_above=index == 0))
     notes = [ingredients_sentence(ingredients_between(trials, first, second), first, second)]
     notes += [f"Compared: {counted(len(pairs), 'pair')} of trials of one scene and seed."]
     notes += [f"Tuning. {line}" for line in tuning_lines(trials, (first, second))]

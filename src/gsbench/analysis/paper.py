@@ -91,26 +91,23 @@ class Published:
     @property
     def printed(self) -> dict[tuple[str, str], PrintedNumber]:
         """The printed numbers by scene and quantity."""
-        rows = (
-            (scene, zip(self.quantities, texts, strict=True))
-            for scene, texts in self.scenes.items()
-        )
-        return {(scene, key): PrintedNumber(text) for scene, row in rows for key, text in row}
+        printed = {}
+        for scene, texts in self.scenes.items():
+            for key, text in zip(self.quantities, texts, strict=True):
+                printed[scene, key] = PrintedNumber(text)
+        return printed
 
 
 @cache
 def load_paper() -> Paper:
     """The method's paper, from the file that ships with gsbench."""
     content = _read("paper.yaml")
-    tables = {
-        name: {
-            (scene, *arm, key): PrintedNumber(text)
-            for scene, rows in content[name]["scenes"].items()
-            for key, texts in zip(QUANTITIES[name], rows, strict=True)
-            for arm, text in zip(ARMS[name], texts, strict=True)
-        }
-        for name in PAPER_TABLES
-    }
+    tables: dict[str, dict[Key, PrintedNumber]] = {name: {} for name in PAPER_TABLES}
+    for name, table in tables.items():
+        for scene, rows in content[name]["scenes"].items():
+            for key, texts in zip(QUANTITIES[name], rows, strict=True):
+                for (init, densify), text in zip(ARMS[name], texts, strict=True):
+                    table[scene, init, densify, key] = PrintedNumber(text)
     return Paper(tables, tuple(content["contradictions"]), content["setup"])
 
 
@@ -226,14 +223,12 @@ def published_table(trials: Sequence[TrialResult], name: str) -> Table:
         raise InputError(
             f"{name} has the scenes {', '.join(scenes)}, and no trial here is of one of them"
         )
-    method = (
-        f"The printed numbers are of densify={paper.densify}; other arms are shown for orientation."
-    )
     notes = [
         f"{paper.title}.",
         f"Read from {paper.source}.",
         f"Conventions: {paper.conventions}.",
-        method,
+        f"The printed numbers are of densify={paper.densify}; other arms are shown for "
+        "orientation.",
     ]
 
     def find(scene: str, arm: Arm, key: str) -> PrintedNumber | None:
@@ -265,16 +260,13 @@ def _differences(
         entries: list[TableEntry] = []
         for one in shown:
             cell, printed = make_cell(group, one, [scene], expected), find(scene, arm, one.key)
-            entries += [
-                TableEntry(printed.text if printed else ""),
-                _difference(cell, printed, one, marks),
-            ]
+            entries.append(TableEntry(printed.text if printed else ""))
+            entries.append(_difference(cell, printed, one, marks))
         rows.append(Row((scene, arm.init, str(replace(arm, init=""))), tuple(entries)))
-    columns = [
-        Column(one.name, *heads)
-        for one in shown
-        for heads in ((paper, (one.key, paper)), ("Δ", (one.key, "delta")))
-    ]
+    columns = []
+    for one in shown:
+        columns.append(Column(one.name, paper, (one.key, paper)))
+        columns.append(Column(one.name, "Δ", (one.key, "delta")))
     setup_notes = [f"The paper on {topic}: it {words}." for topic, words in setup.items()]
     legend = (
         f"Δ is measured minus printed. Of {marks.total()} cells {marks[ROUNDING]} are within "
@@ -312,7 +304,6 @@ def agreement(cell: Cell, printed: PrintedNumber) -> str:
         return ROUNDING
     if cell.std is None:
         return DIFFERS
-    own = StudentT(cell.mean, cell.std / math.sqrt(cell.count), cell.count - 1).interval(
-        1 - CONFIDENCE
-    )
+    error = cell.std / math.sqrt(cell.count)
+    own = StudentT(cell.mean, error, cell.count - 1).interval(1 - CONFIDENCE)
     return INTERVAL if own.low <= high and own.high >= low else DIFFERS

@@ -20,7 +20,6 @@ from gsbench.settings import Switch, check_values
 from gsbench.words import did_you_mean, listed
 
 MAX_SWITCHES = 8
-_ABSENT = object()  # differs from any value
 
 Run = frozenset[str]  # the switches that are on
 TrialKeys = Mapping[str, str]  # scene -> folder of a run's trials, without the seed
@@ -44,10 +43,11 @@ def declared_switches(own: Mapping[str, Switch], values: Mapping[str, Any]) -> d
         if not isinstance(entry, Mapping) or "off" not in entry:
             raise InputError(f"{where} must be {{off: {{KEY: VALUE}}}}, got {entry!r}")
         switches[str(name)] = Switch(**check_values(Switch, dict(entry), where))
+    present = dict(values)
     return {
         name: switch
         for name, switch in switches.items()
-        if any(values.get(key, _ABSENT) != value for key, value in switch.off.items())
+        if present | dict(switch.off) != present  # else it is off already
     }
 
 
@@ -101,11 +101,10 @@ def runs_to_train(switches: Mapping[str, Switch]) -> list[Run]:
                     f"the switches {', '.join(chain)} form a circle: each is within the next"
                 )
             chain, outer = [*chain, outer], switches[outer].within
-    sizes = range(len(switches) + 1)
-    combinations = [
-        Run(chosen) for size in sizes for chosen in itertools.combinations(switches, size)
-    ]
-    runs = dict.fromkeys(effective_run(run, switches) for run in combinations)
+    runs: set[Run] = set()
+    for size in range(len(switches) + 1):
+        combinations = map(Run, itertools.combinations(switches, size))
+        runs |= {effective_run(run, switches) for run in combinations}
     return sorted(runs, key=lambda run: (-len(run), sorted(run)))
 
 
@@ -130,8 +129,11 @@ def judge_runs(
     """The verdicts on all ``runs`` against that with all switches on, in order, as one family."""
     quantity = asked_quantity(metric, trials)
     full = max(runs, key=len)
-    questions = [
-        Question(
+    questions = []
+    for run, keys in runs.items():
+        if run == full:
+            continue
+        question = Question(
             metric=metric,
             sign=quantity.direction or 1,
             least=quantity.worthwhile,
@@ -139,9 +141,7 @@ def judge_runs(
             arm=Arm("", run_name(run, sorted(full))),
             scenes={scene: (runs[full][scene], key) for scene, key in keys.items()},
         )
-        for run, keys in runs.items()
-        if run != full
-    ]
+        questions.append(question)
     return judge(trials, Declaration(time="1970-01-01T00:00:00Z", questions=tuple(questions)))
 
 

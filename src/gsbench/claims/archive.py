@@ -21,12 +21,13 @@ bit.
 import csv
 import hashlib
 import io
+import itertools
 import json
 import re
 import time
 import zipfile
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from lzma import LZMAError
 from pathlib import Path, PurePath
@@ -103,11 +104,9 @@ def write_archive(experiment: Experiment, out: Path, pictures: bool = False) -> 
         except InputError as error:
             left_out.append(f"{trial.label}: {error}")
             continue
-        rows += [
-            {"trial": _folder(trial), "view": view} | metrics
-            for view, metrics in sorted(views.items())
-        ]
-        configurations.setdefault(configuration, []).append((_folder(trial), trial.seed))
+        place = _folder(trial)
+        rows += [{"trial": place, "view": view} | views[view] for view in sorted(views)]
+        configurations.setdefault(configuration, []).append((place, trial.seed))
         kept.append(trial)
     if not kept:
         raise InputError(f"{experiment.name} has no whole trial to export (first: {left_out[0]})")
@@ -120,22 +119,13 @@ def write_archive(experiment: Experiment, out: Path, pictures: bool = False) -> 
             for text, trials in configurations.items()
         ),
         PER_VIEW: _table(rows),
+        **_declared(experiment.folder, kept),
     }
-    for name in RECORDS:
-        record = experiment.folder / name
-        contents |= {name: read_bytes(record)} if record.is_file() else {}
-    if any(
-        q.metric == TEXTURED.key
-        for one in read_declarations(experiment.folder)
-        for q in one.questions
-    ):
-        contents[PIXELS] = _json_lines(_pixel_measures(kept))
     for trial in kept if pictures else ():
         for kind in PICTURES:
+            place = f"{PICTURES_FOLDER}/{_folder(trial)}/{kind}"
             for path in trial.folder.pictures(kind):
-                contents[f"{PICTURES_FOLDER}/{_folder(trial)}/{kind}/{path.name}"] = read_bytes(
-                    path
-                )
+                contents[f"{place}/{path.name}"] = read_bytes(path)
     _check_size(sum(map(len, contents.values())))
     manifest = {
         "format": FORMAT,
@@ -144,26 +134,36 @@ def write_archive(experiment: Experiment, out: Path, pictures: bool = False) -> 
         "gsbench": __version__,
         "sha256": {name: hashlib.sha256(content).hexdigest() for name, content in contents.items()},
     }
-    contents[MANIFEST] = (json.dumps(manifest, indent=1) + "\n").encode()
-    crate = crate_metadata(
-        experiment.name, kept, {name: len(content) for name, content in contents.items()}
-    )
-    contents[CRATE] = (json.dumps(crate, indent=1) + "\n").encode()
+    contents[MANIFEST] = _page(manifest)
+    sizes = {name: len(content) for name, content in contents.items()}
+    # The description of the crate comes first, where other programs look for it.
+    contents = {CRATE: _page(crate_metadata(experiment.name, kept, sizes))} | contents
     with atomic(out, sync=False) as temporary, zipfile.ZipFile(temporary, "w") as archive:
-        for name in (CRATE, *(name for name in contents if name != CRATE)):
+        for name, content in contents.items():
             info = zipfile.ZipInfo(name, FIXED_DATE)
-            archive.writestr(info, contents[name], zipfile.ZIP_DEFLATED, compresslevel=9)
+            archive.writestr(info, content, zipfile.ZIP_DEFLATED, compresslevel=9)
     return left_out
 
 
-def _pixel_measures(trials: Sequence[TrialResult]) -> Iterator[dict[str, Any]]:
-    """The folder and the measures of each trial whose pictures can be read."""
-    for trial in trials:
-        with suppress(InputError):
-            yield {
-                "folder": _folder(trial),
-                "measures": PixelMeasures(error_textured=textured_error(trial)).to_json(),
-            }
+def _declared(home: Path, trials: Sequence[TrialResult]) -> dict[str, bytes]:
+    """The declarations, the ledger, and what declared questions ask of pictures.
+
+    The pictures themselves are mostly not in the archive.
+    """
+    contents = {name: read_bytes(home / name) for name in RECORDS if (home / name).is_file()}
+    asked = itertools.chain(*(one.questions for one in read_declarations(home)))
+    if TEXTURED.key in {question.metric for question in asked}:
+        measured = []
+        for trial in trials:
+            with suppress(InputError):  # a trial whose pictures cannot be read
+                measures = PixelMeasures(error_textured=textured_error(trial)).to_json()
+                measured.append({"folder": _folder(trial), "measures": measures})
+        contents[PIXELS] = _json_lines(measured)
+    return contents
+
+
+def _page(content: Mapping[str, Any]) -> bytes:
+    return (json.dumps(content, indent=1) + "\n").encode()
 
 
 def unpack_archive(file: Path, runs: Path) -> Experiment:
@@ -207,11 +207,9 @@ def _check_configuration(
 ) -> None:
     """Raise InputError if the configuration ``values`` contradicts ``results`` in ``folder``."""
     names = {SEED_KEY: values[SEED_KEY]}
-    names |= {
-        group: values[group].get("name")
-        for group in NAMED_GROUPS
-        if isinstance(values.get(group), dict)
-    }
+    for group in NAMED_GROUPS:
+        if isinstance(own := values.get(group), dict):
+            names[group] = own.get("name")
     for key, value in names.items():
         if value != results[key]:
             raise InputError(
@@ -236,8 +234,8 @@ def _read(file: Path) -> tuple[dict[str, Any], dict[str, bytes]]:
             if manifest.get("version") != VERSION:
                 raise InputError(
                     f"it is of version {manifest.get('version')} of the archive (gsbench "
-                    f"{manifest.get('gsbench')}), "
-                    f"and this gsbench reads {VERSION}: use one gsbench for both"
+                    f"{manifest.get('gsbench')}), and this gsbench reads {VERSION}: use one "
+                    "gsbench for both"
                 )
             _check_size(sum(info.file_size for info in archive.infolist()))
             contents = {str(name): _member(archive, str(name)) for name in manifest["sha256"]}
@@ -374,11 +372,8 @@ def _configuration(trial: TrialResult) -> str:
         raise InputError(NO_CONFIGURATION) from None
     if not isinstance(values, dict):
         raise InputError(f"its {CONFIG} is not a mapping")
-    return json.dumps(
-        without_paths(
-            {key: value for key, value in values.items() if key not in (*PRIVATE, SEED_KEY)}
-        )
-    )
+    kept = {key: value for key, value in values.items() if key not in (*PRIVATE, SEED_KEY)}
+    return json.dumps(without_paths(kept))
 
 
 def _results(trial: TrialResult) -> dict[str, Any]:
@@ -412,10 +407,8 @@ def _lines(content: bytes) -> list[dict[str, Any]]:
 
 
 def _table(rows: Sequence[Mapping[str, object]]) -> bytes:
-    text = io.StringIO()
-    writer = csv.DictWriter(
-        text, dict.fromkeys(name for row in rows for name in row), lineterminator="\n"
-    )
+    text, columns = io.StringIO(), dict.fromkeys(itertools.chain(*rows))
+    writer = csv.DictWriter(text, columns, lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
     return text.getvalue().encode()

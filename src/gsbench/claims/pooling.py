@@ -18,7 +18,7 @@ import numpy as np
 
 from gsbench.analysis.cells import select_trials, with_variants
 from gsbench.analysis.fairness import budget_words
-from gsbench.analysis.pairing import Pairs, pair
+from gsbench.analysis.pairing import Pairs, ScenePairs, pair
 from gsbench.analysis.results import Arm, TrialResult, group_by
 from gsbench.analysis.statistics import Interval, StudentT, t_test
 from gsbench.claims.archive import unpack_archive
@@ -191,35 +191,31 @@ def read_studies(
         for protocol, own in by_protocol:
             groups = _group_into_studies(own, _arm_pairs(own, question, path))
             for arms in groups:
-                qualifiers = [protocol] * (len(by_protocol) > 1) + [arms[0][0].init] * (
-                    len(groups) > 1
-                )
+                qualifiers = [protocol] if len(by_protocol) > 1 else []
+                qualifiers += [arms[0][0].init] if len(groups) > 1 else []
                 label = f"{name} ({', '.join(qualifiers)})" if qualifiers else name
-                questions = [
-                    Question(metric=question.metric, baseline=one, arm=other) for one, other in arms
-                ]
-                pairs_by_arms = [pair(own, asked) for asked in questions]
-                together = Pairs(tuple(row for pairs in pairs_by_arms for row in pairs.rows))
-                if not together.rows:
-                    reason = next(
-                        (f" ({line})" for pairs in pairs_by_arms for line in pairs.left_out), ""
-                    )
-                    raise InputError(
-                        f"{path}: no trials can be paired in {question.metric}{reason}"
-                    )
-                test = t_test(together.differences)
-                mean, interval = (
-                    float(together.differences.mean()),
-                    None if test is None else test.interval(),
-                )
-                studies.append(Study(label, mean, interval, protocol, _budgets(own, arms)))
-                for (baseline, arm), pairs in zip(arms, pairs_by_arms, strict=True):
+                rows: list[ScenePairs] = []
+                left_out: list[str] = []
+                for baseline, arm in arms:
+                    pairs = pair(own, Question(metric=question.metric, baseline=baseline, arm=arm))
                     count = sum(len(row.seeds) for row in pairs.rows)
                     notes.append(
                         f"{label}: {arm} against {baseline}, {count} pairs of trials on "
                         f"{', '.join(pairs.scenes)}; {_size(own)}"
                     )
                     notes += [f"{label}: left out, {line}" for line in pairs.left_out]
+                    rows += pairs.rows
+                    left_out += pairs.left_out
+                if not rows:
+                    reason = f" ({left_out[0]})" if left_out else ""
+                    raise InputError(
+                        f"{path}: no trials can be paired in {question.metric}{reason}"
+                    )
+                differences = Pairs(tuple(rows)).differences
+                test = t_test(differences)
+                interval = None if test is None else test.interval()
+                budgets = _budgets(own, arms)
+                studies.append(Study(label, float(differences.mean()), interval, protocol, budgets))
         return studies, notes, set(map(_mark, trials))
 
 
@@ -268,17 +264,14 @@ def _arm_pairs(
 
 def _budgets(trials: Sequence[TrialResult], pairs: Sequence[tuple[Arm, Arm]]) -> str:
     """``20,000 Gaussians (governor)``: the limits on growth in these pairs of arms."""
-    arms = {arm for pair in pairs for arm in pair}
-    return " or ".join(
-        sorted({budget_words(trial) or "not known" for trial in trials if trial.arm in arms})
-    )
+    own = [trial for trial in trials if any(trial.arm in pair for pair in pairs)]
+    return " or ".join(sorted({budget_words(trial) or "not known" for trial in own}))
 
 
 def _size(trials: Sequence[TrialResult]) -> str:
     """Iterations, view sizes and versions, in which pooled trials may differ, for the reader."""
-    sizes = sorted(
-        {f"{size[0]}×{size[1]}" for trial in trials if (size := trial.record.resolution)}
-    )
+    known = {trial.record.resolution for trial in trials} - {None}
+    sizes = sorted("{}×{}".format(*size) for size in known if size)
     steps = sorted({f"{trial.record.iterations:,}" for trial in trials})
     versions = sorted({trial.record.versions.get("gsbench", "?") for trial in trials})
     return (
@@ -289,6 +282,5 @@ def _size(trials: Sequence[TrialResult]) -> str:
 def _mark(trial: TrialResult) -> str:
     """A hash that distinguishes a trial even from its repetition, which takes other seconds."""
     record = trial.record
-    return sha256_of(
-        [trial.config_hash, trial.seed, record.hashes, record.seconds, dict(trial.metrics)]
-    )
+    facts = [trial.config_hash, trial.seed, record.hashes, record.seconds, dict(trial.metrics)]
+    return sha256_of(facts)

@@ -52,7 +52,7 @@ if model != "none":
 
 
 @pytest.fixture
-def views(tmp_path: Path) -> Any:
+def views(tmp_path) -> Any:
     """Four training views and two test views of noise, and a cloud of seven points."""
     rng = np.random.default_rng(0)
     made = [
@@ -244,7 +244,7 @@ def test_a_training_leaves_its_model_its_lineage_and_its_summary(views, tmp_path
 
 
 def test_renders_of_a_program_are_collected_for_the_test_views(views, tmp_path, monkeypatch):
-    def run(command: Any, log: Path, output: Path, *rest: Any) -> Any:
+    def run(command, log, output, *rest):
         for view in views.scene.test:
             Image.fromarray(255 - view.image).save(output / view.name)
         return SimpleNamespace(seconds=1.0, peak_memory_mb=1.0)
@@ -325,7 +325,7 @@ def test_an_initialiser_gets_the_cameras_that_stand_in_for_those_that_did_not_co
         Capture("made", tmp_path, ("a.png",), (), None, False, "0"),
     )
     reference = CLOUD_STEP if has_reference else None
-    step = init_step(store, capture, Noting(), reference)  # type: ignore[arg-type]
+    step = init_step(store, capture, Noting(), reference)
     step.build(tmp_path)
     assert told == [("photographs", 1, 1)]
     assert (tmp_path / "given").read_text() == str(
@@ -334,9 +334,9 @@ def test_an_initialiser_gets_the_cameras_that_stand_in_for_those_that_did_not_co
     assert step.inputs["reference"] == (CLOUD_STEP.key if has_reference else None)
     assert step.inputs["options"]["count"] == 3
     others = [
-        init_step(store, capture, Noting(4), reference),  # type: ignore[arg-type]
-        init_step(store, replace(capture, fingerprint="1"), Noting(), reference),  # type: ignore[arg-type]
-        init_step(store, replace(capture, test_names=("a.png",)), Noting(), reference),  # type: ignore[arg-type]
+        init_step(store, capture, Noting(4), reference),
+        init_step(store, replace(capture, fingerprint="1"), Noting(), reference),
+        init_step(store, replace(capture, test_names=("a.png",)), Noting(), reference),
     ]
     assert len({step.key, *(other.key for other in others)}) == 4
     (tmp_path / "a.png").write_bytes(b"torn")

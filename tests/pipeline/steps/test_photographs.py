@@ -31,7 +31,7 @@ from gsbench.scene.types import Capture
 
 
 @pytest.fixture
-def photographs(tmp_path: Path) -> Path:
+def photographs(tmp_path) -> Path:
     """Four photographs, the second of them transparent on its left half, and masks that ignore the
     upper half."""
     for index, name in enumerate(("a", "b", "c", "d")):
