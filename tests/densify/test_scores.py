@@ -65,9 +65,7 @@ def alphas(gaussians: Gaussians, camera: Camera) -> np.ndarray:
     """alpha T of every Gaussian in every pixel, [N, H, W], taken apart from all sums."""
     found = np.zeros((len(gaussians), HEIGHT, WIDTH))
     projected = project(gaussians, camera)
-    for tile, members in bin_gaussians(
-        projected.depths, *tile_rectangles(projected, camera, 16), 3
-    ):
+    for tile, members in bin_gaussians(projected.depths, *tile_rectangles(projected, camera), 3):
         for y in range(tile // 3 * 16, min(tile // 3 * 16 + 16, HEIGHT)):
             for x in range(tile % 3 * 16, min(tile % 3 * 16 + 16, WIDTH)):
                 index = projected.index[members]
