@@ -162,7 +162,7 @@ def test_tiles_and_blocks_are_those_that_a_contour_reaches() -> None:
             listed[k, tile], masks[k, tile] = True, frame.masks[entry]
 
     projected = project(case.gaussians(), case.camera())
-    first, past = tile_rectangles(projected, case.camera(), 16)
+    first, past = tile_rectangles(projected, case.camera())
     rows = {int(index): row for row, index in enumerate(projected.index)}
     own = [rows[int(index)] for index in integers[:, layout.INDEX]]
     first, past = first[own].numpy(), past[own].numpy()  # [R, 2]

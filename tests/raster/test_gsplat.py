@@ -13,7 +13,6 @@ import pytest
 import torch
 
 from gsbench.gaussians.model import Gaussians
-from gsbench.raster import CONSTANTS
 from gsbench.raster.contract import Case, departures, render_with_gradients
 from gsbench.raster.gsplat import GsplatRasterizer, _DeviceCamera, _reaches_image, _square_radii
 from gsbench.raster.reference import ReferenceRasterizer, project, tile_rectangles
@@ -186,7 +185,7 @@ def test_square_radii_are_those_of_the_reference() -> None:
 def test_reach_agrees_with_the_tiles_of_the_reference() -> None:
     camera = front_camera(64, 48)
     projected = project(random_gaussians(300, seed=6, log_scale=(-4, 0)), camera)
-    low, high = tile_rectangles(projected, camera, CONSTANTS.tile)
+    low, high = tile_rectangles(projected, camera)
     reached = ((high - low) > 0).all(-1)
     ours = _reaches_image(projected.means + 0.5, projected.radii, 64, 48)
     assert (ours | ~reached).all()  # whatever reaches a tile there reaches the image here

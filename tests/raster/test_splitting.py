@@ -66,7 +66,7 @@ class Slow:
         self.linear = [
             jacobian(lambda point: image_of(self.camera, point), mean) for mean in self.means
         ]
-        first, past = tile_rectangles(self.projected, self.camera, CONSTANTS.tile)  # [M, 2]
+        first, past = tile_rectangles(self.projected, self.camera)  # [M, 2]
         tiles = (self.pixels // CONSTANTS.tile).unsqueeze(0)  # [1, P, 2]
         self.reached = ((tiles >= first.unsqueeze(1)) & (tiles < past.unsqueeze(1))).all(
             -1

@@ -85,6 +85,7 @@ class GsplatRasterizer:
         bad = Readback(bad_values(gaussians, background))
         width, height, tile = camera.width, camera.height, CONSTANTS.tile
         on_device = self._on_device(camera, gaussians.means)
+        # radii [1, N, 2], means [1, N, 2] px, depths [1, N], conics [1, N, 3]
         radii, means, depths, conics, _ = self.library.fully_fused_projection(
             gaussians.means,
             None,
@@ -96,7 +97,7 @@ class GsplatRasterizer:
             height,
             eps2d=CONSTANTS.blur,
             near_plane=CONSTANTS.near,
-        )  # radii [1, N, 2], means [1, N, 2] px, depths [1, N], conics [1, N, 3]
+        )
         seen = (radii > 0).all(-1)  # [1, N]
         square = _square_radii(conics.detach(), seen)  # [1, N] int32
         tiles_x, tiles_y = -(-width // tile), -(-height // tile)
@@ -166,12 +167,8 @@ class _DeviceCamera:
         view = np.eye(4)
         view[:3, :3], view[:3, 3] = camera.rotation, camera.translation
         intrinsics = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
-        numbers = (
-            view[None],
-            intrinsics[None],
-            camera.center,
-            np.array([camera.width / 2, camera.height / 2]),
-        )
+        half_size = np.array([camera.width / 2, camera.height / 2])
+        numbers = (view[None], intrinsics[None], camera.center, half_size)
         return cls(*map(like.new_tensor, numbers))
 
 
@@ -235,9 +232,8 @@ def _empty(
     zero = 0 * points.sum()
     image = background.expand(camera.height, camera.width, 3) + zero
     alpha = torch.zeros_like(image[..., 0]) + zero
-    return RenderOutput(
-        image, alpha, torch.zeros_like(points[:, 0], dtype=torch.int32), points, absolute
-    )
+    radii = torch.zeros_like(points[:, 0], dtype=torch.int32)
+    return RenderOutput(image, alpha, radii, points, absolute)
 
 
 def _square_radii(conics: Tensor, seen: Tensor) -> Tensor:
@@ -250,13 +246,8 @@ def _square_radii(conics: Tensor, seen: Tensor) -> Tensor:
     determinant = 1 / (a * c - b * b)
     half_trace = 0.5 * (a + c) * determinant
     root = (half_trace * half_trace - determinant).clamp_min(CONSTANTS.eigenvalue_floor).sqrt()
-    radii = (
-        (CONSTANTS.sigma_extent * (half_trace + root).sqrt())
-        .ceil()
-        .nan_to_num(0, 0, 0)
-        .clamp(0, MAX_RADIUS)
-    )
-    return torch.where(seen, radii, 0.0).to(torch.int32)
+    radii = (CONSTANTS.sigma_extent * (half_trace + root).sqrt()).ceil()
+    return torch.where(seen, radii.nan_to_num(0, 0, 0).clamp(0, MAX_RADIUS), 0.0).to(torch.int32)
 
 
 def _reaches_image(means: Tensor, radii: Tensor, width: int, height: int) -> Tensor:

@@ -72,8 +72,7 @@ class CpuFrame(NamedTuple):
     masks: NDArray[np.uint16]  # [pairs] bit b: the record may touch block b of the tile
     processed: NDArray[np.int64]  # [tiles] end of the entries that compositing has read
     transmittance: NDArray[np.float32]  # [tiles * TILE_PIXELS] final, by tile, block and lane
-    last: NDArray[
-        np.float32
-    ]  # [tiles * TILE_PIXELS] number of entries before the one that stopped the pixel
+    # [tiles * TILE_PIXELS] number of entries before the one that stopped the pixel
+    last: NDArray[np.float32]
     bounds: NDArray[np.int64]  # [shards + 1] first tile of each shard
     tile_shard: NDArray[np.uint8]  # [tiles] shard of each tile
