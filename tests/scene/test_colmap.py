@@ -13,7 +13,6 @@ from PIL import Image
 from gsbench.errors import InputError
 from gsbench.scene.colmap import model_points, read_model, read_reference, write_model
 from gsbench.scene.colmap_files import _MODELS, ModelChecks, check_model
-from gsbench.scene.options import SplitRule
 from gsbench.scene.readers import read_colmap, read_photos
 from gsbench.scene.types import Camera
 from tests.scene.cameras import cameras_of
@@ -59,8 +58,7 @@ def test_cameras_follow_smaller_files(make_scene, model, params):
 
 
 def test_subset_drops_images_and_their_observations(make_scene, tmp_path: Path):
-    everything = SplitRule(test_every=0)
-    fitted = read_reference(read_colmap("toy", make_scene(), max_images=3, split=everything))
+    fitted = read_reference(read_colmap("toy", make_scene(), max_images=3))
     assert sorted(image.name for image in fitted.images.values()) == ["00.png", "02.png", "04.png"]
     assert {point.track.length() for point in fitted.points3D.values()} == {3}
     assert max(reprojection_errors(fitted)) < 1e-9

@@ -219,11 +219,10 @@ def test_lists_say_what_is_trained_on_and_tested(make_scene, train, test, traine
 
 def test_a_split_without_views_is_refused():
     names = [str(k) for k in range(5)]
-    assert split_names(names, test_every=0) == (names, [])
     for options, said in (
         ({"test_every": 1}, "no training view"),
         ({"test": []}, "no test view"),
-        ({"test_every": -1}, "test_every"),
+        *(({"test_every": every}, "test_every must be positive") for every in (0, -1)),
     ):
         with pytest.raises(InputError, match=said):
             split_names(names, **options)
