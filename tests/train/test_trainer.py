@@ -8,7 +8,6 @@ from __future__ import annotations
 import itertools
 import math
 import time
-from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -16,7 +15,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsbench.densify import ADC, Densifier, NoDensifier, ResGS, Volumetric
+from gsbench.densify import ADC, NoDensifier, Volumetric
 from gsbench.errors import TrainingError
 from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.ply import read_ply
@@ -47,26 +46,6 @@ def test_same_seed_same_bits_other_seed_not(lab: Lab) -> None:
     assert not same(runs[0], runs[2])
 
 
-MAKERS: dict[str, Callable[[], Densifier]] = STATEFUL | {
-    "volumetric": lambda: small(Volumetric, volume_threshold=0.01),
-    "resgs": lambda: small(ResGS, phase_ends=[0.3, 0.6], fade_interval=15, fade_stop=100),
-}
-
-
-@pytest.mark.parametrize("kind", MAKERS)
-def test_interrupted_training_ends_in_the_same_bits(kind: str, lab: Lab) -> None:
-    make = MAKERS[kind]
-    whole = lab.train(make(), "whole")
-    with pytest.raises(StopError):
-        lab.train(make(), "broken", stop_at(70))
-    assert lab.checkpoints("broken") == [50]
-    assert same(whole, lab.train(make(), "broken"))
-    for file in (EVENTS, "volume_histograms.jsonl"):
-        assert lab.text(file, "broken") == lab.text(file, "whole")
-    assert lab.steps(METRICS, "broken") == list(range(10, 121, 10))
-    assert lab.checkpoints("broken") == [50, 100]
-
-
 def test_events_add_up_to_the_gaussians(lab: Lab) -> None:
     densifier = small(Volumetric, volume_threshold=0.01)
     trained = lab.train(densifier)
@@ -86,19 +65,6 @@ def test_nothing_is_refined_in_the_last_iteration(lab: Lab) -> None:
     """3DGS saves its model before it would refine or step."""
     lab.train(small(), iterations=100)
     assert lab.steps(EVENTS) == [40, 60, 80]
-
-
-def test_time_budget_ends_a_training(lab: Lab) -> None:
-    lab.train(NoDensifier(), iterations=10**6, max_seconds=0.3)
-    last = lab.records(METRICS)[-1]
-    assert last["seconds"] >= 0.3
-    assert last["step"] < 10**6
-
-
-def test_visible_adam_trains_too(lab: Lab) -> None:
-    lab.train(small(), visible_adam=True)
-    metrics = lab.records(METRICS)
-    assert metrics[-1]["l1"] < metrics[0]["l1"]
 
 
 class Explode(NoDensifier):
