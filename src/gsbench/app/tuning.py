@@ -1,5 +1,4 @@
-"""Tuning parity: before a sweep's trials, each arm gets the same number of search points, on
-validation views.
+"""Tuning parity: before a sweep, each arm gets equally many search points, on validation views.
 
 Intervals among the words of the sweep or in its grids say what is tuned, and for which arms. An arm
 without intervals is not tuned. Each arm has its own search, whose points are trained in an
@@ -66,8 +65,9 @@ DIGITS = 4  # significant digits of a value, so that people can type it
 
 @dataclass(frozen=True)
 class TuneSettings:
-    """Settings of a tuning. ``points`` is the number for each arm; 0: nothing is tuned, and
-    intervals are left out.
+    """Settings of a tuning.
+
+    ``points`` is the number for each arm; 0: nothing is tuned, and intervals are left out.
 
     ``seed`` lists the seeds of a point's trials. The sweep may have none of them.
     """
@@ -133,8 +133,10 @@ class ArmSearch:
         return None if record is None else record.metrics.get(self.record.metric)
 
     def judge(self, proposal: Proposal, trials: Sequence[Trial]) -> SearchPoint:
-        """Judge a point by the mean of its trials. It has failed if one of them lacks the
-        metric."""
+        """Judge a point by the mean of its trials.
+
+        It has failed if one of them lacks the metric.
+        """
         from optuna.trial import TrialState
 
         values = [value for trial in trials if (value := self.value_of(trial)) is not None]
@@ -265,9 +267,8 @@ def _describe(searches: Sequence[ArmSearch]) -> str:
     untuned = [search.record.arm for search in searches if not search.ranges]
     return (
         f"a search tunes first: {counted(first.wanted, 'point')} each for {listed(list(trials))}, "
-        f"by {first.metric} "
-        f"of validation views on {listed(first.scenes)} with {counted(len(first.seeds), 'seed')}, "
-        f"{sum(trials.values()) * first.wanted} trainings"
+        f"by {first.metric} of validation views on {listed(first.scenes)} with "
+        f"{counted(len(first.seeds), 'seed')}, {sum(trials.values()) * first.wanted} trainings"
         + (f"; not tuned: {listed(untuned)}" if untuned else "")
     )
 
@@ -378,8 +379,10 @@ def _goal(tune: TuneSettings, trials: Sequence[Trial]) -> tuple[str, Literal[-1,
 
 
 def distribution(override: Override) -> BaseDistribution:
-    """The range of an interval, for Optuna. Raises InputError for a wrong interval or a setting
-    that arms share."""
+    """The range of an interval, for Optuna.
+
+    Raises InputError for a wrong interval or a setting that arms share.
+    """
     from optuna.distributions import FloatDistribution, IntDistribution
 
     check_makes_trials(override)
@@ -405,8 +408,7 @@ def distribution(override: Override) -> BaseDistribution:
 def _own_values(
     values: Mapping[str, Any], ranges: Mapping[str, BaseDistribution]
 ) -> dict[str, Any] | None:
-    """The arm's own values of the searched settings; None if one lies outside its range, or nothing
-    is searched."""
+    """The arm's own values of the searched settings; None if outside the ranges, or if none."""
     settings = flatten(values)
     own = {key: settings.get(bare_key(key)) for key in ranges}
     return (
@@ -415,8 +417,7 @@ def _own_values(
 
 
 def _is_in(value: Any, searched: Any) -> bool:
-    """Return whether the range ``searched`` contains a value that rounding to `DIGITS` leaves as it
-    is."""
+    """Return whether ``searched`` contains a value that rounding to `DIGITS` does not change."""
     if (
         isinstance(value, bool)
         or not isinstance(value, int | float)

@@ -46,15 +46,13 @@ def run_batch(trials: Sequence[Trial]) -> list[Outcome]:
 
 
 def begin_for_another_launcher(trials: Sequence[Trial]) -> None:
-    """Check, plan and declare trials that another launcher (a Hydra plugin) will run, perhaps
-    several at once."""
+    """Check, plan and declare trials that a Hydra plug-in will run, perhaps several at once."""
     with storage_errors(checked_runs_folder(trials[0].values["runs"])):
         _begin(trials, [trial for trial in trials if _why_not_done(trial)])
 
 
 def _begin(trials: Sequence[Trial], unfinished: Sequence[Trial]) -> None:
-    """Refuse trials that are known to fail; then make the runs folder, tidy the store, write plan
-    and declarations."""
+    """Refuse trials known to fail; make the runs folder, tidy the store, write the plan."""
     declared_metrics(trials)  # raises for two metrics in one experiment, before anything is written
     runs, launcher = (
         checked_runs_folder(trials[0].values["runs"]),
@@ -81,8 +79,7 @@ def _begin(trials: Sequence[Trial], unfinished: Sequence[Trial]) -> None:
 
 
 def _skip_finished(trials: Sequence[Trial]) -> tuple[list[Outcome], list[Trial]]:
-    """The outcomes of finished trials, and the unfinished ones; each folder once, since a sweep may
-    repeat a value."""
+    """The outcomes of finished trials, and the unfinished ones, each folder once."""
     outcomes: list[Outcome] = []
     unfinished: list[Trial] = []
     for folder, trial in {trial.folder: trial for trial in trials}.items():
@@ -102,8 +99,10 @@ def _why_not_done(trial: Trial) -> str:
 
 @cache
 def _unavailable(options: str) -> frozenset[str]:
-    """The metrics that cannot be computed now. The cache searches for (and downloads) weights once
-    per sweep."""
+    """The metrics that cannot be computed now.
+
+    The cache searches for (and downloads) weights once per sweep.
+    """
     from gsbench.eval.options import EvalConfig
     from gsbench.pipeline.parts import make_evaluator
 
@@ -114,8 +113,7 @@ def _unavailable(options: str) -> frozenset[str]:
 
 
 def missing_folders(trials: Sequence[Trial]) -> list[str]:
-    """A line for each missing folder of photographs, model or weights that trials name, and how to
-    get photographs."""
+    """A line for each missing folder of photographs, model or weights, and where to get them."""
     from gsbench.datasets.catalog import how_to_get
     from gsbench.scene.readers import missing_folder, missing_model
 
@@ -181,8 +179,7 @@ def check_trackers(trials: Sequence[Trial]) -> None:
 
 
 def borrowed_names(trials: Sequence[Trial]) -> list[str]:
-    """A line for each of the user's classes whose name in tables would be that of a class of
-    gsbench."""
+    """A line for each class of the user's whose name in tables is that of a class of gsbench."""
     classes = {
         (group, str(part.get("name")), str(part["_target_"]))
         for trial in trials
@@ -198,8 +195,7 @@ def borrowed_names(trials: Sequence[Trial]) -> list[str]:
 
 
 def need_no_check(trials: Sequence[Trial]) -> bool:
-    """Return whether all components have their shipped options, which gsbench's own tests have
-    checked.
+    """Return whether all components have shipped options, which gsbench's tests have checked.
 
     Then a dry run need not load torch.
     """

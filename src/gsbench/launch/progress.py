@@ -1,5 +1,4 @@
-"""The progress of a sweep: the states of its trials by arm and scene, its speed, time left and
-leading arm."""
+"""The progress of a sweep: states by arm and scene, speed, time left and leading arm."""
 
 from __future__ import annotations
 
@@ -49,8 +48,7 @@ class Progress:
 
 
 def progress_frame(runs: Path, experiment: str) -> pd.DataFrame:
-    """A row for each arm and scene of an experiment in the folder ``runs``, as ``gsbench status
-    --watch`` shows it.
+    """A row for each arm and scene of an experiment, as ``gsbench status --watch`` shows it.
 
     Its columns are arm, scene, done, running, failed, waiting (numbers of trials) and
     iterations_per_second (of running trainings, else 0). ``attrs`` has seconds_left and leader.
@@ -105,8 +103,7 @@ def _names(folders: Sequence[Path]) -> dict[Path, Name]:
 
 
 def _training(folder: Path) -> tuple[int, float]:
-    """The last iteration of the training in progress, and its iterations per second; zeros if there
-    is none."""
+    """The last iteration of the present training, and iterations per second; else zeros."""
     building = TrialFolder(folder).building()
     file = Path(building.folder, CURVES) if building.folder else None
     rows = read_rows(file) if file is not None and file.exists() else []
@@ -173,6 +170,5 @@ def _in_words(means: dict[str, float], metric: Quantity, shared: int) -> str:
         return f"no arm leads in {metric.name}; {shared} trials of each are compared"
     return (
         f"{best} leads so far: {metric.name} {metric.format(means[best])}, mean of the {shared} "
-        "scenes and seeds that "
-        "all arms have. This is not a verdict."
+        "scenes and seeds that all arms have. This is not a verdict."
     )
