@@ -17,20 +17,16 @@ from PIL import Image
 
 from gsbench.errors import InputError
 from gsbench.init import MODEL_FOLDER, Dim, SiftKornia, read_cloud
-from gsbench.init.networks import extract_and_match
+from gsbench.init.networks import extract_and_match, matchers
 from gsbench.init.networks.extract_and_match import (
-    EXTRACTORS,
-    SUPERPOINT_BORDER,
     NetworkJob,
     at_low_resolution,
-    build_matcher,
     choose_pairs,
-    extract_features,
-    match,
-    mutual_nearest_matcher,
     open_store,
 )
+from gsbench.init.networks.extractors import EXTRACTORS, SUPERPOINT_BORDER, extract_features
 from gsbench.init.networks.features import Features, FeatureStore
+from gsbench.init.networks.matchers import build_matcher, match, mutual_nearest_matcher
 from gsbench.logs import no_progress
 from gsbench.scene.types import Capture
 from gsbench.weights import MissingWeightsError, load_state
@@ -248,9 +244,9 @@ class TestContracts:
         torch.save(published, tmp_path / "published.pth")
         settings = superpoint(untrained_weights).feature_settings()
         networks: list[torch.nn.Module] = []
-        load_into = extract_and_match.load_into
+        load_into = matchers.load_into
         monkeypatch.setattr(
-            extract_and_match,
+            matchers,
             "load_into",
             lambda network, *rest: (networks.append(network), load_into(network, *rest)),
         )
@@ -412,7 +408,9 @@ class TestErrors:
             raise torch.OutOfMemoryError("CUDA out of memory")
 
         with pytest.raises(InputError, match=r"0000.png: cpu ran out of memory at 320x240 px"):
-            extract_features(courtyard.images / "0000.png", no_gpu, 1600, 10, CPU)
+            extract_features(
+                courtyard.images / "0000.png", no_gpu, SiftKornia().feature_settings(), CPU
+            )
 
     def test_an_empty_image_has_no_matches(self):
         some = Features(

@@ -3,6 +3,7 @@ right."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,14 +17,14 @@ from gsbench.init.colmap.database import (
     create_database,
     database_counts,
     unknown_camera_groups,
-    verify_pairs,
     write_keypoints,
     write_matches,
 )
+from gsbench.init.colmap.features import extract_sift
+from gsbench.init.colmap.geometry import verification_options, verify_pairs
 from gsbench.init.colmap.mapping import map_images
-from gsbench.init.colmap.reconstruct import verification_options
-from gsbench.init.colmap.sift import extract_sift, match_sift
-from gsbench.init.networks.extract_and_match import EXTRACTORS, extract_features
+from gsbench.init.colmap.matches import match_sift
+from gsbench.init.networks.extractors import EXTRACTORS, extract_features
 from gsbench.init.networks.features import Features, FeatureSettings
 from gsbench.logs import no_progress
 from gsbench.scene.types import Capture
@@ -85,6 +86,13 @@ def test_sift_through_the_external_path_gives_the_same_model(
         )
 
 
+def extract(path: Path, max_image_size: int) -> Features:
+    """The features that kornia's SIFT finds."""
+    cpu = torch.device("cpu")
+    settings = replace(SIFT, max_image_size=max_image_size)
+    return extract_features(path, EXTRACTORS[SIFT.extractor](SIFT, None, cpu), settings, cpu)
+
+
 @pytest.mark.parametrize("max_image_size", [320, 213])
 def test_kornia_keypoints_coincide_with_colmaps(
     own_path: tuple[Path, list[tuple[str, str]]], bare_photos: Capture, max_image_size: int
@@ -94,10 +102,7 @@ def test_kornia_keypoints_coincide_with_colmaps(
     name = bare_photos.image_names[0]
     with pycolmap.Database.open(own_path[0]) as database:
         colmap = database.read_keypoints(database.read_image_with_name(name).image_id)[:, :2]
-    extractor = EXTRACTORS[SIFT.extractor](SIFT, None, torch.device("cpu"))
-    features = extract_features(
-        bare_photos.images / name, extractor, max_image_size, 2000, torch.device("cpu")
-    )
+    features = extract(bare_photos.images / name, max_image_size)
     assert features.network_size == (max_image_size, round(max_image_size * 0.75))
     ours = features.colmap_keypoints
     distances = np.linalg.norm(ours[:, None] - colmap[None], axis=2)  # [K, L]
@@ -115,8 +120,7 @@ def test_a_blob_is_found_at_its_centre(tmp_path: Path, center: tuple[float, floa
     Image.fromarray(np.repeat(blob[..., None], 3, axis=2).round().astype(np.uint8)).save(
         tmp_path / "blob.png"
     )
-    extractor = EXTRACTORS[SIFT.extractor](SIFT, None, torch.device("cpu"))
-    features = extract_features(tmp_path / "blob.png", extractor, 1600, 10, torch.device("cpu"))
+    features = extract(tmp_path / "blob.png", 1600)
     np.testing.assert_allclose(features.colmap_keypoints[0], center, atol=0.05)
 
 

@@ -14,17 +14,16 @@ from scipy.spatial.transform import Rotation
 
 from gsbench.init import Sfm
 from gsbench.init.base import PoseErrors, Preparation, Timer
-from gsbench.init.colmap.mapping import ReconstructionJob, _finish
-from gsbench.init.colmap.reconstruct import similarity_to
-from gsbench.init.report import (
+from gsbench.init.colmap.alignment import (
     compare_poses,
-    draw_cloud,
-    find_warnings,
-    make_report,
     measure_gauge,
+    similarity_to,
     training_extent,
-    view_from_above,
 )
+from gsbench.init.colmap.mapping import MappingResult
+from gsbench.init.colmap_initializer import ReconstructionJob, finish
+from gsbench.init.picture import draw_cloud, view_from_above
+from gsbench.init.report import find_warnings, make_report
 from gsbench.scene.types import Capture
 
 NAMES = ("a.png", "b.png", "c.png", "d.png")
@@ -196,11 +195,11 @@ def test_where_two_cameras_are_common_nothing_is_compared_and_that_is_said(
     work = ReconstructionJob(
         Sfm(), capture, tmp_path / "out", tmp_path / "work", None, Preparation()
     )
-    similarity = similarity_to(model, reference)
-    report = _finish(work, "own", model, reference, similarity, Timer({}), {})
+    mapped = MappingResult(model, 1, "incremental", ())
+    report = finish(work, model, reference, mapped, Timer({}), {})
     assert report.pose_errors is None
     (warning,) = [line for line in report.warnings if "common cameras" in line]
-    assert _finish(work, "own", model, None, None, Timer({}), {}).warnings == tuple(
+    assert finish(work, model, None, mapped, Timer({}), {}).warnings == tuple(
         line for line in report.warnings if line != warning
     )
 

@@ -15,8 +15,13 @@ from PIL import Image
 
 from gsbench.errors import InputError
 from gsbench.init import MODEL_FOLDER, Jittered, Sfm, SfmDense, read_cloud
-from gsbench.init.base import OWN_GAUGE_FOLDER, PICTURE_FILE, REPORT_FILE, InitReport
-from gsbench.init.sfm import WORK_FOLDER
+from gsbench.init.base import (
+    OWN_GAUGE_FOLDER,
+    PICTURE_FILE,
+    REPORT_FILE,
+    WORK_FOLDER,
+    InitReport,
+)
 from gsbench.scene.types import Capture
 from tests.scene.courtyard.surfaces import surface_distance
 

@@ -1,5 +1,7 @@
-"""Every executor that runs here against the float64 reference: the contract of
-``gsbench.raster.base``."""
+"""Every executor that runs here against the float64 reference.
+
+The contract of ``gsbench.raster.base``.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,7 @@
-"""What the compiled CPU rasterizer promises beyond the contract: the same bits, memory safe to
-keep, any host."""
+"""What the compiled CPU rasterizer promises beyond the contract.
+
+The same bits, memory safe to keep, any host.
+"""
 
 from __future__ import annotations
 
@@ -109,8 +111,10 @@ def test_tiles_are_divided_by_their_work(
 
 
 def highest(records: np.ndarray, low_x: Any, low_y: Any, size: float) -> np.ndarray:
-    """The largest log2(alpha) of records [R, 16] in squares of side ``size``: at the mean, or else
-    on an edge."""
+    """The largest log2(alpha) of records [R, 16] in squares of side ``size``.
+
+    At the mean, or else on an edge.
+    """
     mean_x, mean_y, shear, curve_t, curve_y, top = (
         records[:, k, None].astype(np.float64) for k in range(6)
     )
@@ -158,7 +162,7 @@ def test_tiles_and_blocks_are_those_that_a_contour_reaches() -> None:
             listed[k, tile], masks[k, tile] = True, frame.masks[entry]
 
     projected = project(case.gaussians(), case.camera())
-    first, past = tile_rectangles(projected, case.camera(), 16)
+    first, past = tile_rectangles(projected, case.camera())
     rows = {int(index): row for row, index in enumerate(projected.index)}
     own = [rows[int(index)] for index in integers[:, layout.INDEX]]
     first, past = first[own].numpy(), past[own].numpy()  # [R, 2]
@@ -168,10 +172,8 @@ def test_tiles_and_blocks_are_those_that_a_contour_reaches() -> None:
     least = math.log2(1 / 255)
     pixel_y, pixel_x = np.divmod(np.arange(96 * 64), 96)
     reached = highest(records, pixel_x, pixel_y, 0.0) >= least
-    needed, needed_blocks = (
-        np.zeros((len(numbers), 24), bool),
-        np.zeros((len(numbers), 24, 16), bool),
-    )
+    needed = np.zeros((len(numbers), 24), bool)
+    needed_blocks = np.zeros((len(numbers), 24, 16), bool)
     np.logical_or.at(needed, (slice(None), pixel_y // 16 * 6 + pixel_x // 16), reached)
     block = pixel_y % 16 // 4 * 4 + pixel_x % 16 // 4
     np.logical_or.at(
@@ -221,8 +223,10 @@ def test_the_backward_pass_skips_entries_behind_the_one_that_stopped_a_block() -
 
 
 def test_needles_keep_their_gradients() -> None:
-    """Long thin Gaussians: the determinant of their 2D covariance loses its digits in float32 as ac
-    - b^2."""
+    """Long thin Gaussians.
+
+    The determinant of their 2D covariance loses its digits in float32 as ac - b^2.
+    """
     gaussians = Case(90, 70, 40, sh_degree=0).gaussians()
     gaussians.log_scales[:, 0] = 0.5
     gaussians.log_scales[:, 1:] = -9.0
@@ -239,8 +243,10 @@ def test_needles_keep_their_gradients() -> None:
 
 
 def test_turning_a_ball_has_no_gradient() -> None:
-    """Not even a rounding error: Adam would turn 1e-13 into a full step. What is nearly a ball has
-    a true one."""
+    """Not even a rounding error: Adam would turn 1e-13 into a full step.
+
+    What is nearly a ball has a true one.
+    """
     for stretch in (0.0, 0.01):
         gaussians = MANY.gaussians()
         gaussians.log_scales[:] = gaussians.log_scales[:, :1]
@@ -260,8 +266,10 @@ def test_turning_a_ball_has_no_gradient() -> None:
 
 
 def test_renders_may_be_differentiated_late_and_twice() -> None:
-    """Two graphs at once, in the opposite order, and one of them twice: none may use the memory of
-    another."""
+    """Two graphs at once, in the opposite order, and one of them twice.
+
+    None may use the memory of another.
+    """
     rasterizer = CpuRasterizer(threads=1)
     cases = (CASE, MANY)
     alone = [render_with_gradients(rasterizer, case, torch.float32)[1]["means"] for case in cases]
@@ -458,10 +466,8 @@ def _gather_and_scatter(array, indices, out):  # type: ignore[no-untyped-def]
 def test_gather_and_scatter() -> None:
     array = np.arange(60, dtype=np.float32).reshape(20, 3)
     before = array.copy()
-    indices, out = (
-        np.array([5, 0, 19, 7, 2, 1, 3, 4, 6, 8, 9, 10, 11, 12, 7, 7]),
-        np.empty(16, np.float32),
-    )
+    indices = np.array([5, 0, 19, 7, 2, 1, 3, 4, 6, 8, 9, 10, 11, 12, 7, 7])
+    out = np.empty(16, np.float32)
     _gather_and_scatter(array, indices, out)
     np.testing.assert_array_equal(out, before[indices, 1])
     before[indices, 2] = before[indices, 1]

@@ -1,5 +1,7 @@
-"""The table of executors: what `raster=` accepts, what `auto` takes, and that nothing else lists
-them."""
+"""The table of executors.
+
+What `raster=` accepts, what `auto` takes, and that nothing else lists them.
+"""
 
 from __future__ import annotations
 

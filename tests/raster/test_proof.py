@@ -1,5 +1,7 @@
-"""The proof of an executor: it passes sound kernels, catches planted faults, and is made once for
-each version."""
+"""The proof of an executor.
+
+It passes sound kernels, catches planted faults, and is made once for each version.
+"""
 
 from __future__ import annotations
 
@@ -220,8 +222,10 @@ def test_two_processes_prove_once(tmp_path: Path) -> None:
 
 @pytest.fixture
 def gpu(monkeypatch: pytest.MonkeyPatch) -> dict[str, list[str]]:
-    """A GPU on which all executors seem to be installed. The dictionary maps executors to their
-    failures."""
+    """A GPU on which all executors seem to be installed.
+
+    The dictionary maps executors to their failures.
+    """
     failures: dict[str, list[str]] = {}
     monkeypatch.setattr(type(EXECUTORS[0]), "is_installed", property(lambda self: True))
     monkeypatch.setattr(module, "create_rasterizer", lambda name, *_: name)

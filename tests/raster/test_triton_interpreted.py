@@ -1,5 +1,7 @@
-"""What the Triton rasterizer promises beyond the contract, in Triton's interpreter; run by
-``test_triton.py``."""
+"""What the Triton rasterizer promises beyond the contract, in Triton's interpreter.
+
+Run by ``test_triton.py``.
+"""
 
 from __future__ import annotations
 
@@ -65,10 +67,10 @@ def test_the_same_bits_on_every_run() -> None:
 def test_neither_old_memory_nor_the_order_of_programs_changes_a_bit(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Programs in any order, memory full of NaN and of places far outside: nothing is read before
-    it is written.
+    """Programs in any order, memory full of NaN and of places far outside.
 
-    Of the long lists of opaque Gaussians many entries are such that no pixel comes to them.
+    Nothing is read before it is written. Of the long lists of opaque Gaussians many entries are
+    such that no pixel comes to them.
     """
     shorten_segments(monkeypatch)
     case = Case(20, 17, 80, sh_degree=1, log_scale=-0.5, logit=4.0)
@@ -134,8 +136,10 @@ def misses(case: Case, gaussians: Gaussians) -> tuple[dict[str, float], RenderOu
 
 
 def test_a_long_list_is_walked_backward_in_segments() -> None:
-    """Some 600 faint Gaussians before one block, three segments; opaque ones between stop some of
-    the pixels."""
+    """Some 600 faint Gaussians before one block, three segments.
+
+    Opaque ones between stop some of the pixels.
+    """
     case = Case(16, 8, 620, sh_degree=1)
     gaussians = case.gaussians()
     gaussians.means[:, :2] *= 0.3
@@ -154,8 +158,10 @@ def test_a_long_list_is_walked_backward_in_segments() -> None:
 def test_segments_change_nothing_but_the_last_digits(
     monkeypatch: pytest.MonkeyPatch, logit: float
 ) -> None:
-    """Six blocks of some 60 entries, eight a segment, some of them behind where all pixels of a
-    block have stopped."""
+    """Six blocks of some 60 entries, eight a segment.
+
+    Some are behind where all pixels of a block have stopped.
+    """
     case = Case(20, 17, 80, sh_degree=1, log_scale=-0.5, logit=logit)
     shorten_segments(monkeypatch)
     errors, output = misses(case, case.gaussians())
@@ -205,8 +211,10 @@ def test_needles_keep_their_gradients() -> None:
 
 @pytest.mark.parametrize("stretch", [0.0, 0.01])
 def test_turning_a_ball_has_no_gradient(stretch: float) -> None:
-    """Not even a rounding error: Adam would turn 1e-13 into a full step. What is nearly a ball has
-    a true one."""
+    """Not even a rounding error: Adam would turn 1e-13 into a full step.
+
+    What is nearly a ball has a true one.
+    """
     gaussians = SMALL.gaussians()
     gaussians.log_scales[:] = gaussians.log_scales[:, :1]
     gaussians.log_scales[:, 1] += stretch
@@ -248,8 +256,10 @@ def test_far_from_the_origin_nothing_is_lost() -> None:
 
 
 def test_renders_may_be_differentiated_late_and_twice() -> None:
-    """Two graphs at once, in the opposite order, and one of them twice: none may use the memory of
-    another."""
+    """Two graphs at once, in the opposite order, and one of them twice.
+
+    None may use the memory of another.
+    """
     rasterizer = TritonRasterizer()
     cases = (TINY, SMALL)
     alone = [render_with_gradients(rasterizer, case, torch.float32)[1]["means"] for case in cases]
@@ -314,8 +324,10 @@ def test_strided_parameters_and_the_gradient_of_the_background() -> None:
 
 
 def test_a_step_leaves_nothing_alive() -> None:
-    """Without Python's collector of cycles: what a step made is freed as soon as its names are
-    gone."""
+    """Without Python's collector of cycles.
+
+    What a step made is freed as soon as its names are gone.
+    """
     rasterizer, loss = TritonRasterizer(), TritonLoss(0.2)
     parameters = leaves(TINY)
     target = torch.zeros(TINY.height, TINY.width, 3, dtype=torch.uint8)
@@ -350,8 +362,10 @@ def test_a_step_leaves_nothing_alive() -> None:
 
 
 def test_more_rows_than_were_expected() -> None:
-    """Gaussians as large as the image: the memory for their rows grows, and the result is that of a
-    second render."""
+    """Gaussians as large as the image.
+
+    The memory for their rows grows, and the result is that of a second render.
+    """
     gaussians = random_gaussians(6, seed=1, log_scale=(0.5, 1.0)).map(Tensor.float)
     camera = Camera(90, 120, 90, 90, 45, 60, np.eye(3), np.zeros(3))
     rasterizer = TritonRasterizer()

@@ -118,8 +118,7 @@ def test_distorted_cameras_are_not_pinholes(make_scene):
         cameras_of(read_model(root / "sparse/0"))
 
 
-@pytest.mark.parametrize("text", [False, True])
-def test_written_cameras_project_alike(tmp_path: Path, text: bool):
+def test_written_cameras_project_alike(tmp_path: Path):
     rng = np.random.default_rng(5)
     cameras = {}
     for k in range(4):
@@ -128,7 +127,7 @@ def test_written_cameras_project_alike(tmp_path: Path, text: bool):
         cameras[f"{k}.png"] = Camera(
             64, 48, 60.0 + (k > 1), 61.0, 31.0, 25.0, rotation, rng.normal(size=3)
         )
-    write_model(tmp_path / "model", cameras, text=text)
+    write_model(tmp_path / "model", cameras)
     model = pycolmap.Reconstruction(tmp_path / "model")
     assert model.num_cameras() == 2
     for name, camera in cameras.items():

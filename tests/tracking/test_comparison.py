@@ -99,6 +99,12 @@ def test_a_description_of_somebody_else_stays(runs):
     assert tags_of(client, "described")[NOTE] == "my own words"
 
 
+def test_a_description_without_a_verdict_begins_with_what_is_missing(tmp_path):
+    write_sweep(tmp_path)
+    text = description(read_experiment(tmp_path / "swept"))
+    assert text.startswith("**No verdict: it needs a declared metric (eval.primary), two arms")
+
+
 def test_a_long_description_is_cut_at_a_line(tmp_path):
     write_sweep(tmp_path, tuple(f"arm{number:02}_{'x' * 40}" for number in range(20)))
     text = description(read_experiment(tmp_path / "swept"))

@@ -173,8 +173,7 @@ def test_an_error_in_the_background_is_raised_and_not_lost(
 
 
 def test_a_state_goes_to_another_device_whole() -> None:
-    """Nothing of a checkpoint stays on the CPU that the model's device needs, and the other way
-    round."""
+    """A checkpoint lies where the model's device needs it, on the CPU and elsewhere."""
     rates = LearningRates()
     gaussians = TrainableGaussians(random_gaussians(5, seed=0, dtype=torch.float32), rates, 1.0)
     gaussians.values.means.square().sum().backward()

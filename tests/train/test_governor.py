@@ -1,5 +1,7 @@
-"""Arms under the governor, in whole trainings: one count at the end, equal numbers of rounds,
-thresholds on record."""
+"""Arms under the governor, in whole trainings.
+
+One count at the end, equal numbers of rounds, thresholds on record.
+"""
 
 from __future__ import annotations
 
@@ -77,8 +79,10 @@ def trained(
 def test_where_the_strictest_growth_is_too_much_the_faint_are_culled(
     tiny_scene: Scene, truth: Gaussians, tmp_path: Path
 ) -> None:
-    """A threshold in other units than the scene's: a thousandth of it and a thousand times it
-    select everybody."""
+    """A threshold in other units than the scene's.
+
+    A thousandth of it and a thousand times it select everybody.
+    """
     own = {
         "volume_threshold": 1e-24,
         "prune_opacity": 0.03,
@@ -100,8 +104,7 @@ def test_where_the_strictest_growth_is_too_much_the_faint_are_culled(
 def test_a_frozen_training_changes_nothing_more(
     tiny_scene: Scene, truth: Gaussians, tmp_path: Path
 ) -> None:
-    """The first round beyond the limit is the last that does anything, and the later ones say what
-    they would add."""
+    """Only the first round beyond the limit acts; later ones say what they would add."""
     own = {
         "cap": "freeze",
         "max_gaussians": 100,

@@ -1,5 +1,7 @@
-"""A loss with a mask: what is ignored adds nothing to it and has no gradient; what counts weighs
-what it did."""
+"""A loss with a mask: what is ignored adds nothing to it and has no gradient.
+
+What counts weighs what it did.
+"""
 
 from __future__ import annotations
 
@@ -29,8 +31,10 @@ def picture() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
 
 
 def test_the_loss_with_a_mask_is_its_definition(picture) -> None:
-    """L1 summed over what counts; SSIM by scikit-image, of pictures that are equal under the mask;
-    over all pixels."""
+    """L1 summed over what counts.
+
+    SSIM by scikit-image, of pictures that are equal under the mask; over all pixels.
+    """
     image, target, mask = picture
     loss, l1, ssim = PhotometricLoss(0.2, threads=1)(replace_ignored(image, target, mask), target)
     truth, counts = target.numpy() / 255.0, mask.numpy()[..., 0]
@@ -70,10 +74,9 @@ def test_no_gradient_and_no_value_comes_from_under_the_mask(picture, dtype: torc
 
 
 def test_far_from_the_mask_a_pixel_pulls_as_without_one(picture) -> None:
-    """So thresholds on gradients mean the same: the loss is divided by all pixels, not by those
-    that count.
+    """So thresholds on gradients mean the same.
 
-    Far: 11 px, a window on a window.
+    The loss is divided by all pixels, not by those that count. Far: 11 px, a window on a window.
     """
     image, target, _ = picture
     mask = torch.ones(HEIGHT, WIDTH, 1, dtype=torch.bool)

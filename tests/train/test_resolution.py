@@ -1,5 +1,7 @@
-"""The schedule of sizes against a restatement of the rule; small pictures, the count that follows,
-and resuming."""
+"""The schedule of sizes against a restatement of the rule.
+
+Small pictures, the count that follows, and resuming.
+"""
 
 from __future__ import annotations
 
@@ -155,18 +157,18 @@ def test_a_small_picture_is_the_filtered_one_from_the_same_place(
     expected = np.einsum("ih,hwc,jw->ijc", rows, image / 1.0, columns)
     assert np.abs(targets.get(0).numpy() - expected).max() <= 0.5 + 1e-4
     x, y, z = camera.rotation @ np.array([0.1, -0.2, 0.3]) + camera.translation
-    across, down = (
-        (camera.fx * x / z + camera.cx) / camera.width,
-        (camera.fy * y / z + camera.cy) / camera.height,
-    )
+    across = (camera.fx * x / z + camera.cx) / camera.width
+    down = (camera.fy * y / z + camera.cy) / camera.height
     assert (small.fx * x / z + small.cx) / width == pytest.approx(across)
     assert (small.fy * y / z + small.cy) / height == pytest.approx(down)
 
 
 @pytest.mark.parametrize(("height", "width"), [(7, 5), (8, 5), (6, 4)])
 def test_the_energy_within_a_window(height: int, width: int) -> None:
-    """A window has as many pixels on either side of frequency zero; the last is the whole
-    spectrum."""
+    """A window has as many pixels on either side of frequency zero.
+
+    The last is the whole spectrum.
+    """
     (picture,) = soft_pictures(1, height, width, 3)
     spectrum = sum(np.abs(np.fft.fftshift(np.fft.fft2(picture[..., c] / 255.0))) for c in range(3))
     fractions = np.array([0.0, 0.4, 0.8, 1.0])
@@ -320,8 +322,10 @@ def test_interrupted_in_the_middle_it_ends_in_the_same_bits(
 def test_masks_are_as_small_as_their_pictures(
     tiny_scene: Scene, truth: Gaussians, rasterizer: Rasterizer, tmp_path: Path
 ) -> None:
-    """What a mask ignores has no part in a small picture either: whatever stands there, the
-    training is the same."""
+    """What a mask ignores has no part in a small picture either.
+
+    Whatever stands there, the training is the same.
+    """
     trained = []
     for value in (0, 255):
         views = []

@@ -1,5 +1,7 @@
-"""The training loop: it learns, it follows the schedule, it is repeatable, and it goes on where it
-was stopped."""
+"""The training loop.
+
+It learns, it follows the schedule, it is repeatable, and it goes on where it was stopped.
+"""
 
 from __future__ import annotations
 
@@ -271,8 +273,10 @@ def test_as_on_a_device_that_is_behind(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Losses that arrive late, images without room, checkpoints written by a thread: the same bits,
-    stopped or not."""
+    """Losses that arrive late, images without room, checkpoints written by a thread.
+
+    The same bits, stopped or not.
+    """
 
     def make() -> Densifier:
         return small() if kind == "adc" else MCMC(start=20, stop=110, interval=20)
@@ -483,8 +487,10 @@ def test_checkpoints_come_so_many_minutes_after_the_last(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A clock that goes on by half a minute each time: at the start, in each iteration, and after
-    each checkpoint."""
+    """A clock that goes on by half a minute each time.
+
+    At the start, in each iteration, and after each checkpoint.
+    """
     looks, clock = itertools.count(), SimpleNamespace(perf_counter=time.perf_counter)
     clock.monotonic = lambda: 30.0 * next(looks)
     monkeypatch.setattr(trainer, "time", clock)

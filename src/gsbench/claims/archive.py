@@ -7,6 +7,7 @@ It holds:
   seeds;
 - ``per_view.csv``: the metrics of every test view;
 - ``declared.jsonl``: the declarations of the experiment, if there are any;
+- ``ledger.jsonl``: the ideas of a ledger (`gsbench ledger`), if it is one;
 - ``from_pixels.jsonl``: measures of the trials' pictures, if declared claims use them;
 - ``pictures/``: renders and photographs of test views by trial, only if they were asked for;
 - ``archive.json``: the version of this format and the sha256 of the files above;
@@ -47,6 +48,7 @@ from gsbench.runs.layout import (
     DECLARED,
     FROM_PIXELS,
     GROUND_TRUTH,
+    LEDGER,
     PER_VIEW,
     RENDERS,
     RESULTS,
@@ -54,6 +56,7 @@ from gsbench.runs.layout import (
 from gsbench.settings import is_folder_name
 from gsbench.words import readable_bytes, without_folders
 
+RECORDS = (DECLARED, LEDGER)  # files of the experiment, kept as they are
 FORMAT, VERSION = "gsbench results", 1
 PIXELS = "from_pixels.jsonl"
 MANIFEST, CRATE = "archive.json", "ro-crate-metadata.json"
@@ -82,6 +85,7 @@ FILES = {  # media types and descriptions
     PER_VIEW: ("text/csv", "Metrics of every test view of every trial"),
     PIXELS: ("application/jsonl", "What declared claims ask of the trials' pictures, measured"),
     DECLARED: ("application/jsonl", "What was declared before the trials were run"),
+    LEDGER: ("application/jsonl", "The ideas in the order of their tests (gsbench ledger)"),
     MANIFEST: ("application/json", "Version of the archive, and the sha256 of its files"),
 }
 
@@ -142,9 +146,11 @@ def write_archive(experiment: Experiment, out: Path, pictures: bool = False) -> 
 
 
 def _declared(home: Path, trials: Sequence[TrialResult]) -> dict[str, bytes]:
-    """The declarations, and what they ask of pictures: those are mostly not in the archive."""
-    file = home / DECLARED
-    contents = {DECLARED: read_bytes(file)} if file.is_file() else {}
+    """The declarations, the ledger, and what declared questions ask of pictures.
+
+    The pictures themselves are mostly not in the archive.
+    """
+    contents = {name: read_bytes(home / name) for name in RECORDS if (home / name).is_file()}
     asked = itertools.chain(*(one.questions for one in read_declarations(home)))
     if TEXTURED.key in {question.metric for question in asked}:
         measured = []
@@ -318,8 +324,9 @@ def _unpack(
     for name in contents:
         if name.startswith(f"{PICTURES_FOLDER}/"):
             _unpack_picture(home, name, contents[name])
-    if DECLARED in contents:
-        (home / DECLARED).write_bytes(contents[DECLARED])
+    for name in RECORDS:
+        if name in contents:
+            (home / name).write_bytes(contents[name])
 
 
 def _unpack_picture(home: Path, name: str, content: bytes) -> None:

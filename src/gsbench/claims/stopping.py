@@ -160,6 +160,21 @@ def plan_sweep(trials: Sequence[Trial]) -> SweepInLooks:
     return SweepInLooks(declaration, home, by_key)
 
 
+def finished_trials(home: Path, trials: Sequence[Trial]) -> list[TrialResult]:
+    """The results of those ``trials`` that are done. Results of earlier code do not count as
+    done."""
+    by_folder = {trial.folder: trial for trial in trials}
+
+    def is_done(result: TrialResult) -> bool:
+        trial, awaited = by_folder.get(result.path), result.record.awaited
+        # A metric whose weights are missing does not make a trial unfinished.
+        return trial is not None and not trial.files.why_not_done(
+            trial.values, lambda options: awaited
+        )
+
+    return list(filter(is_done, read_experiment(home).trials))
+
+
 def headline(verdict: Verdict) -> str:
     """A pair's verdict: ``better in PSNR on this scene: +0.120 (…), with 2 of at most 6 seeds``"""
     question = verdict.question

@@ -26,8 +26,7 @@ GATE_STEEPNESS = 100.0  # of the sigmoid that suppresses noise on opaque Gaussia
 
 @dataclass
 class MCMC(Budgeted):
-    """Each refinement moves dead Gaussians onto living ones and adds a few copies, up to
-    ``max_gaussians``.
+    """Each round moves dead Gaussians onto living ones and adds copies, up to ``max_gaussians``.
 
     A dead Gaussian has an opacity of at most ``min_opacity``. A Gaussian and its copies get a
     common opacity and scale, so that the picture stays the same (eq. 9 of the paper). After each
@@ -66,8 +65,10 @@ class MCMC(Budgeted):
         return [*self.governing(), self.relocate, self.add] if self.due(refinement.step) else []
 
     def forecast(self, refinement: Refinement) -> int:
-        """The count after a round without the cap: ``strictness`` divides the share that is
-        added."""
+        """The count after a round without the cap.
+
+        ``strictness`` divides the share that is added.
+        """
         return int((1 + self.growth / self.strictness) * len(refinement.gaussians))
 
     def may_cull(self, step: int) -> bool:
@@ -98,8 +99,10 @@ class MCMC(Budgeted):
         refinement.event.relocated = count
 
     def add(self, refinement: Refinement) -> None:
-        """Add copies of living Gaussians, drawn by opacity: a share ``growth`` of the count, up to
-        the cap."""
+        """Add copies of living Gaussians, drawn by opacity.
+
+        A share ``growth`` of the count, up to the cap.
+        """
         gaussians, event = refinement.gaussians, refinement.event
         if event.relocated == 0 and (gaussians.values.opacities <= self.min_opacity).all():
             return  # all are dead
@@ -113,8 +116,10 @@ class MCMC(Budgeted):
     def _copy(
         self, refinement: Refinement, weights: Tensor, count: int, keep: Tensor | None, cause: Cause
     ) -> None:
-        """Append ``count`` (at least 1) copies of Gaussians drawn by ``weights`` [N], which share
-        their opacity; of the others, keep those at the mask ``keep``."""
+        """Append ``count`` (at least 1) copies of Gaussians drawn by ``weights`` [N].
+
+        They share their opacity. Of the others, keep those at the mask ``keep``.
+        """
         gaussians, sources = refinement.gaussians, _draw(weights, count, refinement.rng)  # [A]
         copies = torch.bincount(sources, minlength=len(gaussians)) + 1  # [N], the Gaussian included
         touched = copies > 1
@@ -133,8 +138,7 @@ class MCMC(Budgeted):
 
 
 def shared_opacity(opacities: Tensor, copies: Tensor) -> tuple[Tensor, Tensor]:
-    """Opacity o' and factor s'/s on the scale of each of n = ``copies`` that together look like one
-    Gaussian of opacity o.
+    """Opacity o' and factor s'/s for n = ``copies`` that look like one Gaussian of opacity o.
 
     o' = 1 - (1 - o)^(1/n) and s'/s = o / sum_{i=1..n} sum_{k=0..i-1} C(i-1, k) (-1)^k o'^(k+1) /
     sqrt(k+1), eq. 9 of the paper; all [M].
@@ -150,8 +154,10 @@ def shared_opacity(opacities: Tensor, copies: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _draw(weights: Tensor, count: int, rng: torch.Generator) -> Tensor:
-    """Draw ``count`` indices with replacement, in proportion to ``weights`` [N]; on the CPU, so
-    that a seed gives the same draw on every device."""
+    """Draw ``count`` indices with replacement, in proportion to ``weights`` [N].
+
+    On the CPU, so that a seed gives the same draw on every device.
+    """
     cumulative = weights.double().cpu().cumsum(0)
     draws = torch.rand(count, generator=rng, dtype=torch.float64) * cumulative[-1]
     return (
@@ -187,14 +193,13 @@ MIN_DECAYED = 1e-12  # of opacities and scales after decay
 
 @dataclass
 class MRNF(Budgeted):
-    """Each round replaces pruned Gaussians and adds a small share by long-axis splits; opacities
-    and scales decay.
+    """Each round replaces pruned Gaussians and adds a small share by long-axis splits.
 
-    The refine weight of a Gaussian is the largest sum over pixels of e alpha T in ``score_views``
-    training views, drawn in each round, where e = max(0, 1 - SSIM) divided by its mean in the view.
-    Candidates are the Gaussians seen since the last round whose weight is above
-    ``growth_threshold``. A round prunes Gaussians below ``prune_opacity`` and those too small, too
-    large or too far away. Then it splits:
+    Opacities and scales decay. The refine weight of a Gaussian is the largest sum over pixels of e
+    alpha T in ``score_views`` training views, drawn in each round, where e = max(0, 1 - SSIM)
+    divided by its mean in the view. Candidates are the Gaussians seen since the last round whose
+    weight is above ``growth_threshold``. A round prunes Gaussians below ``prune_opacity`` and those
+    too small, too large or too far away. Then it splits:
 
     1. as many Gaussians as it pruned, drawn by opacity;
     2. until iteration ``grow_until``, further candidates, drawn by refine weight, so that the two
@@ -242,8 +247,7 @@ class MRNF(Budgeted):
         return [self.refill_and_grow, self.decay, self.reset_statistics]
 
     def refill_and_grow(self, refinement: Refinement) -> None:
-        """Prune, split as many Gaussians to replace the pruned ones, then split a share of the
-        candidates."""
+        """Prune, split as many to replace them, then split a share of the candidates."""
         step, rng, event = refinement.step, refinement.rng, refinement.event
         values, seen = refinement.gaussians.values, self.statistics["seen"]
         pruned = self.to_prune(values)  # [N]
@@ -292,8 +296,10 @@ class MRNF(Budgeted):
         return largest
 
     def to_prune(self, gaussians: Gaussians) -> Tensor:
-        """Mask [N] of the Gaussians to prune: transparent, too small, too large, or too far
-        away."""
+        """Mask [N] of the Gaussians to prune.
+
+        Transparent, too small, too large, or too far away.
+        """
         center, half, _ = bounds(gaussians.means.detach())
         limit = REACH * half
         scales = gaussians.log_scales
@@ -303,10 +309,8 @@ class MRNF(Budgeted):
 
     def decay(self, refinement: Refinement) -> None:
         """Lower all opacities and scales a little. Adam's moments stay."""
-        values, remaining = (
-            refinement.gaussians.values,
-            max(0.0, 1 - refinement.step / self.decay_until),
-        )
+        values = refinement.gaussians.values
+        remaining = max(0.0, 1 - refinement.step / self.decay_until)
         opacities = values.opacities - self.opacity_decay * remaining
         margin = max(
             MIN_DECAYED, torch.finfo(opacities.dtype).eps

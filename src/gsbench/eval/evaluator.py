@@ -1,5 +1,4 @@
-"""The evaluator, which applies the metrics of a protocol and the user's own metrics to pairs of
-images."""
+"""The evaluator applies a protocol's metrics and the user's own to pairs of images."""
 
 import importlib.util
 import math
@@ -64,8 +63,10 @@ class MetricContext:
 
 
 class Psnr:
-    """Peak signal-to-noise ratio in dB, at most the protocol's cap (identical images have an
-    infinite PSNR)."""
+    """Peak signal-to-noise ratio in dB, at most the protocol's cap.
+
+    Identical images have an infinite PSNR.
+    """
 
     def __init__(self, context: MetricContext) -> None:
         self._cap = context.protocol.psnr_cap
@@ -126,8 +127,10 @@ class Flip:
 
 
 class StructuralMetric:
-    """A metric of structure without weights, which no protocol changes: its authors' definition
-    holds."""
+    """A metric of structure without weights, which no protocol changes.
+
+    Its authors' definition holds.
+    """
 
     def __init__(self, function: Callable[[Tensor, Tensor], Tensor], min_side: int) -> None:
         self._function, self._min_side = function, min_side  # px
@@ -319,16 +322,17 @@ class Evaluator:
 
 
 def quantize(image: Tensor) -> Tensor:
-    """Round a floating point image in [0, 1] to uint8, as for a PNG: ``floor(clamp(255 x + 0.5, 0,
-    255))``."""
+    """Round a floating point image in [0, 1] to uint8, as for a PNG.
+
+    ``floor(clamp(255 x + 0.5, 0, 255))``.
+    """
     return (image * 255 + 0.5).clamp(0, 255).to(torch.uint8)
 
 
 def summarize(
     per_view: Mapping[str, Mapping[str, float]], unavailable: Mapping[str, str]
 ) -> dict[str, float]:
-    """The mean over views of every metric that all views have and that is not in
-    ``unavailable``."""
+    """The mean over views of every metric that all views have, without ``unavailable``."""
     if not per_view:
         return {}
     views = list(per_view.values())

@@ -161,8 +161,10 @@ def find_metric(key: str) -> MetricFacts | None:
 
 
 def facts_of(key: str, metric: object) -> MetricFacts:
-    """The facts about a user's metric, from the attributes of its class; raises InputError for a
-    wrong attribute."""
+    """The facts about a user's metric, from the attributes of its class.
+
+    Raises InputError for a wrong attribute.
+    """
     given = {
         field.name: getattr(metric, field.name)
         for field in fields(MetricRecord)

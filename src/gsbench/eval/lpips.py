@@ -1,9 +1,8 @@
-"""LPIPS v0.1 (Zhang et al. 2018, "The unreasonable effectiveness of deep features as a perceptual
-metric").
+"""LPIPS v0.1 (Zhang et al. 2018).
 
-The layers of VGG16, AlexNet and SqueezeNet 1.1 are in torchvision's order, so that torchvision's
-ImageNet weights load into them without torchvision. The learned linear heads are those of LPIPS
-v0.1.
+The paper is "The unreasonable effectiveness of deep features as a perceptual metric". The layers of
+VGG16, AlexNet and SqueezeNet 1.1 are in torchvision's order, so that torchvision's ImageNet weights
+load into them without torchvision. The learned linear heads are those of LPIPS v0.1.
 """
 
 from collections.abc import Callable, Mapping
@@ -26,8 +25,7 @@ ROWS_AT_A_TIME = 64  # feature rows compared at once, to limit the memory
 
 @dataclass(frozen=True)
 class Backbone:
-    """A network's convolutional layers, the layers whose output LPIPS compares, and the weights
-    files."""
+    """A network's convolutional layers, which of them LPIPS compares, and the weights files."""
 
     build: Callable[[], nn.Sequential]
     taps: tuple[int, ...]  # indices of the layers whose output is compared
@@ -240,10 +238,10 @@ class Lpips:
 def load_lpips(
     net: str, folder: Path | None = None, download: bool = True, device: torch.device | str = "cpu"
 ) -> Lpips:
-    """Load an LPIPS network; its weights are searched in ``folder`` and the usual places, else
-    downloaded.
+    """Load an LPIPS network.
 
-    Raises ``MissingWeightsError`` if they are not found.
+    Its weights are searched in ``folder`` and the usual places, else downloaded. Raises
+    ``MissingWeightsError`` if they are not found.
     """
     backbone = BACKBONES[net]
     features = find_first_weights(backbone.features, folder, download)
@@ -252,8 +250,10 @@ def load_lpips(
 
 
 def find_first_weights(specs: tuple[WeightsFile, ...], folder: Path | None, download: bool) -> Path:
-    """Find one of the alternatives ``specs`` on this machine; else download the first, if
-    allowed."""
+    """Find one of the alternatives ``specs`` on this machine.
+
+    Else download the first, if allowed.
+    """
     for spec in specs[1:]:
         try:
             return find_weights(spec, folder, download=False)
@@ -265,10 +265,10 @@ def find_first_weights(specs: tuple[WeightsFile, ...], folder: Path | None, down
 def _feature_distance(
     first: Tensor, second: Tensor, head: Tensor, weights: Tensor | None = None
 ) -> Tensor:
-    """Spatial mean of the weighted squared difference of unit feature vectors; maps [1, C, h, w],
-    head [C].
+    """Spatial mean of the weighted squared difference of unit feature vectors.
 
-    ``weights`` [h, w] weight the positions in the mean; None: all equal.
+    Maps [1, C, h, w], head [C]. ``weights`` [h, w] weight the positions in the mean; None: all
+    equal.
     """
     if weights is not None:
         first, second = (
@@ -292,8 +292,10 @@ def _feature_distance(
 
 
 def load_features(stack: nn.Sequential, state: Mapping[str, Tensor], who: str) -> None:
-    """Load published weights into a backbone; raises InputError naming ``who`` if they are for
-    another network."""
+    """Load published weights into a backbone.
+
+    Raises InputError naming ``who`` if they are for another network.
+    """
     expected = stack.state_dict().keys()
     renamed = {key.removeprefix("features."): value for key, value in state.items()}
     missing = [key for key in expected if key not in renamed]

@@ -23,8 +23,7 @@ from gsbench.eval.protocol import FLIP_PPD
 
 
 def psnr(image: Tensor, target: Tensor) -> Tensor:
-    """Peak signal-to-noise ratio in dB, from the mean squared error over all pixels and channels of
-    an image.
+    """Peak signal-to-noise ratio in dB, of the mean squared error over pixels and channels.
 
     Identical images give infinity, which a protocol replaces in reports.
     """
@@ -35,11 +34,11 @@ def psnr(image: Tensor, target: Tensor) -> Tensor:
 
 
 def flip(image: Tensor, target: Tensor, ppd: float = FLIP_PPD) -> Tensor:
-    """Mean FLIP error of sRGB images (0 identical, 1 worst) for a viewer who sees ``ppd`` pixels
-    per degree.
+    """Mean FLIP error of sRGB images: 0 identical, 1 worst.
 
-    Andersson et al. 2020, "FLIP: a difference evaluator for alternating images", computed by
-    NVIDIA's library ``flip-evaluator``. Raises ModuleNotFoundError if it is not installed.
+    The viewer sees ``ppd`` pixels per degree. Andersson et al. 2020, "FLIP: a difference evaluator
+    for alternating images", computed by NVIDIA's library ``flip-evaluator``. Raises
+    ModuleNotFoundError if it is not installed.
     """
     check_pair(image, target)
     pairs = zip(*(as_batch(x).permute(0, 2, 3, 1) for x in (image, target)), strict=True)
@@ -73,13 +72,12 @@ GMSD_MIN_SIZE = 2  # px: one block of 2x2
 
 
 def gmsd(image: Tensor, target: Tensor) -> Tensor:
-    """Gradient magnitude similarity deviation of the luminance: 0 for identical images, less is
-    better.
+    """Gradient magnitude similarity deviation of the luminance.
 
-    Xue, Zhang, Mou and Bovik 2014, "Gradient magnitude similarity deviation: a highly efficient
-    perceptual image quality index", section II. Images are averaged over 2x2 px (odd sides padded
-    with zeros), Prewitt's filter gives the gradients, and the value is the standard deviation of
-    their similarity over pixels.
+    0 is for identical images, less is better. Xue, Zhang, Mou and Bovik 2014, "Gradient magnitude
+    similarity deviation: a highly efficient perceptual image quality index", section II. Images are
+    averaged over 2x2 px (odd sides padded with zeros), Prewitt's filter gives the gradients, and
+    the value is the standard deviation of their similarity over pixels.
     """
     check_pair(image, target)
     check_size(as_batch(image), GMSD_MIN_SIZE, "GMSD")

@@ -15,8 +15,7 @@ NUM_SH_REST = (MAX_SH_DEGREE + 1) ** 2 - 1  # 15 coefficients per channel beside
 
 @dataclass
 class Gaussians:
-    """N Gaussians as raw parameters (before activation), all of one dtype (float32 or float64) and
-    on one device.
+    """N Gaussians as raw parameters (before activation), of one dtype and on one device.
 
     | field          | shape      | activation                                   |
     |----------------|------------|----------------------------------------------|
@@ -46,11 +45,9 @@ class Gaussians:
             "sh_rest": (n, NUM_SH_REST, 3),
         }
         for name, shape in expected.items():
-            if tuple(getattr(self, name).shape) != shape:
-                raise ValueError(
-                    f"gaussians: {name} has shape {tuple(getattr(self, name).shape)}, expected "
-                    f"{shape}"
-                )
+            given = tuple(getattr(self, name).shape)
+            if given != shape:
+                raise ValueError(f"gaussians: {name} has shape {given}, expected {shape}")
 
     def __len__(self) -> int:
         return self.means.shape[0]
@@ -65,8 +62,7 @@ class Gaussians:
 
     @property
     def rotations(self) -> Tensor:
-        """Rotation matrices of the normalised quaternions, [N, 3, 3]; the columns are the axes of
-        the ellipsoids."""
+        """Rotation matrices, [N, 3, 3]; the columns are the axes of the ellipsoids."""
         return quaternion_to_matrix(self.quaternions)
 
     def tensors(self) -> dict[str, Tensor]:
@@ -86,15 +82,12 @@ class Gaussians:
 
     @staticmethod
     def concatenate(parts: list[Gaussians]) -> Gaussians:
-        names = [field.name for field in fields(Gaussians)]
-        return Gaussians(
-            **{name: torch.cat([getattr(part, name) for part in parts]) for name in names}
-        )
+        columns = zip(*(part.tensors().values() for part in parts), strict=True)
+        return Gaussians(*map(torch.cat, columns))
 
 
 def quaternion_to_matrix(quaternions: Tensor) -> Tensor:
-    """Rotation matrices [N, 3, 3] of quaternions [N, 4] (w, x, y, z), which need not be
-    normalised."""
+    """Rotation matrices [N, 3, 3] of quaternions [N, 4] (w, x, y, z) of any length."""
     w, x, y, z = torch.nn.functional.normalize(quaternions, dim=-1).unbind(-1)  # each [N]
     rows = [
         torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
@@ -125,8 +118,7 @@ C3 = (
 
 
 def basis(directions: Tensor, degree: int) -> Tensor:
-    """Real spherical harmonics up to ``degree`` at unit ``directions`` [N, 3], as [N, (degree +
-    1)^2]."""
+    """Real spherical harmonics to ``degree`` at unit ``directions`` [N, 3]: [N, (degree + 1)^2]."""
     x, y, z = directions.unbind(-1)  # each [N]
     terms = [torch.full_like(x, C0)]
     if degree >= 1:
@@ -153,8 +145,7 @@ def basis(directions: Tensor, degree: int) -> Tensor:
 
 
 def colors(sh_dc: Tensor, sh_rest: Tensor, directions: Tensor, degree: int) -> Tensor:
-    """RGB [N, 3], at least 0, of coefficients [N, 3] and [N, 15, 3] in view ``directions`` [N, 3]
-    of unit length."""
+    """RGB [N, 3] >= 0 of coefficients [N, 3] and [N, 15, 3] in unit ``directions`` [N, 3]."""
     values = basis(directions, degree)  # [N, K]
     rgb = values[:, :1] * sh_dc
     if degree > 0:

@@ -228,7 +228,7 @@ class Declaration(Record):
     @property
     def when(self) -> str:
         """``2026-11-21 20:05 UTC``"""
-        return time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(self.moment))
+        return display_time(self.time)
 
     @property
     def kind(self) -> Literal["sweep", "claims", "votes"]:
@@ -332,6 +332,11 @@ def record_text(declarations: Iterable[Declaration]) -> str:
     """The content of ``declared.jsonl``, in the order of time."""
     ordered = sorted(declarations, key=lambda declaration: declaration.moment)
     return "".join(json.dumps(declaration.to_json()) + "\n" for declaration in ordered)
+
+
+def display_time(stamp: str) -> str:
+    """A time stamp (`STAMP`) for people: ``2026-11-21 20:05 UTC``."""
+    return time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(unix_time(stamp) or 0))
 
 
 def unix_time(text: object) -> int | None:

@@ -34,6 +34,7 @@ TRIED = ("3.17.",)  # versions of MLflow whose page was seen to show the views
 COLUMNS = ("scene", "init", "densify", "seed")  # tags of a run
 ARM = "arm"  # the parameter by which runs are grouped
 VERDICT = "- Verdict, "  # how the notes begin that belong above the table
+NO_VERDICT = "No verdict: it needs a declared metric (eval.primary), two arms and two seeds."
 OWN_NOTE = "`gsbench report"  # in a description that `publish` wrote
 CHART_HEIGHT = 250  # px
 NAME_WIDTH = 290  # px of the runs' names
@@ -91,9 +92,9 @@ def description(experiment: Experiment) -> str:
     # The page shows only the first line until it is clicked: decided pairs of arms come first
     # there.
     short = [line.removeprefix(VERDICT).partition(" (")[0] for line in verdicts]
-    answer = "; ".join(sorted(short, key=lambda text: "undecided" in text))
+    answer = "; ".join(sorted(short, key=lambda text: "undecided" in text)) or NO_VERDICT
     end = f"\n\n{OWN_NOTE} {experiment.name}` shows more."
-    text = "\n".join([f"**{answer}**" if answer else "", "", *verdicts, "", *rest]).strip()
+    text = "\n".join([f"**{answer}**", "", *verdicts, "", *rest]).strip()
     if len(text) + len(end) > MAX_TAG:
         text = text[: MAX_TAG - len(end)].rpartition("\n")[0]
     return text + end

@@ -14,7 +14,7 @@ from PIL import Image
 
 from gsbench.init import Sfm
 from gsbench.init.colmap import database as made
-from gsbench.init.colmap import sift
+from gsbench.init.colmap import features, geometry, matches
 from gsbench.logs import Progress
 
 SIZES = {
@@ -167,7 +167,7 @@ def test_verification_tells_its_progress_in_parts(
         "verify_matches",
         lambda path, file, options: listed.append(Path(file).read_text().splitlines()),
     )
-    made.verify_pairs(
+    geometry.verify_pairs(
         database, pairs, None, lambda phase, done, total: told.append((phase, done, total))
     )
     assert told == [("verify", done, count) for done in (*range(0, count, each), count)]
@@ -194,7 +194,7 @@ def test_features_are_extracted_of_eight_images_at_a_time_or_two_a_thread(
         edge_threshold=9.0,
         first_octave=1,
     )
-    sift.extract_sift(
+    features.extract_sift(
         Path("x.db"), images, names, settings, threads, lambda *state: told.append(state), masks
     )
     assert [name for call in calls for name in call["image_names"]] == names
@@ -261,7 +261,7 @@ def test_the_references_cameras_are_known_and_have_its_placed_images() -> None:
 )
 def test_parts_are_small_enough_for_six_a_process(count: int, processes: int, size: int) -> None:
     """Blocks of ``size`` images: sqrt(12 processes) of them, rounded up, of 2 to 16 images each."""
-    assert sift._block_size(count, processes) == size
+    assert matches._block_size(count, processes) == size
 
 
 def test_matching_is_divided_over_processes_and_tells_one_sum(
@@ -269,7 +269,7 @@ def test_matching_is_divided_over_processes_and_tells_one_sum(
 ) -> None:
     jobs, told = [], []
 
-    def match(function: object, job: sift.MatchingJob, progress: Progress, what: str) -> None:
+    def match(function: object, job: matches.MatchingJob, progress: Progress, what: str) -> None:
         """A process that finds one match in its first pair."""
         jobs.append(job)
         assert made.image_ids(job.template) == {str(number): number for number in range(1, 6)}
@@ -278,9 +278,9 @@ def test_matching_is_divided_over_processes_and_tells_one_sum(
             opened.write_matches(*job.parts[0][0], np.array([[3, 4]], dtype=np.uint32))
         progress("match", sum(map(len, job.parts)), None)
 
-    monkeypatch.setattr(sift, "run_with_progress", match)
+    monkeypatch.setattr(matches, "run_with_progress", match)
     pairs = list(itertools.combinations(SIZES, 2))
-    sift.match_sift(
+    matches.match_sift(
         database, pairs, Sfm(), 3, lambda phase, done, total: told.append((phase, done, total))
     )
     assert (told[0], max(told)) == (("match", 0, 10), ("match", 10, 10))

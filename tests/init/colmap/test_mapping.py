@@ -14,24 +14,20 @@ from PIL import Image
 from gsbench.errors import InputError
 from gsbench.init import Sfm
 from gsbench.init.colmap import mapping
-from gsbench.init.colmap.alignment import align_poses
+from gsbench.init.colmap.alignment import similarity_to
 from gsbench.init.colmap.database import (
     assume_focal_lengths,
     cameras_without_prior,
     create_database,
     unknown_camera_groups,
-    verify_pairs,
     write_keypoints,
     write_matches,
 )
+from gsbench.init.colmap.geometry import verification_options, verify_pairs
 from gsbench.init.colmap.mapping import MappingResult, map_images
-from gsbench.init.colmap.reconstruct import (
-    common_poses,
-    poses_by_name,
-    select_pairs,
-    similarity_to,
-    verification_options,
-)
+from gsbench.init.colmap.pairs import select_pairs
+from gsbench.init.colmap.reconstruct import common_poses, poses_by_name
+from gsbench.init.colmap.similarity import align_poses
 from gsbench.logs import no_progress
 
 WIDTH, HEIGHT, FOCAL = 640, 480, 520.0  # px; COLMAP's guess without EXIF is 1.2 x 640 = 768
@@ -356,7 +352,7 @@ def test_a_focal_length_is_assumed_in_a_copy_that_is_verified_anew(
     monkeypatch.setattr(
         made, "assume_focal_lengths", lambda *given: calls.append(given) or [("a", "b")]
     )
-    monkeypatch.setattr(made, "verify_pairs", lambda *given: calls.append(given))
+    monkeypatch.setattr(mapping.geometry, "verify_pairs", lambda *given: calls.append(given))
     monkeypatch.setattr(
         mapping._Mapper, "incremental", lambda _, *given: calls.append(given) or ["model"]
     )

@@ -13,13 +13,10 @@ from scipy.spatial.transform import Rotation
 
 from gsbench.errors import InputError
 from gsbench.init import Sfm
-from gsbench.init.colmap import reconstruct
-from gsbench.init.colmap.database import (
-    create_database,
-    verify_pairs,
-    write_keypoints,
-    write_matches,
-)
+from gsbench.init.colmap import alignment, geometry, mapping, reconstruct
+from gsbench.init.colmap import pairs as pairing
+from gsbench.init.colmap.database import create_database, write_keypoints, write_matches
+from gsbench.init.colmap.geometry import verify_pairs
 from gsbench.logs import no_progress
 
 WIDTH, HEIGHT, FOCAL = 320, 240, 260.0  # px
@@ -75,9 +72,9 @@ def database(tmp_path_factory: pytest.TempPathFactory) -> Path:
     create_database(path, [(camera(), NAMES)])
     write_keypoints(path, keypoints)
     same = np.stack([np.arange(len(POINTS))] * 2, axis=1).astype(np.uint32)
-    pairs = reconstruct.select_pairs(NAMES, Sfm())
+    pairs = pairing.select_pairs(NAMES, Sfm())
     write_matches(path, dict.fromkeys(pairs, same))
-    verify_pairs(path, pairs, reconstruct.verification_options(Sfm()), no_progress)
+    verify_pairs(path, pairs, geometry.verification_options(Sfm()), no_progress)
     return path
 
 
@@ -85,7 +82,7 @@ def test_points_come_from_the_named_images_under_cameras_that_do_not_change(
     database: Path, tmp_path: Path
 ) -> None:
     said: list[tuple[str, int, int | None]] = []
-    model = reconstruct.triangulate(
+    model = mapping.triangulate(
         database,
         database.parent / "images",
         tmp_path / "out",
@@ -118,7 +115,7 @@ def test_matches_that_contradict_the_cameras_triangulate_nothing(
     with pytest.raises(
         InputError, match="no point could be triangulated under the reference cameras"
     ):
-        reconstruct.triangulate(
+        mapping.triangulate(
             database,
             images,
             tmp_path / "out",
@@ -147,11 +144,11 @@ def test_the_poses_of_two_models_are_paired_by_name() -> None:
         rotations, [poses()[name].rotation.matrix() for name in NAMES[1:]], atol=1e-12
     )
     np.testing.assert_allclose(other_rotations, rotations, atol=1e-12)
-    found = reconstruct.similarity_to(first, second)
+    found = alignment.similarity_to(first, second)
     assert found is not None
     assert found.scale == pytest.approx(scale)
     lonely = model_of({NAMES[0]: poses()[NAMES[0]]})
-    assert reconstruct.similarity_to(first, lonely) is None
+    assert alignment.similarity_to(first, lonely) is None
 
 
 def test_options_reach_colmap() -> None:
@@ -163,10 +160,10 @@ def test_options_reach_colmap() -> None:
         two_view_tracks=True,
         min_model_size=5,
     )
-    verification = reconstruct.verification_options(options)
+    verification = geometry.verification_options(options)
     assert verification.ransac.random_seed == 7
     assert (verification.min_num_inliers, verification.min_inlier_ratio) == (11, 0.31)
-    pipeline = reconstruct.pipeline_options(options)
+    pipeline = mapping.pipeline_options(options)
     assert (
         pipeline.random_seed
         == pipeline.mapper.random_seed
@@ -175,21 +172,19 @@ def test_options_reach_colmap() -> None:
     )
     assert pipeline.num_threads == pipeline.mapper.num_threads == options.mapper_threads
     assert not pipeline.triangulation.ignore_two_view_tracks
-    assert reconstruct.pipeline_options(
-        Sfm(two_view_tracks=False)
-    ).triangulation.ignore_two_view_tracks
+    assert mapping.pipeline_options(Sfm(two_view_tracks=False)).triangulation.ignore_two_view_tracks
     assert pipeline.multiple_models
     assert pipeline.min_model_size == 5
     for intrinsics, refined in (("estimate", True), ("reference", False)):
-        pipeline = reconstruct.pipeline_options(Sfm(intrinsics=intrinsics))
+        pipeline = mapping.pipeline_options(Sfm(intrinsics=intrinsics))
         assert pipeline.ba_refine_focal_length == pipeline.ba_refine_extra_params == refined
         assert pipeline.mapper.abs_pose_refine_focal_length == refined
         assert pipeline.mapper.abs_pose_refine_extra_params == refined
 
 
 def test_pairs_of_names() -> None:
-    assert reconstruct.select_pairs("abc", Sfm()) == [("a", "b"), ("a", "c"), ("b", "c")]
-    sequential = reconstruct.select_pairs("abcd", Sfm(pairs="sequential", overlap=1))
+    assert pairing.select_pairs("abc", Sfm()) == [("a", "b"), ("a", "c"), ("b", "c")]
+    sequential = pairing.select_pairs("abcd", Sfm(pairs="sequential", overlap=1))
     assert {frozenset(pair) for pair in sequential} >= {
         frozenset("ab"),
         frozenset("bc"),

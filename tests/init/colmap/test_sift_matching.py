@@ -15,8 +15,9 @@ from hypothesis import strategies as st
 from gsbench.init import MODEL_FOLDER, Sfm
 from gsbench.init.base import Timer
 from gsbench.init.colmap.database import DatabaseTask, create_database, unknown_camera_groups
+from gsbench.init.colmap.features import extract_sift
+from gsbench.init.colmap.matches import distribute_parts, divide_pairs, match_sift
 from gsbench.init.colmap.pairs import best_pairs
-from gsbench.init.colmap.sift import distribute_parts, divide_pairs, extract_sift, match_sift
 from gsbench.logs import no_progress
 from gsbench.scene.types import Capture
 
@@ -177,7 +178,7 @@ def test_auto_leaves_out_what_a_preview_does_not_propose(
     monkeypatch.setattr(
         "gsbench.init.colmap.pairs.best_pairs", lambda descriptors: best_pairs(descriptors, 2)
     )
-    monkeypatch.setattr("gsbench.init.colmap.sift.extract_sift", lambda *_: None)
+    monkeypatch.setattr("gsbench.init.colmap.features.extract_sift", lambda *_: None)
     counts = Sfm(threads=1, pairs="auto").fill_database(task, no_progress, Timer())
     assert counts["pairs_selected"] + counts["pairs_left_out"] == len(pairs)
     assert counts["pairs_left_out"] > 10

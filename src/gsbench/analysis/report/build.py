@@ -18,6 +18,7 @@ from gsbench.analysis.differences import short_version
 from gsbench.analysis.fairness import caveats, fairness_table
 from gsbench.analysis.images import choose_views, png_uri
 from gsbench.analysis.judgement import Verdict
+from gsbench.analysis.ledger_table import describe_ledger, ledger_tables
 from gsbench.analysis.pairing import BASELINE, pair_trials
 from gsbench.analysis.paper import layout_of, load_paper, paper_tables
 from gsbench.analysis.quantities import COSTS, choose_quantities, relative_change
@@ -35,6 +36,7 @@ from gsbench.events import RefineEvent
 from gsbench.parsing import read_if_sound
 from gsbench.runs import layout
 from gsbench.runs.experiments import TuningRecord
+from gsbench.runs.ledger import read_ledger
 from gsbench.runs.trial_record import Histogram
 from gsbench.scene.images import read_image
 from gsbench.words import counted, signed
@@ -73,6 +75,7 @@ def build_report(experiment: Experiment, baseline: str = BASELINE) -> str:
         seeds=experiment.seeds,
         trials=trials,
         versus=[compare_arms(trials, own) for own in judged],
+        ledger=show_ledger(experiment.folder),
         votes=[show_votes(one, trials, judged) for one in load_rounds(experiment.folder)],
         declared=declared.sentences(quantity.name) if declared and quantity else [],
         families=verdicts.families(judged),
@@ -133,6 +136,17 @@ def compare_arms(trials: Sequence[TrialResult], judged: PairVerdicts) -> dict[st
         "views": views,
         "notes": dict.fromkeys([*judged.notes, *faults]),
     }
+
+
+def show_ledger(folder: Path) -> dict[str, Any] | None:
+    """The sentences and tables of the experiment's ledger of ideas; None if it has none."""
+    if not (folder / layout.LEDGER).exists():
+        return None
+    try:
+        ledger = read_ledger(folder)
+    except InputError as error:
+        return {"lines": [str(error)], "tables": []}
+    return {"lines": describe_ledger(ledger), "tables": ledger_tables(ledger)}
 
 
 def show_votes(

@@ -1,5 +1,4 @@
-"""Ray casting for the courtyard, compiled with numba; all functions are scalar and share no
-state."""
+"""Ray casting for the courtyard, compiled with numba; all functions are scalar and pure."""
 
 from math import exp, floor, inf, sqrt
 
@@ -49,8 +48,7 @@ def enter_box(lx, ly, lz, hx, hy, hz, ox, oy, oz, ix, iy, iz):
 
 @inlined
 def hit_tube(outer, half, inner, ox, oy, oz, dx, dy, dz):
-    """The first distance > 0 at which a ray meets a capped cylinder, solid or with a bore; inf if
-    it misses."""
+    """The first distance > 0 of a ray to a capped cylinder, solid or bored; inf for a miss."""
     best = inf
     a = dx * dx + dy * dy
     for radius in (outer, inner):
@@ -151,8 +149,7 @@ def signed_distance(kind, size, x, y, z):
 
 @inlined
 def nearest_surface(layout, x, y, z, limit):
-    """The smallest |distance| from a point to any surface, the ground included, if below ``limit``,
-    else ``limit``."""
+    """The smallest |distance| from a point to any surface or the ground, at most ``limit``."""
     best = min(abs(z), limit)
     for g in range(len(layout.group_low)):
         low, high = layout.group_low[g], layout.group_high[g]
@@ -174,40 +171,35 @@ def nearest_surface(layout, x, y, z, limit):
 
 
 @inlined
+def sign(value):
+    return 1.0 if value > 0 else -1.0
+
+
+@inlined
+def longer_first(a, b, size_a, size_b):
+    """The coordinates of a face in order: grain and planks run along its longer side."""
+    return (a, b) if size_a > size_b else (b, a)
+
+
+@inlined
 def local_normal(kind, size, x, y, z):
-    """The outward normal (3 values) at a local surface point, and coordinates (u, v) in m along the
-    face."""
+    """The outward normal (3 values) at a local surface point, and (u, v) in m along the face."""
     if kind == SPHERE:
         r = size[0]
         return x / r, y / r, z / r, (x + y) * 0.8, z + 0.4 * (x - y)
     if kind == BOX:
         qx, qy, qz = abs(x) - size[0], abs(y) - size[1], abs(z) - size[2]
         if qx >= qy and qx >= qz:
-            return (
-                (1.0 if x > 0 else -1.0),
-                0.0,
-                0.0,
-                (y if size[1] > size[2] else z),
-                (z if size[1] > size[2] else y),
-            )
+            u, v = longer_first(y, z, size[1], size[2])
+            return sign(x), 0.0, 0.0, u, v
         if qy >= qz:
-            return (
-                0.0,
-                (1.0 if y > 0 else -1.0),
-                0.0,
-                (x if size[0] > size[2] else z),
-                (z if size[0] > size[2] else x),
-            )
-        return (
-            0.0,
-            0.0,
-            (1.0 if z > 0 else -1.0),
-            (x if size[0] > size[1] else y),
-            (y if size[0] > size[1] else x),
-        )
+            u, v = longer_first(x, z, size[0], size[2])
+            return 0.0, sign(y), 0.0, u, v
+        u, v = longer_first(x, y, size[0], size[1])
+        return 0.0, 0.0, sign(z), u, v
     radius = sqrt(x * x + y * y)
     if abs(abs(z) - size[1]) < min(abs(radius - size[0]), abs(radius - size[2])):
-        return 0.0, 0.0, (1.0 if z > 0 else -1.0), x, y
+        return 0.0, 0.0, sign(z), x, y
     side = 1.0 if abs(radius - size[0]) <= abs(radius - size[2]) else -1.0
     return side * x / radius, side * y / radius, 0.0, np.arctan2(y, x) * size[0], z
 
@@ -224,9 +216,15 @@ def sky(dx, dy, dz, seed):
 
 
 @inlined
+def received(channel, sun, occlusion, up):
+    """The light on a surface: the sun's, and ambient light from above (share ``up``) and below."""
+    ambient = up * SKY_LIGHT[channel] + (1 - up) * BOUNCE_LIGHT[channel]
+    return sun * SUN_LIGHT[channel] + occlusion * ambient
+
+
+@inlined
 def shade(layout, ox, oy, oz, dx, dy, dz, pixel, seed):
-    """The linear colour that a camera ray sees; ``pixel`` is the angle that one subsample covers,
-    in rad."""
+    """The linear colour that a camera ray sees; ``pixel`` is the angle of one subsample, in rad."""
     t, i = cast(layout, ox, oy, oz, dx, dy, dz, False)
     if i == SKY:
         return sky(dx, dy, dz, seed)
@@ -262,9 +260,9 @@ def shade(layout, ox, oy, oz, dx, dy, dz, pixel, seed):
     sun = max(sun, 0.0)
     up = 0.5 + 0.5 * nz
     return (
-        red * (sun * SUN_LIGHT[0] + occlusion * (up * SKY_LIGHT[0] + (1 - up) * BOUNCE_LIGHT[0])),
-        green * (sun * SUN_LIGHT[1] + occlusion * (up * SKY_LIGHT[1] + (1 - up) * BOUNCE_LIGHT[1])),
-        blue * (sun * SUN_LIGHT[2] + occlusion * (up * SKY_LIGHT[2] + (1 - up) * BOUNCE_LIGHT[2])),
+        red * received(0, sun, occlusion, up),
+        green * received(1, sun, occlusion, up),
+        blue * received(2, sun, occlusion, up),
     )
 
 

@@ -1,5 +1,4 @@
-"""Objects of the procedural courtyard: solid primitives with materials, in metres, z up, the lawn
-at z = 0."""
+"""Objects of the courtyard: solid primitives with materials, in metres, z up, the lawn at z = 0."""
 
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -83,30 +82,20 @@ class _Builder:
 
     def layout(self) -> Layout:
         kind, center, rotation, size, material, tint = zip(*self.rows, strict=True)
-        size = [
+        sizes = [
             (*sides, _bounding_radius(shape, sides))
             for shape, sides in zip(kind, size, strict=True)
         ]
-        starts = np.array([*self.starts, len(self.rows)])
-        boxes = [_bounds(*row[:4]) for row in self.rows]
-        low = [np.min([boxes[i][0] for i in range(a, b)], axis=0) for a, b in pairwise(starts)]
-        high = [np.max([boxes[i][1] for i in range(a, b)], axis=0) for a, b in pairwise(starts)]
-        return Layout(
-            np.array(kind),
-            np.array(center),
-            np.array(rotation),
-            np.array(size),
-            np.array(material),
-            np.array(tint),
-            starts,
-            np.array(low),
-            np.array(high),
-        )
+        starts = [*self.starts, len(self.rows)]
+        bounds = np.array([_bounds(*row[:4]) for row in self.rows])  # [S, 2, 3]
+        low = [bounds[a:b, 0].min(axis=0) for a, b in pairwise(starts)]
+        high = [bounds[a:b, 1].max(axis=0) for a, b in pairwise(starts)]
+        columns = (kind, center, rotation, sizes, material, tint, starts, low, high)
+        return Layout(*map(np.array, columns))
 
 
 def build_layout(seed: int) -> Layout:
-    """The courtyard. The plan is fixed; the seed varies angles and tints of small objects and the
-    shrubs."""
+    """The courtyard. The plan is fixed; the seed varies small objects and shrubs."""
     rng = np.random.default_rng(seed)
     build = _Builder()
     # Objects near the cameras come first: a ray that hits one skips the groups behind it.
@@ -125,17 +114,12 @@ def build_layout(seed: int) -> Layout:
 
 def _house(build: _Builder) -> None:
     build.group(0.0, WALL_DISTANCE + 0.3)
-    build.box(
-        (0, 0, HOUSE_HEIGHT / 2), (2 * WALL_DISTANCE + 1.2, 0.6, HOUSE_HEIGHT), PLASTER, _WHITEWASH
-    )
-    build.box((0, -0.32, 0.22), (2 * WALL_DISTANCE, 0.12, 0.44), STONE, _GREY_STONE)
+    width, height = 2 * WALL_DISTANCE, HOUSE_HEIGHT
+    build.box((0, 0, height / 2), (width + 1.2, 0.6, height), PLASTER, _WHITEWASH)
+    build.box((0, -0.32, 0.22), (width, 0.12, 0.44), STONE, _GREY_STONE)
     build.group(0.0, WALL_DISTANCE + 0.3)
-    build.box(
-        (0, 0.75, HOUSE_HEIGHT + 0.55), (2 * WALL_DISTANCE + 1.6, 2.9, 0.12), TILES, _ROOF, roll=30
-    )
-    build.box(
-        (0, -0.52, HOUSE_HEIGHT - 0.14), (2 * WALL_DISTANCE + 1.4, 0.1, 0.12), WOOD, _DARK_OAK
-    )
+    build.box((0, 0.75, height + 0.55), (width + 1.6, 2.9, 0.12), TILES, _ROOF, roll=30)
+    build.box((0, -0.52, height - 0.14), (width + 1.4, 0.1, 0.12), WOOD, _DARK_OAK)
     for x in (-5.0, -2.5, 2.5, 5.0):
         build.group(x, WALL_DISTANCE)
         _window(build)
@@ -202,12 +186,8 @@ def _shrubs(build: _Builder, rng: np.random.Generator) -> None:
         for _ in range(4):
             angle, small = rng.uniform(0, 2 * pi), radius * rng.uniform(0.5, 0.72)
             height = radius * rng.uniform(0.5, 1.5)
-            build.sphere(
-                (0.62 * radius * cos(angle), 0.62 * radius * sin(angle), height),
-                small,
-                LEAVES,
-                tint,
-            )
+            at = (0.62 * radius * cos(angle), 0.62 * radius * sin(angle), height)
+            build.sphere(at, small, LEAVES, tint)
 
 
 def _well(build: _Builder) -> None:
@@ -246,14 +226,9 @@ def _crate(
     turn, half, slat = _rotation(yaw=yaw), side / 2 - 0.035, 0.07
     for dx in (-half, half):
         for dy in (-half, half):
-            corner = turn @ np.array([dx, dy, 0.0])
-            build.box(
-                (x + corner[0], y + corner[1], z + side / 2),
-                (slat, slat, side),
-                WOOD,
-                _DARK_OAK,
-                yaw=yaw,
-            )
+            across, along, _ = turn @ np.array([dx, dy, 0.0])
+            post = (x + across, y + along, z + side / 2)
+            build.box(post, (slat, slat, side), WOOD, _DARK_OAK, yaw=yaw)
 
 
 def _bench(build: _Builder, rng: np.random.Generator) -> None:
@@ -276,12 +251,8 @@ def _pots(build: _Builder, rng: np.random.Generator) -> None:
         tint = (_LEAF, _PALE_LEAF, _DEEP_LEAF)[rng.integers(3)]
         build.sphere((0, 0, 0.66 * scale), 0.3 * scale, LEAVES, tint)
         for _ in range(3):
-            angle = rng.uniform(0, 2 * pi)
-            at = (
-                0.18 * scale * cos(angle),
-                0.18 * scale * sin(angle),
-                scale * rng.uniform(0.65, 0.95),
-            )
+            angle, out = rng.uniform(0, 2 * pi), 0.18 * scale
+            at = (out * cos(angle), out * sin(angle), scale * rng.uniform(0.65, 0.95))
             build.sphere(at, 0.19 * scale, LEAVES, tint)
 
 
@@ -302,8 +273,7 @@ def _sundial(build: _Builder, rng: np.random.Generator) -> None:
 
 
 def _rotation(yaw: float = 0.0, tilt: float = 0.0, roll: float = 0.0) -> NDArray[np.float64]:
-    """The rotation [3, 3] by ``roll`` about x, then ``tilt`` about y, then ``yaw`` about z, in
-    degrees."""
+    """The rotation [3, 3] by ``roll`` about x, ``tilt`` about y, then ``yaw`` about z, degrees."""
     a, b, c = radians(yaw), radians(tilt), radians(roll)
     about_z = np.array([[cos(a), -sin(a), 0], [sin(a), cos(a), 0], [0, 0, 1]])
     about_y = np.array([[cos(b), 0, sin(b)], [0, 1, 0], [-sin(b), 0, cos(b)]])
