@@ -6,6 +6,7 @@ Before Hydra runs, the whole configuration is composed and checked (`gsbench.con
 decided.
 """
 
+import itertools
 import logging
 import sys
 from collections.abc import Mapping, Sequence
@@ -448,19 +449,14 @@ def words_of_grids(
     If two set one key, the later counts. Trials are in the order of the grids; the shared settings
     vary fastest.
     """
-    listed = {bare_key(key) for grid in grids for key in grid}
-    return [
-        [
-            *(f"{key}={value}" for key, value in grid.items()),
-            *(
-                f"{key}={value}"
-                for key, value in params.items()
-                if bare_key(key) not in map(bare_key, grid)
-            ),
-            *(word for word in given if key_of(word) not in listed - set(map(bare_key, grid))),
-        ]
-        for grid in grids or [{}]
-    ]
+    listed = set(map(bare_key, itertools.chain(*grids)))
+    jobs = []
+    for grid in grids or [{}]:
+        own = set(map(bare_key, grid))
+        shared = {key: value for key, value in params.items() if bare_key(key) not in own}
+        words = [f"{key}={value}" for key, value in (*grid.items(), *shared.items())]
+        jobs.append([*words, *(word for word in given if key_of(word) not in listed - own)])
+    return jobs
 
 
 def _text(key: object, value: object) -> str:

@@ -13,6 +13,7 @@ their folders.
 from __future__ import annotations
 
 import importlib.util
+import itertools
 import logging
 import math
 import statistics
@@ -104,9 +105,9 @@ class ArmSearch:
 
         optuna.logging.set_verbosity(optuna.logging.WARNING)
         sampler = optuna.samplers.TPESampler(seed=0, constant_liar=self.at_once > 1)
-        direction: Literal["maximize", "minimize"] = (
-            "maximize" if self.record.direction > 0 else "minimize"
-        )
+        direction: Literal["maximize", "minimize"] = "minimize"
+        if self.record.direction > 0:
+            direction = "maximize"
         study = optuna.create_study(direction=direction, sampler=sampler)
         if self.first is not None:
             study.enqueue_trial(dict(self.first))
@@ -125,7 +126,8 @@ class ArmSearch:
             "eval.primary=null",
             *words_of_values(values),
         ]
-        return [[*job, *own, f"{SEED}={seed}"] for job in self.jobs for seed in self.record.seeds]
+        seeds = [f"{SEED}={seed}" for seed in self.record.seeds]
+        return [[*job, *own, seed] for job, seed in itertools.product(self.jobs, seeds)]
 
     def value_of(self, trial: Trial) -> float | None:
         """The metric of a trial, read from its files; None if it has none."""
@@ -141,12 +143,10 @@ class ArmSearch:
 
         values = [value for trial in trials if (value := self.value_of(trial)) is not None]
         mean = statistics.fmean(values) if len(values) == len(trials) else None
-        self.study.tell(
-            proposal, mean, state=TrialState.FAIL if mean is None else TrialState.COMPLETE
-        )
-        point = SearchPoint(
-            settings={key: _rounded(value) for key, value in proposal.params.items()}, value=mean
-        )
+        state = TrialState.FAIL if mean is None else TrialState.COMPLETE
+        self.study.tell(proposal, mean, state=state)
+        settings = {key: _rounded(value) for key, value in proposal.params.items()}
+        point = SearchPoint(settings=settings, value=mean)
         self.record.points.append(point)
         return point
 
@@ -182,10 +182,8 @@ def tuned_jobs(
         sweep.task.handle = lambda trials: []  # trials with other values are not listed
         return untuned
     best_words = {arm: _best_words(search) for arm, search in tuned.items()}
-    return [
-        [*job, *best_words.get(trial.folder.parent.name, ())]
-        for job, trial in zip(jobs, trials, strict=True)
-    ]
+    arms = (trial.folder.parent.name for trial in trials)
+    return [[*job, *best_words.get(arm, ())] for job, arm in zip(jobs, arms, strict=True)]
 
 
 def _search(sweep: Sweep, searches: Sequence[ArmSearch]) -> bool:
@@ -194,32 +192,30 @@ def _search(sweep: Sweep, searches: Sequence[ArmSearch]) -> bool:
     A dry run judges only points whose trials are done already; it returns False at the first that
     is not.
     """
-    while proposals := [(search, proposal) for search in searches for proposal in search.propose()]:
-        jobs_by_point = [search.jobs_of(proposal.params) for search, proposal in proposals]
+    while True:
+        points: list[tuple[ArmSearch, Proposal, list[list[str]]]] = []
+        for search in searches:
+            points += [(search, one, search.jobs_of(one.params)) for one in search.propose()]
+        if not points:
+            break
         # Composed together, because `compose_jobs` composes only once what trials share.
-        trials = iter(sweep.trials([job for jobs in jobs_by_point for job in jobs]))
-        points = [
-            (search, proposal, [next(trials) for _ in jobs])
-            for (search, proposal), jobs in zip(proposals, jobs_by_point, strict=True)
-        ]
-        missing = [
-            trial for search, _, own in points for trial in own if search.value_of(trial) is None
-        ]
+        composed = iter(sweep.trials(list(itertools.chain(*(jobs for _, _, jobs in points)))))
+        trials = [list(itertools.islice(composed, len(jobs))) for _, _, jobs in points]
+        missing: list[Trial] = []
+        for (search, _, _), own in zip(points, trials, strict=True):
+            missing += [trial for trial in own if search.value_of(trial) is None]
         if missing and sweep.task.look_only:
             return False
         if missing:
             _write(searches)  # before training, so that the ranges were on record before any result
             sweep.task.launch(missing)
-        for search, proposal, own in points:
-            point = search.judge(proposal, own)
+        for (search, proposal, _), own in zip(points, trials, strict=True):
+            point, record = search.judge(proposal, own), search.record
             if missing:
                 value = "failed" if point.value is None else f"{point.value:.5g}"
-                settings, number = (
-                    ", ".join(words_of_values(point.settings)),
-                    len(search.record.points),
-                )
-                title = f"{search.home.name}: point {number} of {search.record.wanted}"
-                log.info("%s: %s: %s %s", title, settings, search.record.metric, value)
+                title = f"{search.home.name}: point {len(record.points)} of {record.wanted}"
+                settings = ", ".join(words_of_values(point.settings))
+                log.info("%s: %s: %s %s", title, settings, record.metric, value)
     if not sweep.task.look_only:
         _write(searches)
     return True
@@ -304,13 +300,13 @@ def _plan(
     searches = []
     for arm in dict.fromkeys(arms):
         indices = [index for index, name in enumerate(arms) if name == arm]
-        arm_intervals = dict(
-            sorted((key, interval) for i in indices for key, interval in intervals[i].items())
-        )
-        arm_jobs = [
-            tuple(word for word in jobs[i] if key_of(word) not in REPLACED) for i in indices
-        ]
-        fixed = {key_of(word) for job in arm_jobs for word in job}
+        found: dict[str, Override] = {}
+        arm_jobs = []
+        for i in indices:
+            found |= intervals[i]
+            arm_jobs.append(tuple(word for word in jobs[i] if key_of(word) not in REPLACED))
+        arm_intervals = {key: found[key] for key in sorted(found)}
+        fixed = set(map(key_of, itertools.chain(*arm_jobs)))
         if both := next((key for key in arm_intervals if bare_key(key) in fixed), None):
             raise InputError(
                 f"{both} of {arm} is searched in one grid and given in another: leave one of them "

@@ -75,6 +75,12 @@ class Outcome:
         return TrialFolder(self.folder).label
 
 
+def _say_last(outcomes: Sequence[Outcome], trials: Sequence[Trial]) -> None:
+    """Log the outcome of the trial that ended last, and how many have ended."""
+    last = outcomes[-1]
+    log.info("%s: %s  (%d of %d)", last.label, last.message, len(outcomes), len(trials))
+
+
 def outcome_of_results(folder: Path, results: TrialRecord) -> Outcome:
     """The outcome of a complete trial."""
     metrics = "  ".join(f"{key} {value:.4g}" for key, value in results.metrics.items())
@@ -239,13 +245,7 @@ def _run(
             ended = [folder for folder, job in running.items() if job.done()]
             for folder in ended:
                 outcomes.append(collect(running.pop(folder), folder, trials))
-                log.info(
-                    "%s: %s  (%d of %d)",
-                    outcomes[-1].label,
-                    outcomes[-1].message,
-                    len(outcomes),
-                    len(trials),
-                )
+                _say_last(outcomes, trials)
             if not ended:
                 time.sleep(SECONDS_BETWEEN_POLLS)
     except KeyboardInterrupt:
@@ -418,22 +418,13 @@ def _wait(jobs: dict[Path, Job[Outcome]], trials: Sequence[Trial]) -> list[Outco
             if queue is not None:  # while the scheduler does not answer, no job counts as lost
                 for folder, job in jobs.items():
                     unseen[folder] = 0 if job.job_id in queue else unseen[folder] + 1
-            ended += [
-                folder
-                for folder in jobs
-                if unseen[folder] >= CHECKS_UNTIL_LOST and folder not in ended
-            ]
+            lost = [folder for folder in jobs if unseen[folder] >= CHECKS_UNTIL_LOST]
+            ended += [folder for folder in lost if folder not in ended]
         for folder in ended:
             outcomes.append(collect(jobs.pop(folder), folder, trials))
             with suppress(OSError):
                 forget_submission(folder)
-            log.info(
-                "%s: %s  (%d of %d)",
-                outcomes[-1].label,
-                outcomes[-1].message,
-                len(outcomes),
-                len(trials),
-            )
+            _say_last(outcomes, trials)
         if not ended:
             time.sleep(SECONDS_BETWEEN_POLLS)
     return outcomes

@@ -96,10 +96,16 @@ def _names(folders: Sequence[Path]) -> dict[Path, Name]:
         hashes[folder.parent].add(folder.name.partition(SEED)[0])
     names = {}
     for folder in folders:
-        several = len(hashes[folder.parent]) > 1
-        mark = f" {folder.name.partition(SEED)[0]}" if several else ""
-        names[folder] = (folder.parent.name + mark, folder.parents[1].name)
+        arm = folder.parent.name
+        if len(hashes[folder.parent]) > 1:
+            arm += f" {folder.name.partition(SEED)[0]}"
+        names[folder] = (arm, folder.parents[1].name)
     return names
+
+
+def _kinds(name: Name) -> tuple[Name, ...]:
+    """The trials that tell how long one takes, the most similar ones first."""
+    return name, (name[0], ""), ("", "")
 
 
 def _training(folder: Path) -> tuple[int, float]:
@@ -122,21 +128,16 @@ def _seconds_left(
     """
     known: dict[Name, list[float]] = defaultdict(list)
     for trial in trials:
-        arm, scene = names[trial.path]
-        seconds = sum(trial.record.seconds.values())
-        for name in ((arm, scene), (arm, ""), ("", "")):
-            known[name].append(seconds)
+        for kind in _kinds(names[trial.path]):
+            known[kind].append(sum(trial.record.seconds.values()))
     if not known:
         return None
     total = 0.0
     for state in states:
         if state.state in ("done", "failed"):
             continue
-        arm, scene = names[state.folder]
-        seconds = fmean(
-            next(known[name] for name in ((arm, scene), (arm, ""), ("", "")) if name in known)
-        )
-        total += seconds * (1 - _share_done(state) if state.state == "running" else 1)
+        similar = next(known[kind] for kind in _kinds(names[state.folder]) if kind in known)
+        total += fmean(similar) * (1 - _share_done(state) if state.state == "running" else 1)
     return total / max(1, sum(state.state == "running" for state in states))
 
 

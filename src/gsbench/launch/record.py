@@ -170,12 +170,10 @@ def declare(trials: Sequence[Trial]) -> None:
                 log.info("%s: %s stays declared, since %s", home.name, latest.primary, latest.when)
             before = {} if latest is None else latest.planned
             together = merge_planned(before, asked)
+            # Old declarations name no trials: they cover all of this metric.
+            is_covered = together == before or (latest is not None and not latest.names_trials)
             same_metric = latest is not None and latest.primary == metric
-            if (
-                latest is not None
-                and same_metric
-                and (together == before or not latest.names_trials)
-            ):
+            if same_metric and is_covered:
                 continue
             added = declared_now(questions=(open_question(metric),), trials=dict(together))
             write_text(home / DECLARED, record_text([*declarations, added]))
